@@ -28,11 +28,11 @@ test-fast: .venv/installed-test
 test-all: .venv/installed-test .venv/installed-docs
 	$(BIN)/python -m pytest
 
-lint: .venv/installed-test
+lint: .venv/installed-test .venv/links
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-docs: .venv/installed-docs
+docs: .venv/installed-docs .venv/links
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	$(BIN)/python docs/building/check_links.py site
 
@@ -68,6 +68,11 @@ test-versions: .venv/installed-release
 	@echo "installing the docs extra into .venv"
 	$(PIP) -e '.[docs]'
 	@touch $@
+
+# The package as one folder, for the type checker and for editors, which follow no editable installation.
+.venv/links: .venv/bin/python $(wildcard framework/*)
+	@rm -rf $@ && mkdir -p $@/nerfloom
+	@ln -s $(CURDIR)/methods $(CURDIR)/dataparsers $(addprefix $(CURDIR)/,$(filter-out %/__pycache__,$(wildcard framework/*))) $@/nerfloom
 
 clean:
 	rm -rf .venv outputs site

@@ -15,7 +15,7 @@ import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from setuptools import Extension, setup
+from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
 try:
@@ -124,11 +124,11 @@ class BuildKernels(build_ext):
         return True
 
     def copy_extensions_to_source(self) -> None:
-        for extension in self.extensions:
-            path = Path(self.get_ext_filename(extension.name))
-            path.parent.mkdir(exist_ok=True)
-            for old in path.parent.glob(f"*{path.suffix}"):  # of other sources, or no longer the fastest
-                old.unlink()
+        folder = Path("framework/kernels/lib")
+        folder.mkdir(exist_ok=True)
+        suffix = Path(self.get_ext_filename("any")).suffix
+        for old in folder.glob(f"*{suffix}"):  # of other sources, or no longer the fastest
+            old.unlink()
         super().copy_extensions_to_source()
 
 
@@ -139,10 +139,15 @@ class AnyPythonWheel(bdist_wheel):
         return "py3", "none", super().get_tag()[2]
 
 
+# Three folders, one package: nothing else of ours is at the top of site-packages.
+PARTS = {"nerfloom": "framework", "nerfloom.methods": "methods", "nerfloom.dataparsers": "dataparsers"}
+
 setup(
+    package_dir=PARTS,
+    packages=[*PARTS, *(f"{part}.{name}" for part, folder in PARTS.items() for name in find_packages(folder))],
     ext_modules=[
         Extension(
-            f"framework.kernels.lib.{name}",
+            f"nerfloom.kernels.lib.{name}",
             SOURCES,
             extra_compile_args=[*FLAGS, *flags],
             extra_link_args=["-pthread"] if sys.platform == "linux" else [],

@@ -2,7 +2,7 @@
 
 NeRF-Synthetic (Mildenhall et al. 2020) states an angle of view, and has cameras 4.03 units from the origin, to which
 they look; box, near and far are those of its paper. Of any other scene, what the images show is placed in the same box,
-whatever its units and its place (`dataparsers.region`).
+whatever its units and its place (`nerfloom.dataparsers.region`).
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from pathlib import Path
 
 import torch
 
-from dataparsers.captured import placed_cameras
-from dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_region
-from dataparsers.renders import Renders, read_renders
-from framework import DataError, DataParser, ParsedScene
-from framework.base.console import say
-from framework.cameras.camera_path import read_transforms
-from framework.cameras.poses import Placement
-from framework.data.dataset import Split
+from nerfloom import DataError, DataParser, ParsedScene
+from nerfloom.base.console import say
+from nerfloom.cameras.camera_path import read_transforms
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.dataset import Split
+from nerfloom.dataparsers.captured import placed_cameras
+from nerfloom.dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_region
+from nerfloom.dataparsers.renders import Renders, read_renders
 
 TRANSFORMS = "transforms_train.json"
 """File by which the format is recognised."""

@@ -10,15 +10,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dataparsers.placing import Applied, placement_of
-from dataparsers.sparse_points import sparse_points
-from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.cameras.cameras import LENSES
-from framework.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
-from framework.data.dataset import Split, existing_files, image_size
-from framework.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
-from framework.data.scene import PoseSource
-from framework.data.tracks import Tracks
+from nerfloom import Cameras, DataError, DataParser, ParsedScene
+from nerfloom.cameras.cameras import LENSES
+from nerfloom.cameras.poses import Center, Orientation, Placement, estimate_near, held_out
+from nerfloom.data.dataset import Split, existing_files, image_size
+from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
+from nerfloom.data.scene import PoseSource
+from nerfloom.data.tracks import Tracks
+from nerfloom.dataparsers.placing import Applied, placement_of
+from nerfloom.dataparsers.sparse_points import sparse_points
 
 LARGEST_SIDE = 1600
 """Longer side of an image, pixels, above which images are reduced by default."""

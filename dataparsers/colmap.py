@@ -7,14 +7,14 @@ from pathlib import Path, PurePath
 
 from torch import Tensor
 
-from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
-from dataparsers.colmap_lens import lenses_of
-from dataparsers.colmap_model import SparseModel, choose_model, find_models, read_model
-from dataparsers.masks import find_masks
-from framework import DataError, ParsedScene
-from framework.data.dataset import Split
-from framework.data.names_on_disk import has_images, on_disk
-from framework.data.tracks import Tracks, doubts_about
+from nerfloom import DataError, ParsedScene
+from nerfloom.data.dataset import Split
+from nerfloom.data.names_on_disk import has_images, on_disk
+from nerfloom.data.tracks import Tracks, doubts_about
+from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
+from nerfloom.dataparsers.colmap_lens import lenses_of
+from nerfloom.dataparsers.colmap_model import SparseModel, choose_model, find_models, read_model
+from nerfloom.dataparsers.masks import find_masks
 
 
 @dataclass(frozen=True)

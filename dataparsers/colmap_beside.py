@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dataparsers.colmap import tracks_of
-from dataparsers.colmap_lens import lenses_of
-from dataparsers.colmap_model import choose_model, find_models, read_model
-from framework import DataError
-from framework.base.console import say
-from framework.data.names_on_disk import spelled
-from framework.data.tracks import Tracks
+from nerfloom import DataError
+from nerfloom.base.console import say
+from nerfloom.data.names_on_disk import spelled
+from nerfloom.data.tracks import Tracks
+from nerfloom.dataparsers.colmap import tracks_of
+from nerfloom.dataparsers.colmap_lens import lenses_of
+from nerfloom.dataparsers.colmap_model import choose_model, find_models, read_model
 
 LARGEST_ANGLE = 0.2
 """Largest angle between an image's rotations in the model and in the file, degrees: about two pixels of a phone's

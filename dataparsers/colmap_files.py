@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from framework import DataError
+from nerfloom import DataError
 
 LONGEST_NAME = 4096
 """Maximum length of an image's name, bytes; no system opens a longer path."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dataparsers.colmap_model import SparseCamera
-from framework import DataError
-from framework.cameras.cameras import LENSES
-from framework.cameras.colmap import PARAMETERS, Intrinsics, from_colmap
+from nerfloom import DataError
+from nerfloom.cameras.cameras import LENSES
+from nerfloom.cameras.colmap import PARAMETERS, Intrinsics, from_colmap
+from nerfloom.dataparsers.colmap_model import SparseCamera
 
 
 @dataclass(frozen=True)

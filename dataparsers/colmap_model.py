@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.colmap_files import check_binary, image_names, text_names
-from dataparsers.reading import file_name
-from dataparsers.rotations import rotations, unit_quaternions
-from framework import DataError
-from framework.base.console import say
-from framework.cameras.cameras import check_pose
-from framework.data.dataset import one_line
-from framework.data.names_on_disk import match_names
+from nerfloom import DataError
+from nerfloom.base.console import say
+from nerfloom.cameras.cameras import check_pose
+from nerfloom.data.dataset import one_line
+from nerfloom.data.names_on_disk import match_names
+from nerfloom.dataparsers.colmap_files import check_binary, image_names, text_names
+from nerfloom.dataparsers.reading import file_name
+from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 
 LOCATIONS = ("sparse", "colmap/sparse", ".")
 """Folders searched for reconstructions, below which they may lie too; the data folder itself comes last."""

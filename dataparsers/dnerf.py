@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from dataparsers.blender import TRANSFORMS, Blender, has_times
-from framework import DataError, ParsedScene
-from framework.data.dataset import Split
+from nerfloom import DataError, ParsedScene
+from nerfloom.data.dataset import Split
+from nerfloom.dataparsers.blender import TRANSFORMS, Blender, has_times
 
 
 @dataclass(frozen=True)

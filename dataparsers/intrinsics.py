@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dataparsers.captured import sizes_of
-from dataparsers.reading import number, numbers, shown, side_or_none
-from framework import DataError
-from framework.base.errors import nearest
+from nerfloom import DataError
+from nerfloom.base.errors import nearest
+from nerfloom.dataparsers.captured import sizes_of
+from nerfloom.dataparsers.reading import number, numbers, shown, side_or_none
 
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
 """Projection, and the file's names of its coefficients in the order of `LENSES`."""

@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.captured import Captured, PosedImages, captured_scene, checked_box, has_transforms
-from dataparsers.colmap_model import find_models
-from dataparsers.masks import find_masks
-from framework import DataError, ParsedScene
-from framework.base.arrays import read_array
-from framework.cameras.cameras import check_pose
-from framework.cameras.ndc import NdcCameras, find_ndc, ndc_box
-from framework.data.data_folder import IMAGE_SUFFIXES
-from framework.data.dataset import Split, one_line
-from framework.data.names_on_disk import REDUCED
+from nerfloom import DataError, ParsedScene
+from nerfloom.base.arrays import read_array
+from nerfloom.cameras.cameras import check_pose
+from nerfloom.cameras.ndc import NdcCameras, find_ndc, ndc_box
+from nerfloom.data.data_folder import IMAGE_SUFFIXES
+from nerfloom.data.dataset import Split, one_line
+from nerfloom.data.names_on_disk import REDUCED
+from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, checked_box, has_transforms
+from nerfloom.dataparsers.colmap_model import find_models
+from nerfloom.dataparsers.masks import find_masks
 
 POSES = "poses_bounds.npy"
 """File of poses and depth bounds."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from framework.base.console import say
-from framework.data.names_on_disk import REDUCED, files_below, spelled, without_ending
+from nerfloom.base.console import say
+from nerfloom.data.names_on_disk import REDUCED, files_below, spelled, without_ending
 
 
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:

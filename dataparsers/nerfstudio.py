@@ -11,7 +11,16 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from dataparsers.captured import (
+from nerfloom import DataError, ParsedScene
+from nerfloom.base.console import say
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.data.data_folder import IMAGE_SUFFIXES
+from nerfloom.data.dataset import Split
+from nerfloom.data.depths import DEPTH_SUFFIXES
+from nerfloom.data.names_on_disk import nearest_on_disk, on_disk, spelled
+from nerfloom.data.ply import read_points
+from nerfloom.data.tracks import Tracks
+from nerfloom.dataparsers.captured import (
     Captured,
     Division,
     PosedImages,
@@ -19,19 +28,10 @@ from dataparsers.captured import (
     checked_box,
     image_sizes,
 )
-from dataparsers.colmap_beside import names_in_model, tracks_beside
-from dataparsers.intrinsics import ngp_cube, read_intrinsics
-from dataparsers.placing import from_original
-from dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid, shown
-from framework import DataError, ParsedScene
-from framework.base.console import say
-from framework.base.evenly_spaced import evenly_spaced
-from framework.data.data_folder import IMAGE_SUFFIXES
-from framework.data.dataset import Split
-from framework.data.depths import DEPTH_SUFFIXES
-from framework.data.names_on_disk import nearest_on_disk, on_disk, spelled
-from framework.data.ply import read_points
-from framework.data.tracks import Tracks
+from nerfloom.dataparsers.colmap_beside import names_in_model, tracks_beside
+from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
+from nerfloom.dataparsers.placing import from_original
+from nerfloom.dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid, shown
 
 TRANSFORMS = "transforms.json"
 """File by which the format is recognised."""

@@ -13,12 +13,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dataparsers.captured import Captured, captured_scene, has_transforms
-from dataparsers.colmap import read_images
-from dataparsers.colmap_model import choose_model, find_models
-from framework import DataError, ParsedScene
-from framework.data.dataset import Split
-from framework.data.names_on_disk import spelled
+from nerfloom import DataError, ParsedScene
+from nerfloom.data.dataset import Split
+from nerfloom.data.names_on_disk import spelled
+from nerfloom.dataparsers.captured import Captured, captured_scene, has_transforms
+from nerfloom.dataparsers.colmap import read_images
+from nerfloom.dataparsers.colmap_model import choose_model, find_models
 
 SPARSE = "dense/sparse"
 """Folder of the reconstruction in the data folder."""

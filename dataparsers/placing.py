@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from dataparsers.camera_spread import SMALL, camera_spread, warning
-from framework import ParsedScene
-from framework.base.console import say
-from framework.cameras.camera_path import read_transforms
-from framework.cameras.poses import Placement, enlargement, place
-from framework.data.dataset import Split
-from framework.geometry.local_origin import local_origin, rounding
+from nerfloom import ParsedScene
+from nerfloom.base.console import say
+from nerfloom.cameras.camera_path import read_transforms
+from nerfloom.cameras.poses import Placement, enlargement, place
+from nerfloom.data.dataset import Split
+from nerfloom.dataparsers.camera_spread import SMALL, camera_spread, warning
+from nerfloom.geometry.local_origin import local_origin, rounding
 
 if TYPE_CHECKING:
-    from dataparsers.captured import Captured, PosedImages
+    from nerfloom.dataparsers.captured import Captured, PosedImages
 
 
 Applied = tuple[Tensor, float]

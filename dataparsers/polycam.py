@@ -7,14 +7,14 @@ from pathlib import Path
 
 import torch
 
-from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms, image_sizes, sizes_of
-from dataparsers.placing import from_original
-from dataparsers.reading import number, read_json, rigid, side_or_none
-from framework import DataError, ParsedScene
-from framework.data.dataset import Split
-from framework.data.depths import DEPTH_SUFFIXES
-from framework.data.names_on_disk import on_disk
-from framework.data.scene import PoseSource
+from nerfloom import DataError, ParsedScene
+from nerfloom.data.dataset import Split
+from nerfloom.data.depths import DEPTH_SUFFIXES
+from nerfloom.data.names_on_disk import on_disk
+from nerfloom.data.scene import PoseSource
+from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms, image_sizes, sizes_of
+from nerfloom.dataparsers.placing import from_original
+from nerfloom.dataparsers.reading import number, read_json, rigid, side_or_none
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and images in `keyframes`, the ones refined by Polycam first."""

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dataparsers.rotations import nearest_rotation
-from framework import DataError
-from framework.base.errors import shown as shown
-from framework.cameras.cameras import LARGEST_SIDE, check_pose
+from nerfloom import DataError
+from nerfloom.base.errors import shown as shown
+from nerfloom.cameras.cameras import LARGEST_SIDE, check_pose
+from nerfloom.dataparsers.rotations import nearest_rotation
 
 LONGEST_NAME = 250
 """Maximum length of a file's or folder's name, bytes; most systems allow 255."""

@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
-from dataparsers.reading import numbers, read_json, side
-from dataparsers.rotations import rotations, unit_quaternions
-from framework import DataError, ParsedScene
-from framework.data.dataset import Split, existing_files
-from framework.data.names_on_disk import on_disk
-from framework.data.scene import PoseSource
+from nerfloom import DataError, ParsedScene
+from nerfloom.data.dataset import Split, existing_files
+from nerfloom.data.names_on_disk import on_disk
+from nerfloom.data.scene import PoseSource
+from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
+from nerfloom.dataparsers.reading import numbers, read_json, side
+from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 
 METADATA = "metadata.json"
 """File of poses and intrinsics."""

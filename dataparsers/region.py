@@ -11,11 +11,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from framework import Cameras, DataError
-from framework.base.evenly_spaced import evenly_spaced
-from framework.cameras.poses import MOST_LOOK, NEAR, Placement, looked_at, place
-from framework.data.image_files import may_be_transparent, read_image
-from framework.scene.enclosing_box import enclosing_box, is_larger
+from nerfloom import Cameras, DataError
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.cameras.poses import MOST_LOOK, NEAR, Placement, looked_at, place
+from nerfloom.data.image_files import may_be_transparent, read_image
+from nerfloom.scene.enclosing_box import enclosing_box, is_larger
 
 HALF_SIZE = 1.5
 """Half the side of a scene's box, scene units: that of NeRF-Synthetic, for which methods' settings were found."""

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dataparsers.captured import PosedImages
-from dataparsers.intrinsics import ngp_cube, read_intrinsics
-from dataparsers.reading import file_name, read_json, read_pose, read_times
-from framework import DataError
-from framework.base.console import say
-from framework.data.dataset import Split, existing_files, image_size
-from framework.data.names_on_disk import on_disk
+from nerfloom import DataError
+from nerfloom.base.console import say
+from nerfloom.data.dataset import Split, existing_files, image_size
+from nerfloom.data.names_on_disk import on_disk
+from nerfloom.dataparsers.captured import PosedImages
+from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
+from nerfloom.dataparsers.reading import file_name, read_json, read_pose, read_times
 
 OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
 """Entries that state more of a lens than its angle of view."""

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from framework import DataError
-from framework.kernels.math import cross_matrix
+from nerfloom import DataError
+from nerfloom.kernels.math import cross_matrix
 
 LARGEST_ROUNDING = 0.02
 """Largest deviation of R R^T from the identity, and of a quaternion's length from 1, that rounding explains: that of

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
-from framework.data.tracks import DOUBTS, LARGEST_DEVIATION, Sightings, Tracks
+from nerfloom.base.console import say
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.tracks import DOUBTS, LARGEST_DEVIATION, Sightings, Tracks
 
 if TYPE_CHECKING:
-    from dataparsers.captured import PosedImages
+    from nerfloom.dataparsers.captured import PosedImages
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,10 @@
-"""Nerfloom: what a method, a data format or a script imports.
+"""Neural radiance fields: what a notebook, a script, a method or a data format imports.
 
-Names are imported on use, so that `import framework` costs nothing.
+`load` loads a run, to render its views and evaluate it, and `train` trains another (docs/notebooks). An occupancy grid,
+sampling and compositing are for a radiance field and a training loop of your own (docs/plug-and-play.md). A method is a
+`Method`, a data format a `DataParser` (docs/plugins.md).
+
+Names are imported on use, so that `import nerfloom` costs nothing.
 """
 
 from __future__ import annotations
@@ -11,37 +15,59 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from framework.base.config import RayConfig as RayConfig
-    from framework.base.config import TrainConfig as TrainConfig
-    from framework.base.decisions import Decision as Decision
-    from framework.base.errors import ConfigError as ConfigError
-    from framework.base.errors import DataError as DataError
-    from framework.base.errors import NerfloomError as NerfloomError
-    from framework.base.optimised import Optimised as Optimised
-    from framework.base.optimised import RowChange as RowChange
-    from framework.cameras.cameras import Cameras as Cameras
-    from framework.cameras.view import View as View
-    from framework.data.dataset import Dataset as Dataset
-    from framework.data.parsed_scene import DataParser as DataParser
-    from framework.data.parsed_scene import ParsedScene as ParsedScene
-    from framework.data.pixels import PixelBatch as PixelBatch
-    from framework.data.pixels import ViewBatch as ViewBatch
-    from framework.data.scene import Scene as Scene
-    from framework.fields.base import Field as Field
-    from framework.gaussian_model import GaussianModel as GaussianModel
-    from framework.geometry.points import Points as Points
-    from framework.geometry.rays import Rays as Rays
-    from framework.geometry.rays import Samples as Samples
-    from framework.method import Method as Method
-    from framework.model import LearnsMotion as LearnsMotion
-    from framework.model import Loss as Loss
-    from framework.model import Model as Model
-    from framework.ray_model import RayModel as RayModel
-    from framework.rendering.rendered import Picture as Picture
-    from framework.rendering.rendered import Rendered as Rendered
-    from framework.rendering.renderer import Renderer as Renderer
-    from framework.rendering.volume import VolumeRenderer as VolumeRenderer
-    from framework.samplers.base import Sampler as Sampler
+    from nerfloom.base.config import RayConfig as RayConfig
+    from nerfloom.base.config import TrainConfig as TrainConfig
+    from nerfloom.base.decisions import Decision as Decision
+    from nerfloom.base.errors import ConfigError as ConfigError
+    from nerfloom.base.errors import DataError as DataError
+    from nerfloom.base.errors import NerfloomError as NerfloomError
+    from nerfloom.base.optimised import Optimised as Optimised
+    from nerfloom.base.optimised import RowChange as RowChange
+    from nerfloom.cameras.cameras import Cameras as Cameras
+    from nerfloom.cameras.view import View as View
+    from nerfloom.data.dataset import Dataset as Dataset
+    from nerfloom.data.parsed_scene import DataParser as DataParser
+    from nerfloom.data.parsed_scene import ParsedScene as ParsedScene
+    from nerfloom.data.pixels import PixelBatch as PixelBatch
+    from nerfloom.data.pixels import ViewBatch as ViewBatch
+    from nerfloom.data.scene import Scene as Scene
+    from nerfloom.fields.base import Field as Field
+    from nerfloom.gaussian_model import GaussianModel as GaussianModel
+    from nerfloom.geometry.bounds import contract as contract
+    from nerfloom.geometry.bounds import intersect_box as intersect_box
+    from nerfloom.geometry.points import Points as Points
+    from nerfloom.geometry.rays import Rays as Rays
+    from nerfloom.geometry.rays import Samples as Samples
+    from nerfloom.kernels.alpha import composite_alpha as composite_alpha
+    from nerfloom.kernels.compositing import composite as composite
+    from nerfloom.kernels.compositing import distortion as distortion
+    from nerfloom.kernels.contraction import contract_to_unit as contract_to_unit
+    from nerfloom.method import Method as Method
+    from nerfloom.model import LearnsMotion as LearnsMotion
+    from nerfloom.model import Loss as Loss
+    from nerfloom.model import Model as Model
+    from nerfloom.plug_and_play.rendering import Rendering as Rendering
+    from nerfloom.plug_and_play.rendering import accumulate as accumulate
+    from nerfloom.plug_and_play.rendering import render as render
+    from nerfloom.plug_and_play.sampling import clip_to_box as clip_to_box
+    from nerfloom.plug_and_play.sampling import sample_inverse_cdf as sample_inverse_cdf
+    from nerfloom.plug_and_play.sampling import sample_proposals as sample_proposals
+    from nerfloom.plug_and_play.sampling import sample_uniform as sample_uniform
+    from nerfloom.plug_and_play.skipping import OccupancyGrid as OccupancyGrid
+    from nerfloom.plug_and_play.skipping import sample as sample
+    from nerfloom.ray_model import RayModel as RayModel
+    from nerfloom.rendering.rendered import Picture as Picture
+    from nerfloom.rendering.rendered import Rendered as Rendered
+    from nerfloom.rendering.renderer import Renderer as Renderer
+    from nerfloom.rendering.volume import VolumeRenderer as VolumeRenderer
+    from nerfloom.runs import TrainedRun as TrainedRun
+    from nerfloom.runs import image as image
+    from nerfloom.runs import list_methods as list_methods
+    from nerfloom.runs import load as load
+    from nerfloom.runs import train as train
+    from nerfloom.samplers.base import Sampler as Sampler
+    from nerfloom.samplers.inverse_cdf import inverse_cdf as inverse_cdf
+    from nerfloom.samplers.proposal import interlevel_loss as interlevel_loss
 
 _HOMES = {
     "Cameras": "cameras.cameras",
@@ -57,6 +83,7 @@ _HOMES = {
     "Method": "method",
     "Model": "model",
     "NerfloomError": "base.errors",
+    "OccupancyGrid": "plug_and_play.skipping",
     "Optimised": "base.optimised",
     "ParsedScene": "data.parsed_scene",
     "Picture": "rendering.rendered",
@@ -67,20 +94,42 @@ _HOMES = {
     "Rays": "geometry.rays",
     "Rendered": "rendering.rendered",
     "Renderer": "rendering.renderer",
+    "Rendering": "plug_and_play.rendering",
     "RowChange": "base.optimised",
     "Sampler": "samplers.base",
     "Samples": "geometry.rays",
     "Scene": "data.scene",
     "TrainConfig": "base.config",
+    "TrainedRun": "runs",
     "View": "cameras.view",
     "ViewBatch": "data.pixels",
     "VolumeRenderer": "rendering.volume",
+    "accumulate": "plug_and_play.rendering",
+    "clip_to_box": "plug_and_play.sampling",
+    "composite": "kernels.compositing",
+    "composite_alpha": "kernels.alpha",
+    "contract": "geometry.bounds",
+    "contract_to_unit": "kernels.contraction",
+    "distortion": "kernels.compositing",
+    "image": "runs",
+    "interlevel_loss": "samplers.proposal",
+    "intersect_box": "geometry.bounds",
+    "inverse_cdf": "samplers.inverse_cdf",
+    "list_methods": "runs",
+    "load": "runs",
+    "render": "plug_and_play.rendering",
+    "sample": "plug_and_play.skipping",
+    "sample_inverse_cdf": "plug_and_play.sampling",
+    "sample_proposals": "plug_and_play.sampling",
+    "sample_uniform": "plug_and_play.sampling",
+    "train": "runs",
 }
+"""Module that holds each name."""
 
-# Threads of torch's that wait look out for work for milliseconds, unless told otherwise before torch is loaded. Beside
-# another program that uses up the time in which they could work: a training is four times slower than its share of the
-# cores would make it. The first is for GNU's OpenMP (in rounds, some 20 microseconds), the other for LLVM's and Intel's
-# (in milliseconds).
+# Waiting threads of torch look for work for milliseconds by default. That takes time from other programs, and from a
+# training beside them, which is then four times slower than its share of the cores would make it. GNU's OpenMP takes
+# the first variable (in rounds, some 20 microseconds), LLVM's and Intel's the second (in milliseconds); both are read
+# when torch is loaded.
 if "torch" not in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     os.environ.setdefault("KMP_BLOCKTIME", "1")
@@ -91,5 +140,9 @@ __all__ = sorted(_HOMES)
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(f"framework.{_HOMES[name]}"), name)
-    raise AttributeError(f"module 'framework' has no attribute '{name}'")
+        return getattr(import_module(f"nerfloom.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'nerfloom' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -10,27 +10,27 @@ from typing import ClassVar, Generic, Literal
 import torch
 from torch import Tensor, nn
 
-from framework.base.device import HostValue
-from framework.base.optimised import Optimised, RowChange
-from framework.base.pace import Pace
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.data.scene import Scene
-from framework.kernels.splat_project import SplatCamera
-from framework.model import Model
-from framework.rendering.rendered import Picture
-from framework.splats.density_control import RESET, GradientMean, grown
-from framework.splats.drawing import DRAWN, draw_view, on_image, splat_camera
-from framework.splats.gaussians import Gaussians
-from framework.splats.learning import as_gaussians, as_tables, row_changes, steps_per_move
-from framework.splats.look import Look
-from framework.splats.mcmc import moved, shaken
-from framework.splats.redrawn import Redrawn
-from framework.splats.resolution import ImageSizes, most_octaves
-from framework.splats.room import Room
-from framework.splats.settings import SplattingConfigT
-from framework.splats.start import from_points, scene_size
-from framework.splats.table import Table
+from nerfloom.base.device import HostValue
+from nerfloom.base.optimised import Optimised, RowChange
+from nerfloom.base.pace import Pace
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.data.scene import Scene
+from nerfloom.kernels.splat_project import SplatCamera
+from nerfloom.model import Model
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.density_control import RESET, GradientMean, grown
+from nerfloom.splats.drawing import DRAWN, draw_view, on_image, splat_camera
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.learning import as_gaussians, as_tables, row_changes, steps_per_move
+from nerfloom.splats.look import Look
+from nerfloom.splats.mcmc import moved, shaken
+from nerfloom.splats.redrawn import Redrawn
+from nerfloom.splats.resolution import ImageSizes, most_octaves
+from nerfloom.splats.room import Room
+from nerfloom.splats.settings import SplattingConfigT
+from nerfloom.splats.start import from_points, scene_size
+from nerfloom.splats.table import Table
 
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""

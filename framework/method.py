@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from framework.base.config import RayConfig, TrainConfig
-from framework.base.decisions import Choice, Decision, fill, left_open
-from framework.base.errors import ConfigError
-from framework.data.scene import Scene
-from framework.fields.base import Field
-from framework.model import Model
-from framework.ray_model import RayModel
-from framework.rendering.renderer import Renderer
-from framework.rendering.volume import volume_renderer as volume_renderer
-from framework.samplers.base import Sampler
-from framework.samplers.choice import SamplingConfig, sampler_choice
-from framework.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
+from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.decisions import Choice, Decision, fill, left_open
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.scene import Scene
+from nerfloom.fields.base import Field
+from nerfloom.model import Model
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.renderer import Renderer
+from nerfloom.rendering.volume import volume_renderer as volume_renderer
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.choice import SamplingConfig, sampler_choice
+from nerfloom.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
 
 DEPTH = 0.1
 """Default weight of the depth loss if there are depth images."""
@@ -71,8 +71,8 @@ class Method:
     model: type[Model[Any]] = RayModel
     """Class of the model: called with (config, scene, field, sampler, renderer), or (config, scene) without a field."""
     decide: Callable[[Any, Scene], tuple[Any, list[Decision]]] = nothing_to_decide
-    """Fills in the settings that depend on the data, and gives the reasons (`framework.base.decisions.fill`)."""
-    interface: int = 2
+    """Fills in the settings that depend on the data, and gives the reasons (`nerfloom.base.decisions.fill`)."""
+    interface: int = 3
     """Version of the plugin interface that the method was written for (`registry.INTERFACE`)."""
 
     def decided(self, config: Any, scene: Scene) -> tuple[Any, list[Decision]]:

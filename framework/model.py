@@ -11,19 +11,19 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast, run
 import torch
 from torch import Tensor, nn
 
-from framework.base.config import TrainConfig
-from framework.base.device import has_bfloat16
-from framework.base.optimised import ParameterGroup, RowChange, parameter_groups
-from framework.base.pace import Pace
-from framework.base.protocols import SeesRegistered
-from framework.base.step_kind import StepKind
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.data.dataset import Dataset
-from framework.data.scene import Scene
-from framework.fields.appearance import Appearance
-from framework.geometry.points import Points
-from framework.rendering.rendered import Picture
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.device import has_bfloat16
+from nerfloom.base.optimised import ParameterGroup, RowChange, parameter_groups
+from nerfloom.base.pace import Pace
+from nerfloom.base.protocols import SeesRegistered
+from nerfloom.base.step_kind import StepKind
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.scene import Scene
+from nerfloom.fields.appearance import Appearance
+from nerfloom.geometry.points import Points
+from nerfloom.rendering.rendered import Picture
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 PartT = TypeVar("PartT")

@@ -8,23 +8,23 @@ from typing import ClassVar, Generic, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig
-from framework.base.step_kind import StepKind
-from framework.cameras.cameras import subpixels
-from framework.cameras.refinement import PoseRefinement
-from framework.cameras.unseen import unseen_patches
-from framework.cameras.view import View
-from framework.data.pixels import PixelBatch, thinned
-from framework.data.scene import Scene
-from framework.encodings.opening import Opening
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.kernels.math import safe_normalize
-from framework.kernels.native import torch_on_one_thread
-from framework.kernels.traced_error import PixelTargets, TracedError
-from framework.model import Loss, Model, evaluating, parts
-from framework.rendering.losses import (
+from nerfloom.base.config import RayConfig
+from nerfloom.base.step_kind import StepKind
+from nerfloom.cameras.cameras import subpixels
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.cameras.unseen import unseen_patches
+from nerfloom.cameras.view import View
+from nerfloom.data.pixels import PixelBatch, thinned
+from nerfloom.data.scene import Scene
+from nerfloom.encodings.opening import Opening
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.traced_error import PixelTargets, TracedError
+from nerfloom.model import Loss, Model, evaluating, parts
+from nerfloom.rendering.losses import (
     density_before,
     depth_error,
     depth_roughness,
@@ -33,15 +33,15 @@ from framework.rendering.losses import (
     mean_squared_error,
     opacity_of_transparent,
 )
-from framework.rendering.rendered import Picture, Rendered
-from framework.rendering.renderer import Renderer
-from framework.rendering.traced import error_of_traced, traced_rays
-from framework.rendering.volume import VolumeRenderer
-from framework.samplers.base import Sampler, SkipsCells
-from framework.samplers.in_view import pixels_in_view
-from framework.scene.few_images import FewImagesConfig, unseen_weight
-from framework.scene.motion import MotionConfig
-from framework.scene.shared_space import SharedSpace
+from nerfloom.rendering.rendered import Picture, Rendered
+from nerfloom.rendering.renderer import Renderer
+from nerfloom.rendering.traced import error_of_traced, traced_rays
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.base import Sampler, SkipsCells
+from nerfloom.samplers.in_view import pixels_in_view
+from nerfloom.scene.few_images import FewImagesConfig, unseen_weight
+from nerfloom.scene.motion import MotionConfig
+from nerfloom.scene.shared_space import SharedSpace
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 PATCH = 8
@@ -189,7 +189,7 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def _for_few_images(
         self, config: FewImagesConfig, rendered: Rendered, batch: PixelBatch, step: int
     ) -> dict[str, Tensor]:
-        """Return the terms of the loss that replace images where there are few (`framework.scene.few_images`)."""
+        """Return the terms of the loss that replace images where there are few (`nerfloom.scene.few_images`)."""
         losses, poses = dict[str, Tensor](), self.scene.camera_to_worlds
         if config.occlusion_loss_mult:
             near = config.occlusion_range * self.scene.near

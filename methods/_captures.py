@@ -7,7 +7,7 @@ from typing import ClassVar, Generic, Literal, TypeVar
 
 from torch import Tensor
 
-from framework import (
+from nerfloom import (
     Cameras,
     ConfigError,
     Decision,
@@ -19,14 +19,14 @@ from framework import (
     Sampler,
     Scene,
 )
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.base.optimised import Optimised
-from framework.cameras.refinement import PoseRefinement
-from framework.rendering.losses import normalised_distortion
-from framework.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
-from framework.samplers.proposal import half_edge
-from framework.scene.reasons import MARCHED_REASON, POSE_REASONS
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.optimised import Optimised
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.rendering.losses import normalised_distortion
+from nerfloom.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
+from nerfloom.samplers.proposal import half_edge
+from nerfloom.scene.reasons import MARCHED_REASON, POSE_REASONS
 
 DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from framework.base.config import AT_LEAST_0, Range
-from framework.base.optimised import Optimised
-from framework.encodings.hash_grid import HashGridConfig
+from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.hash_grid import HashGridConfig
 
 
 @dataclass(frozen=True)

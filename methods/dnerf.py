@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
 
-from framework import Decision, Field, LearnsMotion, Method, RayModel, Sampler, Scene
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.base.optimised import Optimised
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.deformed import DeformedField
-from framework.fields.encoded import EncodedField
-from framework.fields.nerf import NeRFField
-from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
-from framework.scene.motion import MotionConfig, slices_choice
-from methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
+from nerfloom import Decision, Field, LearnsMotion, Method, RayModel, Sampler, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.deformed import DeformedField
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
+from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
+from nerfloom.scene.motion import MotionConfig, slices_choice
 
 NUM_STEPS, HASH_NUM_STEPS = 192, 384
 """Steps along the diagonal of the box: with networks, and with a hash grid."""

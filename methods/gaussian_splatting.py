@@ -13,27 +13,27 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework import Cameras, Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
-from framework.base.console import say
-from framework.base.decisions import Choice, fill
-from framework.base.device import HostValue
-from framework.cameras.refinement import PoseRefinement
-from framework.data.dataset import Dataset
-from framework.fields.appearance import AFFINE, Appearance, affine_colors
-from framework.kernels.splat_blend import CHANNELS
-from framework.kernels.splat_project import SplatCamera, sort_keys
-from framework.kernels.ssim import photometric_loss
-from framework.rendering.losses import mean_depth_error
-from framework.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
-from framework.splats.drawing import draw, splat_camera
-from framework.splats.guide import GUIDE, FoundDistances
-from framework.splats.learning import open_degree
-from framework.splats.resolution import enlarged, reduced, reduced_distances
-from framework.splats.settings import SplattingConfig, decide_splatting
-from framework.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
-from framework.tools.surfaces import found_surfaces
-from framework.training.optim import learning_rate_factor
+from nerfloom import Cameras, Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.console import say
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.device import HostValue
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.data.dataset import Dataset
+from nerfloom.fields.appearance import AFFINE, Appearance, affine_colors
+from nerfloom.kernels.splat_blend import CHANNELS
+from nerfloom.kernels.splat_project import SplatCamera, sort_keys
+from nerfloom.kernels.ssim import photometric_loss
+from nerfloom.rendering.losses import mean_depth_error
+from nerfloom.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
+from nerfloom.splats.drawing import draw, splat_camera
+from nerfloom.splats.guide import GUIDE, FoundDistances
+from nerfloom.splats.learning import open_degree
+from nerfloom.splats.resolution import enlarged, reduced, reduced_distances
+from nerfloom.splats.settings import SplattingConfig, decide_splatting
+from nerfloom.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
+from nerfloom.tools.surfaces import found_surfaces
+from nerfloom.training.optim import learning_rate_factor
 
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first

@@ -11,19 +11,19 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
-from framework import Decision, Method, Scene
-from framework.base.config import AUTO, Auto, Range
-from framework.base.decisions import Choice, fill, is_open
-from framework.base.device import relative_speed
-from framework.encodings.hash_grid import HashGrid, HashGridConfig
-from framework.fields.encoded import EncodedField
-from framework.fields.inverted import InvertedField
-from framework.ray_model import RayModel
-from framework.rendering.background import background_renderer
-from framework.samplers.background import BackgroundConfig, decide_background, foreground
-from framework.samplers.choice import contracted_box
-from framework.samplers.inside import make_foreground_sampler
-from framework.scene.few_images import FewImagesConfig, decide_few_images
+from nerfloom import Decision, Method, Scene
+from nerfloom.base.config import AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill, is_open
+from nerfloom.base.device import relative_speed
+from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.inverted import InvertedField
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.background import background_renderer
+from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
+from nerfloom.samplers.choice import contracted_box
+from nerfloom.samplers.inside import make_foreground_sampler
+from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 
 FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
 """Seconds of training on two threads of a CPU, and pixels of the longer side of the images, from which `plan` counts.

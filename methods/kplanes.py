@@ -11,20 +11,20 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework import Decision, LearnsMotion, Method, PixelBatch, Points, RayModel, Rendered, Scene
-from framework.base import device as devices
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.base import MLP
-from framework.fields.encoded import BoxField, EncodedField
-from framework.kernels.math import truncated_exp
-from framework.kernels.plane_bands import squared_steps
-from framework.kernels.planes_layout import MAX_VERTICES
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
-from framework.scene.few_images import FewImagesConfig, decide_few_images
-from framework.scene.motion import MotionConfig, slices_choice, vertices_in_time
+from nerfloom import Decision, LearnsMotion, Method, PixelBatch, Points, RayModel, Rendered, Scene
+from nerfloom.base import device as devices
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.base import MLP
+from nerfloom.fields.encoded import BoxField, EncodedField
+from nerfloom.kernels.math import truncated_exp
+from nerfloom.kernels.plane_bands import squared_steps
+from nerfloom.kernels.planes_layout import MAX_VERTICES
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
+from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
+from nerfloom.scene.motion import MotionConfig, slices_choice, vertices_in_time
 
 FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL = 2**14, 2**15, 75.0
 """Samples of a training step of a still scene, in a short time and in a long one, and seconds from which on they grow.

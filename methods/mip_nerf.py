@@ -10,14 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from framework import Decision, Field, Method, RayModel, Sampler, Scene
-from framework.base.config import Range
-from framework.base.optimised import Optimised
-from framework.encodings.integrated import IntegratedEncoding
-from framework.fields.integrated import IntegratedField
-from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
-from framework.samplers.proposal import half_edge
+from nerfloom import Decision, Field, Method, RayModel, Sampler, Scene
+from nerfloom.base.config import Range
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.integrated import IntegratedEncoding
+from nerfloom.fields.integrated import IntegratedField
+from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
+from nerfloom.samplers.proposal import half_edge
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""

@@ -13,26 +13,17 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from framework import Decision, Field, Method, PixelBatch, Rendered, Sampler, Scene
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.base.device import device_kind
-from framework.base.optimised import Optimised
-from framework.encodings.integrated import IntegratedEncoding, icosahedron_directions
-from framework.encodings.multisampled import MultisampledHashGrid
-from framework.fields.integrated import IntegratedDensity, IntegratedField
-from framework.fields.sized import SizedDensity, SizedField
-from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.rendering.losses import charbonnier
-from framework.samplers.choice import (
-    COARSEST_PROPOSAL,
-    contracted_box,
-    decide_samples,
-    make_sampler,
-    samples_choices,
-)
-from framework.samplers.proposal import LEARN_EVERY, half_edge
-from methods._captures import (
+from nerfloom import Decision, Field, Method, PixelBatch, Rendered, Sampler, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.device import device_kind
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_directions
+from nerfloom.encodings.multisampled import MultisampledHashGrid
+from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
+from nerfloom.fields.sized import SizedDensity, SizedField
+from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.methods._captures import (
     MARCHED_SAMPLES,
     PAPER_SAMPLES,
     RefinedConfig,
@@ -41,7 +32,16 @@ from methods._captures import (
     refined_sampler_choice,
     refinement_choice,
 )
-from methods._grids import GridsConfig, grid_optimiser
+from nerfloom.methods._grids import GridsConfig, grid_optimiser
+from nerfloom.rendering.losses import charbonnier
+from nerfloom.samplers.choice import (
+    COARSEST_PROPOSAL,
+    contracted_box,
+    decide_samples,
+    make_sampler,
+    samples_choices,
+)
+from nerfloom.samplers.proposal import LEARN_EVERY, half_edge
 
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""

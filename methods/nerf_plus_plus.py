@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from framework import Decision, Field, Method, Sampler, Scene
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.encoded import EncodedField
-from framework.fields.inverted import InvertedField
-from framework.rendering.background import background_renderer
-from framework.samplers.background import decide_background, foreground
-from framework.samplers.choice import contracted_box, decide_samples
-from framework.samplers.inside import make_foreground_sampler
-from framework.scene.few_images import decide_few_images
-from methods import vanilla_nerf
-from methods._grids import GridsConfig, grid_optimiser
-from methods.vanilla_nerf import OCCUPANCY_SAMPLES_PER_BATCH, OPEN_UNTIL, VanillaNeRFConfig
+from nerfloom import Decision, Field, Method, Sampler, Scene
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.inverted import InvertedField
+from nerfloom.methods import vanilla_nerf
+from nerfloom.methods._grids import GridsConfig, grid_optimiser
+from nerfloom.methods.vanilla_nerf import OCCUPANCY_SAMPLES_PER_BATCH, OPEN_UNTIL, VanillaNeRFConfig
+from nerfloom.rendering.background import background_renderer
+from nerfloom.samplers.background import decide_background, foreground
+from nerfloom.samplers.choice import contracted_box, decide_samples
+from nerfloom.samplers.inside import make_foreground_sampler
+from nerfloom.scene.few_images import decide_few_images
 
 GRID_SAMPLES_PER_BATCH = 2**16
 """Samples of a training step on hash grids, instant-ngp's."""

@@ -12,19 +12,19 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from framework import Decision, Field, Method, PixelBatch, Points, Rays, Rendered, Renderer, Sampler, Samples, Scene
-from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.encodings.hash_grid import HashGrid, HashGridConfig
-from framework.fields.appearance import Appearance
-from framework.fields.encoded import NUM_FEATURES, EncodedField
-from framework.fields.normals import NormalHead, density_normals, normal_penalties
-from framework.kernels.compositing import ray_sum
-from framework.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
-from framework.samplers.choice import batch_choice, make_sampler
-from framework.scene.few_images import FewImagesConfig, decide_few_images
-from framework.scene.reasons import LIGHT_REASONS
-from methods._captures import MARCHED_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+from nerfloom import Decision, Field, Method, PixelBatch, Points, Rays, Rendered, Renderer, Sampler, Samples, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.fields.appearance import Appearance
+from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
+from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
+from nerfloom.kernels.compositing import ray_sum
+from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
+from nerfloom.samplers.choice import batch_choice, make_sampler
+from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
+from nerfloom.scene.reasons import LIGHT_REASONS
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors where the appearance varies."""

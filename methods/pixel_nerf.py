@@ -15,7 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from framework import (
+from nerfloom import (
     ConfigError,
     DataError,
     Dataset,
@@ -32,15 +32,15 @@ from framework import (
     Scene,
     View,
 )
-from framework.base.config import Range, SourceViewsConfig
-from framework.data.pixels import composite
-from framework.data.source_views import images_of, nearest_in_direction, other_images
-from framework.data.training_images import evenly_spread
-from framework.encodings.pixel_aligned import ImageEncoder, SourceViews
-from framework.fields.pixel_aligned import PixelAlignedField
-from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
-from framework.samplers.proposal import half_edge
+from nerfloom.base.config import Range, SourceViewsConfig
+from nerfloom.data.pixels import composite
+from nerfloom.data.source_views import images_of, nearest_in_direction, other_images
+from nerfloom.data.training_images import evenly_spread
+from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
+from nerfloom.fields.pixel_aligned import PixelAlignedField
+from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
+from nerfloom.samplers.proposal import half_edge
 
 BLOCKS_AFTER = 2
 """Residual blocks after the mean over views, as in the paper."""

@@ -11,20 +11,20 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from framework import Decision, Field, Method, PixelBatch, RayModel, Rendered, Renderer, Sampler, Scene
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range
-from framework.base.decisions import Choice, fill
-from framework.base.device import HostValue
-from framework.base.optimised import Optimised
-from framework.base.step_kind import StepKind
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.tensor import CP, VM, TensorField
-from framework.geometry.bounds import box_around_cells, cubic_vertices
-from framework.kernels.memory import require
-from framework.kernels.planes import PlanesLayout
-from framework.samplers.base import SkipsCells
-from framework.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
-from framework.scene.few_images import FewImagesConfig, decide_few_images
+from nerfloom import Decision, Field, Method, PixelBatch, RayModel, Rendered, Renderer, Sampler, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.device import HostValue
+from nerfloom.base.optimised import Optimised
+from nerfloom.base.step_kind import StepKind
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.tensor import CP, VM, TensorField
+from nerfloom.geometry.bounds import box_around_cells, cubic_vertices
+from nerfloom.kernels.memory import require
+from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.samplers.base import SkipsCells
+from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
+from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 
 BLIND_STEPS = 128
 """Steps before the occupancy grid is updated: the field starts nearly empty, and would mark every cell as empty."""

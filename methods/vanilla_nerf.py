@@ -14,16 +14,16 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from framework import Decision, Method, RayModel, Sampler, Scene
-from framework.base.config import Range
-from framework.base.optimised import Optimised
-from framework.fields.nerf import NeRFField
-from framework.kernels.frequency import MAX_FREQUENCIES
-from framework.rendering.background import background_renderer
-from framework.samplers.background import BackgroundConfig, decide_background, foreground
-from framework.samplers.choice import HierarchicalConfig, contracted_box, decide_samples
-from framework.samplers.inside import make_foreground_sampler
-from framework.scene.few_images import FewImagesConfig, decide_few_images
+from nerfloom import Decision, Method, RayModel, Sampler, Scene
+from nerfloom.base.config import Range
+from nerfloom.base.optimised import Optimised
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.rendering.background import background_renderer
+from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
+from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples
+from nerfloom.samplers.inside import make_foreground_sampler
+from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""

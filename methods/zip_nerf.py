@@ -15,20 +15,20 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from framework import ConfigError, Decision, Field, Method, Rays, Rendered, Renderer, Sampler, Scene
-from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice
-from framework.base.optimised import Optimised
-from framework.encodings.hash_grid import HashGrid, HashGridConfig
-from framework.encodings.multisampled import MultisampledHashGrid
-from framework.fields.appearance import AFFINE, Appearance, exposed
-from framework.fields.encoded import DensityField
-from framework.fields.multisampled import MultisampledDensity, MultisampledField
-from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.samplers.choice import decide_samples, make_sampler
-from framework.samplers.proposal import ProposalSampler
-from framework.scene.reasons import LIGHT_REASONS
-from methods._captures import PAPER_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+from nerfloom import ConfigError, Decision, Field, Method, Rays, Rendered, Renderer, Sampler, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.decisions import Choice
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.multisampled import MultisampledHashGrid
+from nerfloom.fields.appearance import AFFINE, Appearance, exposed
+from nerfloom.fields.encoded import DensityField
+from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
+from nerfloom.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+from nerfloom.samplers.choice import decide_samples, make_sampler
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.scene.reasons import LIGHT_REASONS
 
 SAMPLES_PER_BATCH = 2**14
 """Samples a training step with an occupancy grid over a box."""

@@ -6,8 +6,8 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import ParsedScene
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import ParsedScene
 
 
 def noise(width: int, height: int, seed: int, channels: int = 3) -> np.ndarray:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import Dataset
-from framework.data.scene import Scene
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.scene import Scene
 
 Capsule = tuple[tuple[float, float, float], tuple[float, float, float], float]
 """Both ends of the axis, and the radius: of a ball the ends are one."""

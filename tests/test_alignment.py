@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.geometry.alignment import align, align_cameras, pose_errors
+from nerfloom.base.errors import DataError
+from nerfloom.geometry.alignment import align, align_cameras, pose_errors
 
 
 def some_poses(count: int) -> torch.Tensor:

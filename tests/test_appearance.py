@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework.data.image_files import read_image
-from framework.data.light import APPEARANCE_STOPS, GRID, light_of, light_spread
+from nerfloom.data.image_files import read_image
+from nerfloom.data.light import APPEARANCE_STOPS, GRID, light_of, light_spread
 
 
 def scene(seed: int, shape: tuple[int, int] = (90, 120)) -> np.ndarray:

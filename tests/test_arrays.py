@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.base.arrays import read_array
+from nerfloom.base.arrays import read_array
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

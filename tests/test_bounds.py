@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from framework.geometry.bounds import contract, intersect_box, to_unit_box
+from nerfloom.geometry.bounds import contract, intersect_box, to_unit_box
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 1.0, 3.0]], dtype=torch.float64)
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from framework.base.config import TrainConfig
-from framework.base.device import machine_memory
-from framework.base.errors import ConfigError, DataError
-from framework.data.dataset import Dataset, ParsedScene, load_dataset, read_image
-from framework.data.pixel_cache import MAGIC, PixelMemory, unpack
-from framework.data.pixel_store import FileStore
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.device import machine_memory
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.data.dataset import Dataset, ParsedScene, load_dataset, read_image
+from nerfloom.data.pixel_cache import MAGIC, PixelMemory, unpack
+from nerfloom.data.pixel_store import FileStore
 from tests.forked import Forks, Program
 from tests.images import noise, parsed, write_noise
 
@@ -60,7 +60,7 @@ def test_a_later_run_decodes_nothing_and_says_so(
 ) -> None:
     first = cached(scene, folder)
     assert "decoding them once into" in capsys.readouterr().err.replace("\n", " ")
-    monkeypatch.setattr("framework.data.decoding.read_image", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("nerfloom.data.decoding.read_image", lambda *_: pytest.fail("decoded again"))
     second = cached(scene, folder)
     assert "that an earlier run decoded into" in capsys.readouterr().err.replace("\n", " ")
     assert torch.equal(first.pixels, second.pixels)
@@ -141,9 +141,9 @@ def test_an_error_leaves_no_file(scene: ParsedScene, folder: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from framework.data.dataset import load_dataset
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_store import FileStore
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_store import FileStore
 from tests.images import parsed
 if sys.argv[3] == "killed":
     FileStore.finish = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
@@ -213,11 +213,11 @@ MEASURE = """
 import sys, threading
 from pathlib import Path
 import torch
-from framework.data.dataset import load_dataset
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_stream import PixelStream
-from framework.data.pixels import draw_batch
-from framework.base.device import seed_step
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_stream import PixelStream
+from nerfloom.data.pixels import draw_batch
+from nerfloom.base.device import seed_step
 from tests.images import parsed
 
 def status(name):

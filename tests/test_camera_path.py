@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework import DataError
-from framework.cameras.camera_path import CameraPath, Keyframe, read_camera_path, read_transforms, write_camera_path
-from framework.cameras.poses import Placement
+from nerfloom import DataError
+from nerfloom.cameras.camera_path import CameraPath, Keyframe, read_camera_path, read_transforms, write_camera_path
+from nerfloom.cameras.poses import Placement
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.dataparsers.captures import poses as captured_poses
 from tests.dataparsers.captures import to_scene, write_capture
 

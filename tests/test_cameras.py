@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras, check_pose, subpixels
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras, check_pose, subpixels
 from tests.kernels.compiled import needs_kernels
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from framework import (
+from nerfloom import (
     ConfigError,
     Field,
     LearnsMotion,
@@ -38,17 +38,17 @@ from framework import (
     View,
     VolumeRenderer,
 )
-from framework.base.optimised import ParameterGroup
-from framework.base.registry import load_method, registered
-from framework.kernels.frequency import frequency_encoding
-from framework.samplers.occupancy import OccupancySampler
-from framework.tools.testing import assert_method, check_method
-from framework.tools.testing.check import CHECKS, Check
+from nerfloom.base.optimised import ParameterGroup
+from nerfloom.base.registry import load_method, registered
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.tools.testing import assert_method, check_method
+from nerfloom.tools.testing.check import CHECKS, Check
 from tests.interfaces.methods.discs import DiscConfig, Discs
 from tests.training.helpers import TINY
 
 ROOT = Path(__file__).parents[1]
-BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
+BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
 SLOW = ("dnerf",)
 
 
@@ -379,7 +379,7 @@ EITHER: list[tuple[str, type, str]] = [
     ("view", BottomlessPicture, "depth of a picture holds a value that is not finite"),
     ("view", LosesEveryRow, r"rgb of a picture has shape \(24, 24, 3\), not \(8, 8, 3\)"),
     ("view", StaysInEvaluation, "render_view leaves the model in evaluation mode"),
-    ("loss", NamelessLoss, "the loss is Tensor; return a framework.Loss"),
+    ("loss", NamelessLoss, "the loss is Tensor; return a nerfloom.Loss"),
     ("loss", NoTerms, "its terms are a dictionary of scalars"),
     ("loss", LossOfEachPixel, r"the loss 'rgb' is \((128|24, 24),?\), not a scalar tensor"),
     ("loss", Detached, "no loss has a gradient"),
@@ -517,8 +517,8 @@ class Tinted(TinyField):
 OF_RAYS: list[tuple[str, type, Any, str]] = [
     ("config", RayModel, Unwritable(), "'weights'|parameterized generic"),
     ("config", RayModel, Undecorated(), r"write @dataclass\(frozen=True\)"),
-    ("config", RayModel, Foreign(), "does not derive from framework.TrainConfig"),
-    ("build", NotDerived, TinyConfig(), "NotDerived'> does not derive from framework.Model"),
+    ("config", RayModel, Foreign(), "does not derive from nerfloom.TrainConfig"),
+    ("build", NotDerived, TinyConfig(), "NotDerived'> does not derive from nerfloom.Model"),
     ("render", ColumnOfDepths, TinyConfig(), r"in evaluation, depth of 128 rays has shape \(128, 1\), not \(128,\)"),
     ("render", InfiniteDepth, TinyConfig(), "median_depth of 128 rays holds a value that is not finite"),
     ("render", InDoubles, TinyConfig(), "in evaluation, rgb of 128 rays is torch.float64; make it torch.float32"),
@@ -588,7 +588,7 @@ def test_each_fault_is_found_by_its_check(
     check: str, method: Method, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And by none that it needs; the others, which sound methods pass, take most of the time."""
-    monkeypatch.setattr("framework.tools.testing.check.CHECKS", with_what_it_needs(check))
+    monkeypatch.setattr("nerfloom.tools.testing.check.CHECKS", with_what_it_needs(check))
     assert_found(method, check, words)
 
 

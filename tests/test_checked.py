@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.checked import checked
-from framework.data.scene import Scene
-from framework.training.trainer import State
+from nerfloom.base.checked import checked
+from nerfloom.data.scene import Scene
+from nerfloom.training.trainer import State
 
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 POSES = torch.eye(4)[:3].repeat(5, 1, 1)

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras
-from framework.cameras.colmap import PARAMETERS, from_colmap
-from framework.data.coverage import unreachable_pixels
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.colmap import PARAMETERS, from_colmap
+from nerfloom.data.coverage import unreachable_pixels
 
 WIDTH, HEIGHT = 1600, 1064
 REAL: dict[str, list[float]] = {

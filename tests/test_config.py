@@ -11,10 +11,10 @@ import pytest
 import tyro
 import yaml
 
-from framework.base.config import RayConfig, TrainConfig, from_plain, to_plain
-from framework.base.errors import ConfigError
-from framework.base.registry import load_method, registered
-from framework.training.run import read_run
+from nerfloom.base.config import RayConfig, TrainConfig, from_plain, to_plain
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import load_method, registered
+from nerfloom.training.run import read_run
 
 
 @pytest.mark.parametrize("method", ["instant-ngp", "vanilla-nerf"])

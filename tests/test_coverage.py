@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras, join_cameras
-from framework.data.coverage import pixels_with_rays, unreachable_pixels
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras, join_cameras
+from nerfloom.data.coverage import pixels_with_rays, unreachable_pixels
 from tests.test_lenses import ALL, FISHEYE, GOPRO, HEIGHT, WIDTH, cameras
 
 BARREL = [-0.5] + [0.0] * 8

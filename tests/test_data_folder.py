@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import DataError
-from framework.cli.process_data import USAGE
-from framework.data.data_folder import find_data, processed_folder
+from nerfloom.base.errors import DataError
+from nerfloom.cli.process_data import USAGE
+from nerfloom.data.data_folder import find_data, processed_folder
 
 
 @pytest.mark.parametrize("part", ["transforms_train.json", "train", "."])

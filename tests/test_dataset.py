@@ -11,13 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
-from dataparsers.blender import Blender
-from framework.base.errors import DataError
-from framework.data.dataset import assemble, existing_files, image_size, load_dataset, read_image
-from framework.data.decoding import from_arrays
-from framework.data.masks import read_mask
-from framework.data.pixels import background_colors, composite
-from framework.tools.processing.images import prepare
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import assemble, existing_files, image_size, load_dataset, read_image
+from nerfloom.data.decoding import from_arrays
+from nerfloom.data.masks import read_mask
+from nerfloom.data.pixels import background_colors, composite
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.tools.processing.images import prepare
 from tests.images import noise, parsed, write_mask
 
 

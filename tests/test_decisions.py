@@ -6,12 +6,12 @@ from typing import Any, Literal
 
 import pytest
 
-from framework.base.config import AUTO, Auto, TrainConfig
-from framework.base.decisions import Choice, Decision, fill, is_open, left_open
-from framework.base.errors import ConfigError
-from framework.base.registry import load_method, registered
-from framework.method import nothing_to_decide
-from framework.samplers.choice import SamplingConfig
+from nerfloom.base.config import AUTO, Auto, TrainConfig
+from nerfloom.base.decisions import Choice, Decision, fill, is_open, left_open
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import load_method, registered
+from nerfloom.method import nothing_to_decide
+from nerfloom.samplers.choice import SamplingConfig
 from tests.truth.test_training import SCENE
 
 

@@ -11,13 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import load_dataset
-from framework.data.depths import ray_distances, read_depth, read_depths
-from framework.data.pixels import gather_batch
-from framework.geometry.rays import Samples
-from framework.rendering.losses import depth_error
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.depths import ray_distances, read_depth, read_depths
+from nerfloom.data.pixels import gather_batch
+from nerfloom.geometry.rays import Samples
+from nerfloom.rendering.losses import depth_error
 from tests.training.helpers import tiny_run, tiny_trainer
 
 
@@ -51,7 +51,7 @@ def test_a_picture_far_larger_than_its_photograph_is_refused_by_its_head(
 ) -> None:
     iio.imwrite(tmp_path / "d.png", np.zeros((33, 32), np.uint16))
     assert read_depth(tmp_path / "d.png", 4, 5).shape == (5, 4)
-    monkeypatch.setattr("framework.data.depths._values", lambda path: pytest.fail("its pixels were read"))
+    monkeypatch.setattr("nerfloom.data.depths._values", lambda path: pytest.fail("its pixels were read"))
     with pytest.raises(DataError, match=r"d\.png has 32 x 33 pixels, and its image 4 x 4; it may have 64 times"):
         read_depth(tmp_path / "d.png", 4, 4)
 
@@ -131,7 +131,7 @@ def ball_depths(folder: Path, parsed) -> tuple[Path, ...]:
 
 @pytest.mark.parametrize("places", [1, 4])
 def test_depths_reach_batches_as_distances(places: int, shared_tiny: Path, tmp_path: Path) -> None:
-    from framework.cameras.cameras import subpixels
+    from nerfloom.cameras.cameras import subpixels
 
     run = tiny_run("nerfacto", shared_tiny, tmp_path)
     parsed = run.parser.parse(shared_tiny, "train")
@@ -153,7 +153,7 @@ def test_depth_teaches_nerfacto_where_the_surface_is(shared_tiny: Path, tmp_path
     still = tiny_trainer("nerfacto", shared_tiny, tmp_path / "still")
     parsed = still.run.parser.parse(shared_tiny, "train")
     parsed = dataclasses.replace(parsed, depth_paths=ball_depths(tmp_path, parsed))
-    from framework.training.trainer import Trainer
+    from nerfloom.training.trainer import Trainer
 
     errors = []
     for mult in (0.0, None):

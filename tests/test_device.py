@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from framework.base.device import choose_device, has_bfloat16, peak_memory, stream_seed
-from framework.base.errors import ConfigError
-from framework.base.machine_config import MOST_THREADS, MachineConfig
+from nerfloom.base.device import choose_device, has_bfloat16, peak_memory, stream_seed
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.machine_config import MOST_THREADS, MachineConfig
 
 
 def test_every_step_has_a_stream_of_its_own() -> None:

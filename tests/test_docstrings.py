@@ -17,7 +17,7 @@ import pytest
 from torch import nn
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("framework", "methods", "dataparsers", "nerfloom")
+FOLDERS = ("framework", "methods", "dataparsers")
 FILES = sorted(file.relative_to(ROOT).as_posix() for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
 
 FRAGMENTS = re.compile(

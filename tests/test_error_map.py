@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import Dataset
-from framework.data.error_map import EVENLY, ErrorMap
-from framework.data.pixels import draw_batch
-from framework.data.scene import Scene
-from framework.rendering.losses import mean_squared_error
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.error_map import EVENLY, ErrorMap
+from nerfloom.data.pixels import draw_batch
+from nerfloom.data.scene import Scene
+from nerfloom.rendering.losses import mean_squared_error
 
 
 @pytest.fixture(scope="module")

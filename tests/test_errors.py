@@ -4,8 +4,8 @@ import pickle
 
 import pytest
 
-from framework.base.console import say
-from framework.base.errors import LONGEST_MESSAGE, DataError, printable, shown
+from nerfloom.base.console import say
+from nerfloom.base.errors import LONGEST_MESSAGE, DataError, printable, shown
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from framework.base.evenly_spaced import evenly_spaced
+from nerfloom.base.evenly_spaced import evenly_spaced
 
 
 @pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 5), (5, 5), (5, 9), (7, 3), (10, 4), (2**31 + 12, 7)])

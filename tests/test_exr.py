@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.base.errors import DataError
-from framework.data.depths import read_depth
+from nerfloom.base.errors import DataError
+from nerfloom.data.depths import read_depth
 from tests.exr_files import NONE, PIZ, RLE, ZIP, ZIPS, write_exr
 
 HEIGHT, WIDTH = 37, 29

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from framework.base import extras
-from framework.tools.comparison.plots import MISSING
+from nerfloom.base import extras
+from nerfloom.tools.comparison.plots import MISSING
 
 ROOT = Path(__file__).parents[1]
 

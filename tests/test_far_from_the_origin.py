@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.colmap_model import read_model
-from dataparsers.nerfstudio import Nerfstudio
-from framework import ParsedScene
-from framework.base.registry import load_method
-from framework.cameras.camera_path import read_transforms
-from framework.cameras.poses import Placement
-from framework.data.dataset import load_dataset
-from framework.data.offsets import offset_file, read_offset
-from framework.data.ply import read_header, read_points, write_points
-from framework.export.cameras import all_cameras, camera_list, posed_files
-from framework.export.colmap_text import write_model
-from framework.export.mesh import Mesh
-from framework.export.mesh_files import decimals, write_mesh
-from framework.export.transforms import write_transforms as write_cameras
-from framework.training.run import TRANSFORMS, Run, write_transforms
+from nerfloom import ParsedScene
+from nerfloom.base.registry import load_method
+from nerfloom.cameras.camera_path import read_transforms
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.offsets import offset_file, read_offset
+from nerfloom.data.ply import read_header, read_points, write_points
+from nerfloom.dataparsers.colmap_model import read_model
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.export.cameras import all_cameras, camera_list, posed_files
+from nerfloom.export.colmap_text import write_model
+from nerfloom.export.mesh import Mesh
+from nerfloom.export.mesh_files import decimals, write_mesh
+from nerfloom.export.transforms import write_transforms as write_cameras
+from nerfloom.training.run import TRANSFORMS, Run, write_transforms
 from tests.dataparsers.captures import moved, poses, write_capture
 
 UTM = np.array([512345.678, 5403210.987, 432.1])

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.errors import ConfigError
-from framework.base.registry import load_method
-from framework.scene.few_images import (
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import load_method
+from nerfloom.scene.few_images import (
     FEW,
     FEW_WITH_ALPHA,
     UNSEEN_START,
@@ -18,7 +18,7 @@ from framework.scene.few_images import (
     FewImagesConfig,
     unseen_weight,
 )
-from framework.training.trainer import Trainer
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 from tests.truth.test_training import SCENE
 

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from framework.base.config import RayConfig
-from framework.base.device import to_float64
-from framework.base.registry import load_method
-from framework.kernels import native
-from framework.kernels.adam import sparse_adam_reference
+from nerfloom.base.config import RayConfig
+from nerfloom.base.device import to_float64
+from nerfloom.base.registry import load_method
+from nerfloom.kernels import native
+from nerfloom.kernels.adam import sparse_adam_reference
 from tests.training.helpers import TINY, tiny_trainer
 
 
@@ -47,7 +47,7 @@ def taken_away(values: Tensor) -> Tensor:
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
     monkeypatch.setattr(native, "available", lambda: False)
-    for name in ("framework.data.error_map", "framework.evaluation.metrics", "framework.kernels.step_functions"):
+    for name in ("nerfloom.data.error_map", "nerfloom.evaluation.metrics", "nerfloom.kernels.step_functions"):
         monkeypatch.setattr(importlib.import_module(name), "to_float64", taken_away)
 
 

@@ -22,6 +22,6 @@ def test_what_they_say_and_how_they_end(forks: Forks, monkeypatch: pytest.Monkey
 
 
 def test_they_know_nothing_of_each_other_but_torch(forks: Forks) -> None:
-    code = "import sys; print('torch' in sys.modules, 'framework' in sys.modules, 'tests.conftest' in sys.modules)"
-    assert forks.run("import framework.kernels.native").returncode == 0
+    code = "import sys; print('torch' in sys.modules, 'nerfloom.model' in sys.modules, 'tests.conftest' in sys.modules)"
+    assert forks.run("import nerfloom.kernels.native").returncode == 0
     assert forks.run(code).stdout.split() == ["True", "False", "False"]

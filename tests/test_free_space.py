@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import load_dataset
-from framework.data.free_space import ALONE, CLEAR_SHARE, STEPS, before_points, clear_distances, distances_alone
-from framework.data.sources import PixelSource, Request, make_source
-from framework.data.sparse_depth import SparseDepth
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import weights_and_transmittance
-from framework.rendering.losses import WRONG, matter_before
-from framework.training.trainer import Trainer
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.free_space import ALONE, CLEAR_SHARE, STEPS, before_points, clear_distances, distances_alone
+from nerfloom.data.sources import PixelSource, Request, make_source
+from nerfloom.data.sparse_depth import SparseDepth
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import weights_and_transmittance
+from nerfloom.rendering.losses import WRONG, matter_before
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run
 
 

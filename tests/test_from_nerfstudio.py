@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.from_nerfstudio import (
+from nerfloom.base.from_nerfstudio import (
     CAMERA_SETTINGS,
     FORMATS,
     KINDS,
@@ -18,11 +18,11 @@ from framework.base.from_nerfstudio import (
     format_answer,
     taken,
 )
-from framework.base.registry import load_dataparser, load_method, registered
-from framework.cli.export import KINDS as EXPORTS
-from framework.cli.process_data import KINDS as INPUTS
-from framework.cli.render import PATHS
-from framework.cli.train import _flag_names, main, run_of
+from nerfloom.base.registry import load_dataparser, load_method, registered
+from nerfloom.cli.export import KINDS as EXPORTS
+from nerfloom.cli.process_data import KINDS as INPUTS
+from nerfloom.cli.render import PATHS
+from nerfloom.cli.train import _flag_names, main, run_of
 from tests.conftest import Refused
 
 

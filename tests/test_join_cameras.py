@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import join_cameras
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import join_cameras
 from tests.test_lenses import FISHEYE, GOPRO, cameras
 
 

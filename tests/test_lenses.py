@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras, subpixels
-from framework.geometry.lenses import LENSES, Distortion, distort, panorama, undistort, unproject
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.geometry.lenses import LENSES, Distortion, distort, panorama, undistort, unproject
 from tests.kernels.compiled import needs_kernels
 
 GOPRO = [-0.23, 0.04, 1.2e-3, -8e-4, 6e-3, 0.02, -0.01, 1e-3, 5e-4]

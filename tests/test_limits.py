@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from framework.geometry.bounds import contract
-from framework.geometry.limits import at_least, between
-from framework.kernels.math import safe_normalize
-from framework.kernels.spacing import to_disparity
+from nerfloom.geometry.bounds import contract
+from nerfloom.geometry.limits import at_least, between
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.spacing import to_disparity
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])

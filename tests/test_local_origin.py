@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.data.offsets import offset_file, read_offset, write_offset
-from framework.geometry.local_origin import local_origin, rounding
+from nerfloom.base.errors import DataError
+from nerfloom.data.offsets import offset_file, read_offset, write_offset
+from nerfloom.geometry.local_origin import local_origin, rounding
 
 UTM = torch.tensor([512345.678, 5403210.987, 432.1], dtype=torch.float64)
 """A place on Earth in metres."""

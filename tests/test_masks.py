@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from framework.base.errors import DataError
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.masks import read_mask
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_set import PixelSet
-from framework.data.pixels import composite, draw_batch
-from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.evaluation.metrics import psnr, ssim
-from framework.scene.profile import SceneProfile
-from framework.scene.silhouettes import Silhouettes
-from framework.training.trainer import Trainer
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.masks import read_mask
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels import composite, draw_batch
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.metrics import psnr, ssim
+from nerfloom.scene.profile import SceneProfile
+from nerfloom.scene.silhouettes import Silhouettes
+from nerfloom.training.trainer import Trainer
 from tests.images import parsed, write_mask, write_noise
 from tests.training.helpers import tiny_run, tiny_trainer
 

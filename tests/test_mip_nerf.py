@@ -6,20 +6,20 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.machine_config import MachineConfig
-from framework.data.scene import Scene
-from framework.fields.integrated import IntegratedDensity, IntegratedField
-from framework.fields.sized import SizedDensity, SizedField
-from framework.ray_model import RayModel
-from framework.rendering.losses import charbonnier, mean_squared_error, normalised_distortion
-from framework.samplers.hierarchical import HierarchicalSampler
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.proposal import ProposalSampler
-from framework.tools.stress.scenes import ball_views
-from framework.tools.testing import check_method
-from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
-from framework.tools.testing.subject import Learner
-from methods import mip_nerf, mip_nerf_360
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.data.scene import Scene
+from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
+from nerfloom.fields.sized import SizedDensity, SizedField
+from nerfloom.methods import mip_nerf, mip_nerf_360
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.losses import charbonnier, mean_squared_error, normalised_distortion
+from nerfloom.samplers.hierarchical import HierarchicalSampler
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.tools.stress.scenes import ball_views
+from nerfloom.tools.testing import check_method
+from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
+from nerfloom.tools.testing.subject import Learner
 from tests.training.helpers import TINY
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

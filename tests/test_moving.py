@@ -7,16 +7,16 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.registry import load_method
-from framework.cameras.view import View
-from framework.data.pixels import composite
-from framework.data.scene import Scene
-from framework.fields.deformed import DeformedField
-from framework.fields.nerf import NeRFField
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.samplers.proposal import ProposalSampler
-from framework.training.trainer import Trainer
+from nerfloom.base.registry import load_method
+from nerfloom.cameras.view import View
+from nerfloom.data.pixels import composite
+from nerfloom.data.scene import Scene
+from nerfloom.fields.deformed import DeformedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {

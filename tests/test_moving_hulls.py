@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.registry import load_method
-from framework.data.travel import Travel
-from framework.geometry.points import Points
-from framework.samplers.occupancy import OccupancySampler
-from framework.scene.moving_hulls import moving_box, moving_hulls
-from framework.scene.silhouettes import Silhouettes
-from framework.scene.speed import travel_of
-from framework.training.preparation import decided, skip_by_silhouettes
-from framework.training.trainer import Trainer
+from nerfloom.base.registry import load_method
+from nerfloom.data.travel import Travel
+from nerfloom.geometry.points import Points
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.scene.moving_hulls import moving_box, moving_hulls
+from nerfloom.scene.silhouettes import Silhouettes
+from nerfloom.scene.speed import travel_of
+from nerfloom.training.preparation import decided, skip_by_silhouettes
+from nerfloom.training.trainer import Trainer
 from tests.moving_bodies import BOX, Motion, jump, lost, photographed, swinging_limb, thrown_ball
 from tests.training.helpers import chosen, tiny_run
 

@@ -6,16 +6,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.bounds import contract, contraction_scale
-from framework.geometry.multisamples import (
+from nerfloom.geometry.bounds import contract, contraction_scale
+from nerfloom.geometry.multisamples import (
     NUM_MULTISAMPLES,
     Pattern,
     fixed_pattern,
     hashed_pattern,
     multisamples,
 )
-from framework.geometry.points import Frustums, conical_frustums, frames, sample_points
-from framework.geometry.rays import Rays, Samples
+from nerfloom.geometry.points import Frustums, conical_frustums, frames, sample_points
+from nerfloom.geometry.rays import Rays, Samples
 
 F64 = torch.float64
 ENDS = torch.tensor([[0.0, 1.0], [0.0, 1e-3], [0.5, 0.75], [2.0, 6.0], [100.0, 100.01], [1e4, 3e4]], dtype=F64)

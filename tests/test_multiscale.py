@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from framework.base.errors import DataError
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixels import gather_batch
-from framework.data.sources import PixelSource, Request
-from framework.evaluation.evaluator import Evaluation, evaluate
-from framework.scene.silhouettes import Silhouettes
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixels import gather_batch
+from nerfloom.data.sources import PixelSource, Request
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.evaluation.evaluator import Evaluation, evaluate
+from nerfloom.scene.silhouettes import Silhouettes
 from tests.training.helpers import tiny_trainer
 
 SIZES = (20, 10, 5, 2)

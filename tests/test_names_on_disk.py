@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.data.names_on_disk import files_below, match_names, nearest_on_disk, on_disk
+from nerfloom.data.names_on_disk import files_below, match_names, nearest_on_disk, on_disk
 
 
 def make(folder: Path, *files: str) -> Path:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from framework import Cameras
-from framework.base.errors import DataError
-from framework.cameras.ndc import Ndc, NdcCameras, find_ndc, middle_frame, ndc_box
+from nerfloom import Cameras
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.ndc import Ndc, NdcCameras, find_ndc, middle_frame, ndc_box
 
 NEARS = torch.full((5,), 2.0, dtype=torch.float64)
 

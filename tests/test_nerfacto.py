@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.machine_config import MachineConfig
-from framework.base.registry import load_method
-from framework.data.scene import Scene
-from framework.evaluation.appearance import appearance_of, fit_appearance
-from framework.evaluation.evaluator import evaluate
-from framework.fields.appearance import Appearance
-from framework.training.trainer import Trainer
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.registry import load_method
+from nerfloom.data.scene import Scene
+from nerfloom.evaluation.appearance import appearance_of, fit_appearance
+from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.fields.appearance import Appearance
+from nerfloom.training.trainer import Trainer
 from tests.conftest import EditJson
 from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer
 
@@ -99,7 +99,7 @@ def test_gradients_fade_towards_the_camera(shared_tiny: Path, tmp_path: Path) ->
     """Moving a scene to a tenth of the distance scales its gradients by a hundredth, values being the same."""
     trainer = captured(shared_tiny, tmp_path, {"unbounded": True})
     assert trainer.model.renderer.unit_length is not None
-    from framework.kernels.math import scale_gradient
+    from nerfloom.kernels.math import scale_gradient
 
     values = torch.ones(3, 2, requires_grad=True)
     out = scale_gradient(values, torch.tensor([0.01, 1.0, 0.25]))
@@ -187,7 +187,7 @@ def test_the_mean_appearance_is_what_photographs_have_in_common(
         off[share] = (shown.rgb - expected)[inside].square().mean().sqrt().item()
     print(f"off the mean photograph by {off[0.0]:.3f} without the mean vector in training, {off[0.25]:.3f} with it")
     assert off[0.25] < 0.6 * off[0.0]
-    monkeypatch.setattr("framework.evaluation.appearance.STEPS", 0)
+    monkeypatch.setattr("nerfloom.evaluation.appearance.STEPS", 0)
     model, dataset = trainer.model, trainer.train_set
     appearance = appearance_of(model)
     assert appearance is not None

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from framework.base.optimised import Optimised, parameter_groups
+from nerfloom.base.optimised import Optimised, parameter_groups
 
 
 class Part(nn.Module):

@@ -10,22 +10,22 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from dataparsers.procedural import Procedural
-from framework.base.errors import ConfigError, DataError
-from framework.base.machine_config import MachineConfig
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixels import composite
-from framework.data.source_views import images_of, nearest_in_direction, other_images
-from framework.data.sources import Request, make_source
-from framework.evaluation.evaluator import evaluate, views_to_judge
-from framework.evaluation.metrics import psnr
-from framework.model import RendersFromImages
-from framework.tools.stress.faults import spoiled_pose
-from framework.tools.testing.scenes import ball_in_a_box
-from framework.training.run import Run, create_folder
-from framework.training.trained import build_model, load_trained
-from framework.training.trainer import Trainer
-from methods.pixel_nerf import METHOD, PixelNeRF, PixelNeRFConfig
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixels import composite
+from nerfloom.data.source_views import images_of, nearest_in_direction, other_images
+from nerfloom.data.sources import Request, make_source
+from nerfloom.dataparsers.procedural import Procedural
+from nerfloom.evaluation.evaluator import evaluate, views_to_judge
+from nerfloom.evaluation.metrics import psnr
+from nerfloom.methods.pixel_nerf import METHOD, PixelNeRF, PixelNeRFConfig
+from nerfloom.model import RendersFromImages
+from nerfloom.tools.stress.faults import spoiled_pose
+from nerfloom.tools.testing.scenes import ball_in_a_box
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trained import build_model, load_trained
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY, tiny_trainer
 
 SMALL = dataclasses.replace(PixelNeRFConfig(), machine=MachineConfig(device_type="cpu"), **TINY["pixel-nerf"])
@@ -159,7 +159,7 @@ def test_what_cannot_be_rendered_says_why(many: dict[str, Dataset]) -> None:
 
 @pytest.mark.parametrize("method", ["vanilla-nerf", "instant-ngp", "gaussian-splatting"])
 def test_methods_that_learn_one_scene_refuse_several(method: str, many: dict[str, Dataset]) -> None:
-    from framework.base.registry import load_method
+    from nerfloom.base.registry import load_method
 
     with pytest.raises(ConfigError, match=f"shows 3 scenes, and {method} learns one") as raised:
         build_model(method, load_method(method).config, many["train"].scene)
@@ -213,9 +213,9 @@ def trained_on_many(folder: Path, parser: Procedural, config: PixelNeRFConfig) -
 @pytest.fixture
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     """The method by its name, also where the package was installed before it had this one."""
-    from framework.base import registry
+    from nerfloom.base import registry
 
-    monkeypatch.setenv("NERFLOOM_METHODS", "pixel-nerf=methods.pixel_nerf:METHOD")
+    monkeypatch.setenv("NERFLOOM_METHODS", "pixel-nerf=nerfloom.methods.pixel_nerf:METHOD")
     registry.registered.cache_clear()
 
 

@@ -7,15 +7,15 @@ import pytest
 import torch
 from scipy import stats
 
-from dataparsers.blender import Blender
-from framework.base.device import seed_step
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.error_map import ErrorMap
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_set import PixelSet
-from framework.data.pixel_stream import PixelStream
-from framework.data.pixels import PixelBatch, draw_batch, draw_pixels
-from framework.training.checkpoint import load_checkpoint
+from nerfloom.base.device import seed_step
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.error_map import ErrorMap
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixel_stream import PixelStream
+from nerfloom.data.pixels import PixelBatch, draw_batch, draw_pixels
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.training.checkpoint import load_checkpoint
 from tests.images import write_noise
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 

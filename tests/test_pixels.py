@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy import stats
 
-from dataparsers.blender import Blender
-from framework.cameras.cameras import subpixels
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixel_set import PixelSet
-from framework.data.pixels import composite, draw_batch, draw_from_images, gather_colors, gather_colors_reference
+from nerfloom.cameras.cameras import subpixels
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels import composite, draw_batch, draw_from_images, gather_colors, gather_colors_reference
+from nerfloom.dataparsers.blender import Blender
 from tests.kernels.compiled import needs_kernels
 
 
@@ -51,8 +51,8 @@ def test_pixels_are_drawn_evenly_and_by_the_seed(dataset: Dataset) -> None:
 
 
 def test_images_of_different_sizes_share_one_buffer() -> None:
-    from framework.cameras.cameras import Cameras
-    from framework.data.scene import Scene
+    from nerfloom.cameras.cameras import Cameras
+    from nerfloom.data.scene import Scene
 
     sizes = torch.tensor([[4, 2], [3, 5]])
     pixels = torch.cat([torch.full((8, 3), 10), torch.full((15, 3), 200)]).to(torch.uint8)

@@ -7,13 +7,13 @@ import math
 import pytest
 import torch
 
-from framework.base.device import relative_speed
-from framework.base.machine_config import MachineConfig
-from framework.base.processes import Processes
-from framework.base.registry import load_method
-from framework.data.scene import Scene
-from framework.samplers.choice import batch_choice, samples_choices
-from methods.instant_ngp import Plan, plan
+from nerfloom.base.device import relative_speed
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.processes import Processes
+from nerfloom.base.registry import load_method
+from nerfloom.data.scene import Scene
+from nerfloom.methods.instant_ngp import Plan, plan
+from nerfloom.samplers.choice import batch_choice, samples_choices
 
 SECONDS = [10 * 360 ** (step / 60) for step in range(61)]  # 10 s to 1 h
 SIZES = (200, 400, 500, 800, 1600)
@@ -87,7 +87,7 @@ def test_speed_grows_with_threads_but_less_than_they_do(monkeypatch: pytest.Monk
     for threads, (less, more) in enumerate(itertools.pairwise(speeds), 1):
         assert less < more < less * (threads + 1) / threads
     assert relative_speed(MachineConfig(device_type="cuda")) == 10
-    monkeypatch.setattr("framework.base.device.processes", lambda: dataclasses.replace(Processes(), count=2))
+    monkeypatch.setattr("nerfloom.base.device.processes", lambda: dataclasses.replace(Processes(), count=2))
     assert relative_speed(MachineConfig(device_type="cpu")) == 1
 
 
@@ -147,7 +147,7 @@ def test_samples_a_step_follow_the_time(
     method: str, seconds: float | None, threads: int, device: str, samples: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    monkeypatch.setattr("framework.samplers.choice.device_kind", lambda machine: machine.device_type)
+    monkeypatch.setattr("nerfloom.samplers.choice.device_kind", lambda machine: machine.device_type)
     declared = load_method(method)
     machine = MachineConfig(device_type=device)  # type: ignore[arg-type]
     config = dataclasses.replace(declared.config, max_seconds=seconds, machine=machine)

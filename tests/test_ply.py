@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.data.ply import read_points, write_points
+from nerfloom.base.errors import DataError
+from nerfloom.data.ply import read_points, write_points
 
 POINTS = [(1.0, 2.0, 3.0), (-0.5, 0.25, 1e3)]
 EXPECTED = torch.tensor(POINTS, dtype=torch.float64)

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.carried import carried_poses
-from framework.cameras.refinement import PoseRefinement
-from framework.geometry.alignment import align_cameras
-from framework.geometry.rays import Rays
-from framework.kernels.math import cross_matrix
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.carried import carried_poses
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.geometry.alignment import align_cameras
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.math import cross_matrix
 
 
 def some_rays() -> Rays:

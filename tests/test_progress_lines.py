@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import pytest
 from rich.console import Console
 
-from framework.base import console
-from framework.base.meter import Meter, time_text
+from nerfloom.base import console
+from nerfloom.base.meter import Meter, time_text
 
 
 class Clock:

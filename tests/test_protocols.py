@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import nn
 
-import framework
-from framework.base.optimised import DefersGradient
-from framework.base.protocols import SeesRegistered
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.appearance import Appearance
-from framework.model import HasAppearance
-from framework.samplers.base import SkipsCells, StopsEarly
-from framework.samplers.occupancy import OccupancySampler
+import nerfloom
+from nerfloom.base.optimised import DefersGradient
+from nerfloom.base.protocols import SeesRegistered
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.appearance import Appearance
+from nerfloom.model import HasAppearance
+from nerfloom.samplers.base import SkipsCells, StopsEarly
+from nerfloom.samplers.occupancy import OccupancySampler
 
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 WITH_ATTRIBUTES = (SkipsCells, StopsEarly, HasAppearance, DefersGradient)
@@ -64,11 +64,11 @@ def test_what_lacks_one_is_none_of_the_kind() -> None:
 def test_every_protocol_with_attributes_sees_what_is_registered() -> None:
     """A new one that does not would be blind from Python 3.12 on."""
     kinds = {}
-    for module in pkgutil.walk_packages(framework.__path__, "framework."):
+    for module in pkgutil.walk_packages(nerfloom.__path__, "nerfloom."):
         if ".templates" in module.name or "triton_kernels" in module.name or ".integrations" in module.name:
             continue
         for value in vars(importlib.import_module(module.name)).values():
-            if getattr(value, "_is_runtime_protocol", False) and str(value.__module__).startswith("framework."):
+            if getattr(value, "_is_runtime_protocol", False) and str(value.__module__).startswith("nerfloom."):
                 kinds[value.__qualname__] = value
     annotated = {name for name, kind in kinds.items() if any(map(inspect.get_annotations, kind.__mro__))}
     assert annotated == {kind.__qualname__ for kind in WITH_ATTRIBUTES}

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from dataparsers.procedural import Procedural
-from framework.base.registry import load_method
-from framework.data.dataset import DataParser
-from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.training.datasets import load_split
-from framework.training.run import Run, create_folder
-from framework.training.trainer import Trainer
+from nerfloom.base.registry import load_method
+from nerfloom.data.dataset import DataParser
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.dataparsers.procedural import Procedural
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 
 pytestmark = pytest.mark.slow
 

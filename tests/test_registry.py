@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.base import registry
-from framework.base.elsewhere import ELSEWHERE
-from framework.base.errors import ConfigError, DataError
-from framework.data.data_folder import find_data
+from nerfloom.base import registry
+from nerfloom.base.elsewhere import ELSEWHERE
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.data.data_folder import find_data
 
 BUILT_IN = {
     "dnerf",
@@ -37,16 +37,16 @@ def test_the_built_in_methods_are_registered_like_anybodys() -> None:
 
 
 def test_summaries_are_the_modules_first_lines() -> None:
-    import methods.instant_ngp
+    import nerfloom.methods.instant_ngp
 
-    assert methods.instant_ngp.__doc__ is not None
+    assert nerfloom.methods.instant_ngp.__doc__ is not None
     entry = registry.registered("methods")["instant-ngp"]
-    assert registry.summary(entry) == methods.instant_ngp.__doc__.split("\n")[0]
+    assert registry.summary(entry) == nerfloom.methods.instant_ngp.__doc__.split("\n")[0]
 
 
 def test_listing_imports_neither_torch_nor_methods() -> None:
     code = (
-        "import sys; from framework.cli.train import _overview; text = _overview(); "
+        "import sys; from nerfloom.cli.train import _overview; text = _overview(); "
         "assert 'instant-ngp' in text; print([m for m in ('torch', 'numpy', 'tyro', 'methods') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -96,7 +96,7 @@ def test_a_broken_plugin_is_named_and_the_rest_goes_on(environment: Callable[...
         ("leaving", "cannot be loaded: SystemExit: 3"),
         ("unreadable", "cannot be loaded: SyntaxError"),
         ("gone", "'no_such_module_at_all'; PYTHONPATH has to name the folder that no_such_module_at_all is in"),
-        ("wrong", "wrong_plugin:METHOD is no framework.Method"),
+        ("wrong", "wrong_plugin:METHOD is no nerfloom.Method"),
     ):
         with pytest.raises(ConfigError, match=re.escape(reason)):
             registry.load_method(name)
@@ -105,7 +105,7 @@ def test_a_broken_plugin_is_named_and_the_rest_goes_on(environment: Callable[...
 
 METHOD_FILE = '''"""A method of the environment."""
 from dataclasses import replace
-from methods.instant_ngp import METHOD as NGP
+from nerfloom.methods.instant_ngp import METHOD as NGP
 METHOD = replace(NGP, paper="none", interface={interface})
 '''
 
@@ -119,10 +119,10 @@ def test_methods_of_the_environment_and_their_interface(environment: Callable[..
     environment(modules, methods="mine = env_plugin:METHOD ,newer=newer_plugin:METHOD,older=older_plugin:METHOD,")
     assert registry.load_method("mine").paper == "none"
     assert registry.summary(registry.registered("methods")["mine"]) == "A method of the environment."
-    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 3, and this is 2; upgrade nerfloom"):
+    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 4, and this is 3; upgrade nerfloom"):
         registry.load_method("newer")
     with pytest.raises(
-        ConfigError, match=r"'older' .* plugin interface 1, and this is 2; docs/plugins\.md, .*says what to change"
+        ConfigError, match=r"'older' .* plugin interface 2, and this is 3; docs/plugins\.md, .*says what to change"
     ):
         registry.load_method("older")
 
@@ -135,7 +135,7 @@ def test_an_unreadable_variable_is_told(environment: Callable[..., Path], value:
 
 
 def test_what_the_environment_names_cannot_hide_what_is_installed(environment: Callable[..., Path]) -> None:
-    environment(methods="instant-ngp=other_module:METHOD,kplanes=methods.kplanes:METHOD")
+    environment(methods="instant-ngp=other_module:METHOD,kplanes=nerfloom.methods.kplanes:METHOD")
     both = "it is registered by both nerfloom and NERFLOOM_METHODS; uninstall or rename one of them"
     assert registry.summary(registry.registered("methods")["instant-ngp"]) == f"({both})"
     with pytest.raises(ConfigError, match=f"method 'instant-ngp' cannot be used: {both}"):
@@ -196,7 +196,7 @@ def test_what_is_said_to_be_here_is_here() -> None:
 
 
 FORMAT_FILE = '''"""A data format that looks at nothing without failing."""
-from dataparsers.procedural import Procedural
+from nerfloom.dataparsers.procedural import Procedural
 class Format(Procedural):
     @classmethod
     def recognizes(cls, path):

@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from framework.data import residence
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.error_map import ErrorMap
-from framework.data.pixel_set import PixelSet
-from framework.data.pixels import PixelBatch, draw_batch, draw_pixels
-from framework.data.residence import on_device
-from framework.data.sparse_depth import SparseDepth
+from nerfloom.data import residence
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.error_map import ErrorMap
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels import PixelBatch, draw_batch, draw_pixels
+from nerfloom.data.residence import on_device
+from nerfloom.data.sparse_depth import SparseDepth
+from nerfloom.dataparsers.blender import Blender
 
 ELSEWHERE = torch.device("meta")
 """A device that has no values, in place of a GPU."""

@@ -8,17 +8,17 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.registry import load_dataparser
-from framework.cameras.cameras import Cameras
-from framework.data.data_folder import find_data
-from framework.data.dataset import Dataset
-from framework.data.sparse_depth import SparseDepth
-from framework.geometry.bounds import nested_boxes
-from framework.geometry.rays import Rays
-from framework.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
-from framework.scene.shared_space import SharedSpace, share_cut_off, times_seen
-from framework.training.preparation import decided
-from framework.training.ray_starts import MOST_LATE, UNKNOWN, share_late
+from nerfloom.base.registry import load_dataparser
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.data_folder import find_data
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.sparse_depth import SparseDepth
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
+from nerfloom.scene.shared_space import SharedSpace, share_cut_off, times_seen
+from nerfloom.training.preparation import decided
+from nerfloom.training.ray_starts import MOST_LATE, UNKNOWN, share_late
 from tests.test_free_space import row
 from tests.training.test_graphs import small
 

@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.travel import Travel
-from framework.kernels.march import Occupancy, candidates
-from framework.kernels.silhouettes import hold_balls
-from framework.scene.moving_hulls import moving_box, moving_hulls
-from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
-from framework.scene.speed import travel_of
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.travel import Travel
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.kernels.march import Occupancy, candidates
+from nerfloom.kernels.silhouettes import hold_balls
+from nerfloom.scene.moving_hulls import moving_box, moving_hulls
+from nerfloom.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from nerfloom.scene.speed import travel_of
 from tests.conftest import write_tiny
 
 BOX = torch.tensor([[-1.2, -1.2, -1.2], [1.2, 1.2, 1.2]])

@@ -10,20 +10,20 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.config import TrainConfig, from_plain
-from framework.base.errors import ConfigError, NerfloomError
-from framework.base.machine_config import MachineConfig
-from framework.base.registry import load_method, registered
-from framework.data.scene import Scene
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.base import MLP
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.hash_grid_layout import MAX_RESOLUTION, HashGridLayout
-from framework.kernels.memory import table
-from framework.kernels.planes import PlanesLayout
-from framework.samplers.occupancy import OccupancySampler
-from framework.training.trained import build_model
+from nerfloom.base.config import TrainConfig, from_plain
+from nerfloom.base.errors import ConfigError, NerfloomError
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.registry import load_method, registered
+from nerfloom.data.scene import Scene
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.base import MLP
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.hash_grid_layout import MAX_RESOLUTION, HashGridLayout
+from nerfloom.kernels.memory import table
+from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.training.trained import build_model
 from tests.training.helpers import TINY
 
 SHARED_BY = type(load_method("instant-ngp").config)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.base.device import seed_step
-from framework.base.registry import load_method
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixel_set import PixelSet
-from framework.data.sources import PixelSource, Request, ViewSource, make_source
-from framework.data.sparse_depth import SparseDepth
+from nerfloom.base.device import seed_step
+from nerfloom.base.registry import load_method
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.sources import PixelSource, Request, ViewSource, make_source
+from nerfloom.data.sparse_depth import SparseDepth
 from tests.images import write_noise
 
 SIZES = [(20, 10), (7, 30), (16, 16)]

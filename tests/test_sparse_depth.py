@@ -7,19 +7,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.device import seed_step
-from framework.cameras.cameras import Cameras, subpixels
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixels import draw_batch, gather_batch
-from framework.data.sources import KEYPOINTS, PixelSource, Request, make_source
-from framework.data.sparse_depth import sparse_depth
-from framework.data.tracks import Sightings
-from framework.evaluation.evaluator import floaters
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import weights_and_transmittance
-from framework.rendering.losses import WRONG, distance_likelihood
-from framework.rendering.rendered import Picture
-from framework.training.trainer import Trainer
+from nerfloom.base.device import seed_step
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixels import draw_batch, gather_batch
+from nerfloom.data.sources import KEYPOINTS, PixelSource, Request, make_source
+from nerfloom.data.sparse_depth import sparse_depth
+from nerfloom.data.tracks import Sightings
+from nerfloom.evaluation.evaluator import floaters
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import weights_and_transmittance
+from nerfloom.rendering.losses import WRONG, distance_likelihood
+from nerfloom.rendering.rendered import Picture
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_run
 
 LENSES = {

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from framework.geometry.rays import Rays
-from framework.geometry.spheres import InvertedRays, distances_behind, intersect_sphere, nearest_to_centre
+from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.spheres import InvertedRays, distances_behind, intersect_sphere, nearest_to_centre
 
 UNIT = torch.tensor([0.0, 0.0, 0.0, 1.0]).double()
 MOVED = torch.tensor([0.3, -1.0, 2.0, 2.5]).double()

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.data.pixels import PixelBatch
-from framework.kernels.native import available
-from framework.kernels.traced_error import TracedError
-from framework.ray_model import RayModel
-from framework.training.trainer import Trainer
+from nerfloom.data.pixels import PixelBatch
+from nerfloom.kernels.native import available
+from nerfloom.kernels.traced_error import TracedError
+from nerfloom.ray_model import RayModel
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_trainer
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.data.tracks import DOUBTS, LARGEST_DEVIATION, Tracks, distance_deviations, doubts_about
+from nerfloom.data.tracks import DOUBTS, LARGEST_DEVIATION, Tracks, distance_deviations, doubts_about
 
 SOUND = torch.zeros(1, dtype=torch.int64)
 """No doubt about the only point."""

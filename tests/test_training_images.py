@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework.base.errors import ConfigError
-from framework.data.training_images import chosen_images, evenly_spread
-from framework.training.datasets import load_split
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.training_images import chosen_images, evenly_spread
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.training.datasets import load_split
 from tests.dataparsers.captures import write_capture
 from tests.training.helpers import tiny_run
 

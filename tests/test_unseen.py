@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.unseen import REACH, moved_rays, square_patches, unseen_patches, unseen_poses
-from framework.geometry.rays import Rays
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.unseen import REACH, moved_rays, square_patches, unseen_patches, unseen_poses
+from nerfloom.geometry.rays import Rays
 
 
 def turned(angle: float, position: tuple[float, float, float]) -> Tensor:

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from dataparsers.colmap import Colmap
-from dataparsers.record3d import Record3D
-from framework.cameras.poses import place
-from framework.cameras.upright import sideways_up
+from nerfloom.cameras.poses import place
+from nerfloom.cameras.upright import sideways_up
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.record3d import Record3D
 
 Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

@@ -8,20 +8,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.data.dataset import Dataset
-from framework.fields.appearance import affine_colors, exposed
-from framework.fields.multisampled import MultisampledField
-from framework.geometry.multisamples import Pattern
-from framework.geometry.points import Frustums, Points
-from framework.kernels import native
-from framework.kernels.kept import Waves
-from framework.kernels.multisampled_grid import multisampled_grid_reference
-from framework.kernels.multisamples import unit_multisamples_reference
-from framework.rendering.volume import VolumeRenderer
-from framework.tools.testing import check_method
-from framework.training.trainer import Trainer
-from methods.zip_nerf import METHOD, ZipNeRFConfig
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.dataset import Dataset
+from nerfloom.fields.appearance import affine_colors, exposed
+from nerfloom.fields.multisampled import MultisampledField
+from nerfloom.geometry.multisamples import Pattern
+from nerfloom.geometry.points import Frustums, Points
+from nerfloom.kernels import native
+from nerfloom.kernels.kept import Waves
+from nerfloom.kernels.multisampled_grid import multisampled_grid_reference
+from nerfloom.kernels.multisamples import unit_multisamples_reference
+from nerfloom.methods.zip_nerf import METHOD, ZipNeRFConfig
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.tools.testing import check_method
+from nerfloom.training.trainer import Trainer
 from tests.kernels.compiled import needs_kernels
 from tests.training.helpers import TINY, chosen, said_otherwise, tiny_run, tiny_trainer
 

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from torch import Tensor
 
-from dataparsers.blender import Blender
-from framework import DataError, DataParser, ParsedScene
-from framework.base.console import say, track
-from framework.base.user_cache import cache_folder
-from framework.data.dataset import Split
+from nerfloom import DataError, DataParser, ParsedScene
+from nerfloom.base.console import say, track
+from nerfloom.base.user_cache import cache_folder
+from nerfloom.data.dataset import Split
+from nerfloom.dataparsers.blender import Blender
 
 VERSION = 1
 """Version of the scene's appearance; raised whenever it changes, so that old caches are not used."""
@@ -58,7 +58,7 @@ class Procedural(DataParser):
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Return the distance (N,) from `points` (N, 3) to the nearest surface of the scene at time 0."""
-        from dataparsers.procedural.scene import signed_distance
+        from nerfloom.dataparsers.procedural.scene import signed_distance
 
         return signed_distance(points)
 
@@ -80,14 +80,14 @@ class Procedural(DataParser):
 
     def _render(self, folder: Path) -> None:
         if self.num_scenes > 1:
-            from dataparsers.procedural.many import write_scenes  # only if something must be rendered
+            from nerfloom.dataparsers.procedural.many import write_scenes  # only if something must be rendered
 
             views = self.views_per_scene
             write_scenes(
                 folder, size=self.size, num_scenes=self.num_scenes, views=views, seed=self.scene_seed, progress=track
             )
             return
-        from dataparsers.procedural.views import write_dataset
+        from nerfloom.dataparsers.procedural.views import write_dataset
 
         counts = {"train": self.num_train, "val": 8, "test": 16}
         write_dataset(folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed, progress=track)
@@ -95,7 +95,7 @@ class Procedural(DataParser):
 
 def _of_many(parsed: ParsedScene, split: Split) -> ParsedScene:
     """Return parsed images with the scenes that they show."""
-    from dataparsers.procedural.many import what_is_shown
+    from nerfloom.dataparsers.procedural.many import what_is_shown
 
     numbers, given = what_is_shown(parsed.image_paths, split)
     return replace(parsed, scene_indices=numbers, source_images=given)

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.procedural.scene import Colour, Part, Parts
-from dataparsers.procedural.shapes import Box, Shape, Sphere
-from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, complete_folder, render_view
+from nerfloom.dataparsers.procedural.scene import Colour, Part, Parts
+from nerfloom.dataparsers.procedural.shapes import Box, Shape, Sphere
+from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, complete_folder, render_view
 
 UNSEEN = {"val": 4, "test": 8}
 """Number of scenes of the splits that nothing is learnt from."""

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dataparsers.procedural.shapes import Box, Cylinder, Shape, Sphere, Torus, dot
+from nerfloom.dataparsers.procedural.shapes import Box, Cylinder, Shape, Sphere, Torus, dot
 
 Colour = tuple[float, float, float]
 """Red, green and blue."""

@@ -18,8 +18,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from dataparsers.procedural.scene import PARTS, Parts, trace_rows
-from framework.kernels.native import torch_on_one_thread
+from nerfloom.dataparsers.procedural.scene import PARTS, Parts, trace_rows
+from nerfloom.kernels.native import torch_on_one_thread
 
 CAMERA_ANGLE = 0.6911
 """Horizontal field of view, radians, as in NeRF-Synthetic."""

@@ -32,8 +32,8 @@ from PIL import Image
 from torch.nn.functional import grid_sample
 
 import nerfloom
-from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view
-from framework.kernels.math import cross_matrix
+from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view
+from nerfloom.kernels.math import cross_matrix
 
 SIZE, NUM_TRAIN, NUM_TEST = 128, 48, 6
 TILE = 200

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union
 
-from framework.base.config import LEFT_TO_DATA, TrainConfig
-from framework.cli.flag_groups import groups_of
+from nerfloom.base.config import LEFT_TO_DATA, TrainConfig
+from nerfloom.cli.flag_groups import groups_of
 
 
 def flag_tables(name: str, config: TrainConfig) -> str:

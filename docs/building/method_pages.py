@@ -12,9 +12,9 @@ from typing import Any
 
 from flags import flag_tables, help_texts
 
-from framework.base.config import LEFT_TO_DATA
-from framework.base.registry import Entry, load_method, registered
-from framework.method import Method
+from nerfloom.base.config import LEFT_TO_DATA
+from nerfloom.base.registry import Entry, load_method, registered
+from nerfloom.method import Method
 
 PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
 """What `method_pictures.py` has made."""
@@ -22,7 +22,7 @@ PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
 
 def methods() -> dict[str, Entry]:
     """Return the methods of this repository, sorted by name; plugins that are installed besides are no part of it."""
-    return {name: entry for name, entry in registered("methods").items() if entry.module.startswith("methods.")}
+    return {name: entry for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")}
 
 
 def page(name: str, text: str | None) -> str:

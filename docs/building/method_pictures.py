@@ -55,7 +55,7 @@ def train(words: list[str], folder: Path) -> None:
         "run",
     ]
     at = words.index("procedural") if "procedural" in words else len(words)
-    command = [sys.executable, "-m", "framework.cli.train", *words[:at], *hidden, *words[at:]]
+    command = [sys.executable, "-m", "nerfloom.cli.train", *words[:at], *hidden, *words[at:]]
     subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True)
 
 

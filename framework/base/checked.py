@@ -6,7 +6,7 @@ import types
 import typing
 from typing import Any, Literal, TypeVar, Union
 
-from framework.base.errors import shown
+from nerfloom.base.errors import shown
 
 T = TypeVar("T")
 

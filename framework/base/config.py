@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, Un
 
 import yaml
 
-from framework.base.errors import ConfigError, nearest, shown
-from framework.base.from_nerfstudio import config_answer
-from framework.base.machine_config import MachineConfig, ViewerConfig
+from nerfloom.base.errors import ConfigError, nearest, shown
+from nerfloom.base.from_nerfstudio import config_answer
+from nerfloom.base.machine_config import MachineConfig, ViewerConfig
 
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]

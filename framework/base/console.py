@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, Progress, TextColumn
 
-from framework.base.errors import printable
-from framework.base.meter import Meter
+from nerfloom.base.errors import printable
+from nerfloom.base.meter import Meter
 
 SECONDS_BETWEEN_LINES = 10.0
 """Seconds between lines of progress where there is no terminal."""

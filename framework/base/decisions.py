@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from framework.base.config import LEFT_TO_DATA, TrainConfig
+from nerfloom.base.config import LEFT_TO_DATA, TrainConfig
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 BY_IMAGES = ("masks", "background", "start")

@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.base.machine_config import MachineConfig
-from framework.base.processes import processes
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.processes import processes
 
 GPU_SPEED = 10.0
 """Speed of a GPU in training, relative to two threads of a CPU."""

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from framework.base.errors import ConfigError, shown
+from nerfloom.base.errors import ConfigError, shown
 
 MOST_THREADS = 1024
 """Maximum number of CPU threads that a run may ask for."""

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
-from framework.base.protocols import SeesRegistered
+from nerfloom.base.protocols import SeesRegistered
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

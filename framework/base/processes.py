@@ -18,8 +18,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from framework.base.console import console
-from framework.base.errors import ConfigError, LostProcessError
+from nerfloom.base.console import console
+from nerfloom.base.errors import ConfigError, LostProcessError
 
 PATIENCE = timedelta(days=1)
 """Maximum time to wait for another process, which may be evaluating. One that has ended is noticed at once."""

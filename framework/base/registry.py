@@ -3,10 +3,10 @@
 Built-in and third-party entries are registered in the same way, by entry points of the installed package:
 
     [project.entry-points."nerfloom.methods"]
-    my-method = "my_package.my_method:METHOD"      # a framework.Method
+    my-method = "my_package.my_method:METHOD"      # a nerfloom.Method
 
     [project.entry-points."nerfloom.dataparsers"]
-    my-format = "my_package.my_format:MyFormat"    # a framework.DataParser
+    my-format = "my_package.my_format:MyFormat"    # a nerfloom.DataParser
 
 Code that is not installed is registered by environment variables:
 
@@ -18,6 +18,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -26,19 +27,19 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.base.elsewhere import ELSEWHERE
-from framework.base.errors import ConfigError, nearest
-from framework.base.from_nerfstudio import format_answer
+from nerfloom.base.elsewhere import ELSEWHERE
+from nerfloom.base.errors import ConfigError, nearest
+from nerfloom.base.from_nerfstudio import format_answer
 
 if TYPE_CHECKING:
-    from framework.data.dataset import DataParser
-    from framework.method import Method
+    from nerfloom.data.dataset import DataParser
+    from nerfloom.method import Method
 
 Kind = Literal["methods", "dataparsers"]
-INTERFACE: dict[Kind, int] = {"methods": 2, "dataparsers": 1}
+INTERFACE: dict[Kind, int] = {"methods": 3, "dataparsers": 2}
 """Version of the interface that plugins use (docs/plugins.md). A change that breaks plugins raises it."""
-CHANGED = "docs/plugins.md, 'From interface 1 to 2', says what to change"
-"""What to tell of methods that were written for the version before."""
+CHANGED = "docs/plugins.md, 'Plugins for an older interface', says what to change"
+"""What to do about a plugin for an older version."""
 VARIABLES = {"methods": "NERFLOOM_METHODS", "dataparsers": "NERFLOOM_DATAPARSERS"}
 CALLED = {"methods": "method", "dataparsers": "data format"}
 
@@ -117,10 +118,14 @@ def summary(entry: Entry) -> str:
 
 
 def _source(module: str) -> Path | None:
-    """Return the file of a module. Only the top-level package is looked up: a full lookup would import its parents."""
-    top, *rest = module.split(".")
+    """Return the file of a module. A lookup imports parents, so it ends at the first that is not imported yet."""
+    parts = module.split(".")
+    found = 1
+    while found < len(parts) and ".".join(parts[:found]) in sys.modules:
+        found += 1
+    rest = parts[found:]
     try:
-        spec = importlib.util.find_spec(top)
+        spec = importlib.util.find_spec(".".join(parts[:found]))
     except (ImportError, ValueError):
         return None
     if spec is None:
@@ -173,7 +178,7 @@ def _load(kind: Kind, name: str) -> Any:
         if isinstance(error, ModuleNotFoundError) and error.name == top and entry.package == VARIABLES[kind]:
             reason += f"; PYTHONPATH has to name the folder that {top} is in"
         if _looks_old(error):
-            reason += f". It seems to be written for plugin interface 1, and this is {INTERFACE[kind]}: {CHANGED}"
+            reason += f". It seems to be for an older plugin interface than {INTERFACE[kind]}: {CHANGED}"
         raise ConfigError(f"{title} cannot be loaded: {reason}") from error
     interface, ours = getattr(loaded, "interface", INTERFACE[kind]), INTERFACE[kind]
     if interface != ours:
@@ -186,7 +191,7 @@ def _load(kind: Kind, name: str) -> Any:
 def _looks_old(error: BaseException) -> bool:
     """Return whether a plugin failed as one does that was written for the interface before."""
     if isinstance(error, ImportError):
-        return (error.name or "").split(".")[0] == "framework"
+        return (error.name or "").split(".")[0] in ("framework", "nerfloom")
     return isinstance(error, TypeError) and "Method.__init__()" in str(error)
 
 
@@ -200,12 +205,12 @@ def load_method(name: str) -> Method:
         ConfigError: for an unknown name, or if its module cannot be imported or holds no method of this plugin
             interface.
     """
-    from framework.method import Method
+    from nerfloom.method import Method
 
     method = _load("methods", name)
     if not isinstance(method, Method):
         entry = entry_of("methods", name)
-        raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is no framework.Method")
+        raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is no nerfloom.Method")
     return method
 
 
@@ -219,10 +224,10 @@ def load_dataparser(name: str) -> type[DataParser]:
         ConfigError: for an unknown name, or if its module cannot be imported or holds no data format of this plugin
             interface.
     """
-    from framework.data.dataset import DataParser
+    from nerfloom.data.dataset import DataParser
 
     parser = _load("dataparsers", name)
     if not (isinstance(parser, type) and issubclass(parser, DataParser)):
         entry = entry_of("dataparsers", name)
-        raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is no framework.DataParser")
+        raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is no nerfloom.DataParser")
     return parser

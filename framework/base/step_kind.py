@@ -11,7 +11,7 @@ class StepKind:
     """All that a training step depends on besides the values of tensors that stay where they are.
 
     Steps of equal kinds run the same operations on tensors of the same sizes, so that one of them can be recorded and
-    repeated (`framework.training.graphs`).
+    repeated (`nerfloom.training.graphs`).
     """
 
     of: tuple[Hashable, ...] = ()

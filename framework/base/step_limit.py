@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Collection
 from typing import TypeVar
 
-from framework.base.config import TrainConfig
-from framework.base.errors import FlagError
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import FlagError
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 

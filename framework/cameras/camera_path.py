@@ -17,11 +17,11 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from framework.base.atomic import write_atomically
-from framework.base.errors import DataError, nearest, shown
-from framework.cameras.cameras import Cameras, check_pose
-from framework.cameras.poses import Placement
-from framework.geometry.lenses import panorama
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.errors import DataError, nearest, shown
+from nerfloom.cameras.cameras import Cameras, check_pose
+from nerfloom.cameras.poses import Placement
+from nerfloom.geometry.lenses import panorama
 
 CameraType = Literal["perspective", "fisheye", "equirectangular"]
 CAMERA_TYPES: dict[str, str] = {"perspective": "pinhole", "fisheye": "fisheye", "equirectangular": "equirectangular"}

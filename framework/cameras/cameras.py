@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.device import runs_ahead
-from framework.base.errors import DataError
-from framework.geometry.lenses import DISTORTED, Distortion, LensRays, iterations_needed, project, unproject
-from framework.geometry.lenses import LENSES as LENSES
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.given import check_indices, is_followed
+from nerfloom.base.device import runs_ahead
+from nerfloom.base.errors import DataError
+from nerfloom.geometry.lenses import DISTORTED, Distortion, LensRays, iterations_needed, project, unproject
+from nerfloom.geometry.lenses import LENSES as LENSES
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.given import check_indices, is_followed
 
 ROTATION_TOLERANCE = 1e-3
 """Maximum deviation of a pose's rotation matrix from an orthonormal one."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.geometry.alignment import align_cameras, nearest_rotations
+from nerfloom.geometry.alignment import align_cameras, nearest_rotations
 
 WIDTH = 3.0
 """Distance within which training cameras count alike, in median distances of one to the nearest other: a camera that

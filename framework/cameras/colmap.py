@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import LARGEST_SIDE
-from framework.geometry.lenses import LENSES
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import LARGEST_SIDE
+from nerfloom.geometry.lenses import LENSES
 
 PARAMETERS: dict[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": ("pinhole", "f cx cy"),

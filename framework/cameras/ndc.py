@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import CENTER, Cameras
-from framework.geometry.rays import Rays
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import CENTER, Cameras
+from nerfloom.geometry.rays import Rays
 
 LEAST_AHEAD = 1e-3
 """Minimum cosine of the angle between a ray and the common axis; other rays have no image in the box."""

@@ -8,11 +8,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.base.evenly_spaced import evenly_spaced
-from framework.base.splits import Split
-from framework.cameras.cameras import Cameras
-from framework.cameras.upright import sideways_up
-from framework.kernels.math import cross_matrix
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.base.splits import Split
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.upright import sideways_up
+from nerfloom.kernels.math import cross_matrix
 
 Orientation = Literal["auto", "up", "pca", "none"]
 Center = Literal["poses", "focus", "none"]

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.geometry.alignment import nearest_rotations
-from framework.geometry.rays import Rays
-from framework.kernels.math import safe_normalize
+from nerfloom.geometry.alignment import nearest_rotations
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.math import safe_normalize
 
 NEIGHBOURS = 3
 """Number of cameras, near each other, of which the pose of an unseen view is a mean."""

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
+from nerfloom.cameras.cameras import Cameras
 
 
 @dataclass(frozen=True)

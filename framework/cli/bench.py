@@ -8,11 +8,11 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from framework.base.child import python_command
-from framework.base.console import say
-from framework.base.errors import ConfigError, FlagError, nearest
-from framework.base.extras import install_command
-from framework.cli.bench_flags import (
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, FlagError, nearest
+from nerfloom.base.extras import install_command
+from nerfloom.cli.bench_flags import (
     AblationFlags,
     CacheFlags,
     ContentionFlags,
@@ -29,13 +29,13 @@ from framework.cli.bench_flags import (
     StartsFlags,
     ViewerBenchFlags,
 )
-from framework.cli.bench_gpu import GpuFlags, measure_gpu
-from framework.cli.bench_processes import ProcessesFlags, measure_processes
-from framework.cli.bench_results import write_results
-from framework.cli.bench_tables import TablesFlags, measure_tables
-from framework.cli.common import chosen_kind, make_room, run_command
-from framework.cli.flags import read_flags
-from framework.training.run_path import check_data, trained_run
+from nerfloom.cli.bench_gpu import GpuFlags, measure_gpu
+from nerfloom.cli.bench_processes import ProcessesFlags, measure_processes
+from nerfloom.cli.bench_results import write_results
+from nerfloom.cli.bench_tables import TablesFlags, measure_tables
+from nerfloom.cli.common import chosen_kind, make_room, run_command
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import check_data, trained_run
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -80,19 +80,19 @@ def _command(arguments: list[str]) -> None:
 
 
 def _kernels(flags: KernelFlags) -> None:
-    from framework.kernels import native
+    from nerfloom.kernels import native
 
     for name in flags.variants:
         if name not in native.NEEDS:
             raise FlagError(f"--variants: there is no '{name}'. {nearest(name, native.NEEDS)}")
-        command = python_command("framework.cli.bench", "kernels", "--output-dir", flags.output_dir)
+        command = python_command("nerfloom.cli.bench", "kernels", "--output-dir", flags.output_dir)
         command += ["--samples", str(flags.samples), "--repeats", str(flags.repeats)]
         command += ["--plot-dir", str(flags.plot_dir)] if flags.plot_dir else []
         if subprocess.run(command, env={**os.environ, "NERFLOOM_KERNELS": name}).returncode:
             raise ConfigError(f"measuring the kernels' variant {name} failed; the lines above say why")
     if not flags.variants:
-        from framework.tools.benchmarks import bars
-        from framework.tools.benchmarks.kernels import measure
+        from nerfloom.tools.benchmarks import bars
+        from nerfloom.tools.benchmarks.kernels import measure
 
         rows, content = measure(flags.samples, flags.repeats)
         name = f"kernels-{native.variant()}"
@@ -103,15 +103,15 @@ def _kernels(flags: KernelFlags) -> None:
 
 
 def _quadrature(flags: QuadratureFlags) -> None:
-    from framework.tools.benchmarks.quadrature import main as quadrature
+    from nerfloom.tools.benchmarks.quadrature import main as quadrature
 
     flags.output_dir.mkdir(parents=True, exist_ok=True)
     quadrature(flags.output_dir / "quadrature.json", flags.plot_dir, flags.quick, flags.seed)
 
 
 def _methods(flags: MethodFlags) -> None:
-    from framework.cli.compare import compare
-    from framework.tools.benchmarks.methods import draw, published, standard_plan
+    from nerfloom.cli.compare import compare
+    from nerfloom.tools.benchmarks.methods import draw, published, standard_plan
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.run_dir or Path("outputs") / f"bench-{name}"
@@ -125,9 +125,9 @@ def _methods(flags: MethodFlags) -> None:
 
 
 def _curves(flags: CurvesFlags) -> None:
-    from framework.base.console import console
-    from framework.tools.benchmarks import curves
-    from framework.tools.comparison import plots
+    from nerfloom.base.console import console
+    from nerfloom.tools.benchmarks import curves
+    from nerfloom.tools.comparison import plots
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.run_dir or Path("outputs") / f"curves-{name}"
@@ -149,7 +149,7 @@ def _curves(flags: CurvesFlags) -> None:
 
 
 def _ablation(flags: AblationFlags) -> None:
-    from framework.tools.benchmarks.ablation import measure
+    from nerfloom.tools.benchmarks.ablation import measure
 
     path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
     make_room(path)
@@ -157,7 +157,7 @@ def _ablation(flags: AblationFlags) -> None:
 
 
 def _starts(flags: StartsFlags) -> None:
-    from framework.tools.benchmarks.starts import measure
+    from nerfloom.tools.benchmarks.starts import measure
 
     path = flags.output_dir / f"starts-{flags.data.resolve().name}.json"
     make_room(path)
@@ -165,9 +165,9 @@ def _starts(flags: StartsFlags) -> None:
 
 
 def _profile(flags: ProfileFlags) -> None:
-    from framework.cli.train import run_of
-    from framework.tools.benchmarks.profile_step import measure
-    from framework.tools.comparison.plan import split_words
+    from nerfloom.cli.train import run_of
+    from nerfloom.tools.benchmarks.profile_step import measure
+    from nerfloom.tools.comparison.plan import split_words
 
     if not (words := split_words(flags.method, "--method")):
         raise FlagError("--method is empty; give the name of a method, such as instant-ngp")
@@ -179,21 +179,21 @@ def _profile(flags: ProfileFlags) -> None:
 
 def _operations(flags: OperationsFlags) -> None:
     os.environ["NERFLOOM_KERNELS"] = "reference"  # which is read when kernels are first asked for
-    from framework.tools.benchmarks.operations import METHODS, measure
+    from nerfloom.tools.benchmarks.operations import METHODS, measure
 
     make_room(flags.output)
     write_results(flags.output, measure(flags.methods or METHODS, flags.before, flags.steps))
 
 
 def _contention(flags: ContentionFlags) -> None:
-    from framework.tools.benchmarks.contention import WORK, measure
+    from nerfloom.tools.benchmarks.contention import WORK, measure
 
     make_room(flags.output)
     write_results(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
 
 
 def _cache(flags: CacheFlags) -> None:
-    from framework.tools.benchmarks.cache import measure
+    from nerfloom.tools.benchmarks.cache import measure
 
     make_room(flags.output)
     size = (flags.width, flags.height)
@@ -201,13 +201,13 @@ def _cache(flags: CacheFlags) -> None:
 
 
 def _poses(flags: PosesFlags) -> None:
-    from framework.tools.benchmarks.poses import compare
+    from nerfloom.tools.benchmarks.poses import compare
 
     print(json.dumps(compare(flags.processed, flags.model), indent=2))
 
 
 def _pose_refinement(flags: PoseRefinementFlags) -> None:
-    from framework.tools.benchmarks.pose_refinement import measure
+    from nerfloom.tools.benchmarks.pose_refinement import measure
 
     path = flags.output_dir / "pose-refinement.json"
     make_room(path)
@@ -217,7 +217,7 @@ def _pose_refinement(flags: PoseRefinementFlags) -> None:
 def _meshes(flags: MeshFlags) -> None:
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"ns-bench meshes needs packages that are not installed: {advice}")
-    from framework.tools.benchmarks.meshes import measure
+    from nerfloom.tools.benchmarks.meshes import measure
 
     make_room(flags.output)
     run = None if flags.load_config is None else trained_run(flags.load_config).parent
@@ -229,8 +229,8 @@ def _viewer(flags: ViewerBenchFlags) -> None:
 
     import torch
 
-    from framework.tools.benchmarks.viewer import measured
-    from framework.training.machine import machine
+    from nerfloom.tools.benchmarks.viewer import measured
+    from nerfloom.training.machine import machine
 
     if not flags.runs or not all(width >= 8 for width in flags.widths):
         raise FlagError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
@@ -251,8 +251,8 @@ def _frames(flags: FramesFlags) -> None:
 
     import torch
 
-    from framework.tools.benchmarks.frames import measure
-    from framework.training.machine import machine
+    from nerfloom.tools.benchmarks.frames import measure
+    from nerfloom.training.machine import machine
 
     if not flags.runs or min(*flags.widths, 8) < 8 or min(*flags.threads, 1) < 1 or flags.pictures < 1:
         raise FlagError(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.cli.bench_results import PICTURES, RESULTS
+from nerfloom.cli.bench_results import PICTURES, RESULTS
 
 
 @dataclass(frozen=True)

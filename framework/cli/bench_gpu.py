@@ -7,9 +7,9 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
-from framework.base.errors import ConfigError
-from framework.cli.bench_results import RESULTS, write_results
-from framework.cli.common import make_room
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.bench_results import RESULTS, write_results
+from nerfloom.cli.common import make_room
 
 AROUND, STEPS_SECONDS = 30.0, 60.0
 """Seconds that a method's start and evaluation are expected to take, and the timed steps."""
@@ -61,8 +61,8 @@ def measure_gpu(flags: GpuFlags) -> None:
 
     if not torch.cuda.is_available():
         raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; --interpreter needs none")
-    from framework.cli.compare import compare
-    from framework.tools.benchmarks.gpu import METHODS, Part, gpu_plan, in_time, measured_kernels, reached, timed_steps
+    from nerfloom.cli.compare import compare
+    from nerfloom.tools.benchmarks.gpu import METHODS, Part, gpu_plan, in_time, measured_kernels, reached, timed_steps
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     path = flags.output_dir / f"gpu-{name}.json"
@@ -85,9 +85,9 @@ def measure_gpu(flags: GpuFlags) -> None:
 def _interpret(path: Path) -> None:
     if find_spec("triton") is None:
         raise ConfigError("ns-bench gpu --interpreter: Triton is not installed: pip install triton")
-    from framework.base.console import console
-    from framework.tools.benchmarks.kernel_errors import as_table, interpreted
-    from framework.training.machine import machine
+    from nerfloom.base.console import console
+    from nerfloom.tools.benchmarks.kernel_errors import as_table, interpreted
+    from nerfloom.training.machine import machine
 
     make_room(path)
     rows = interpreted()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.cli.bench_results import RESULTS, write_results
-from framework.cli.common import make_room
+from nerfloom.cli.bench_results import RESULTS, write_results
+from nerfloom.cli.common import make_room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ def measure_processes(flags: ProcessesFlags) -> None:
     Args:
         flags: the flags of the command.
     """
-    from framework.tools.benchmarks.processes import measure
+    from nerfloom.tools.benchmarks.processes import measure
 
     path = flags.output_dir / f"processes-{flags.data.resolve().name}.json"
     make_room(path)

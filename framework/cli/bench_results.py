@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import say
+from nerfloom.base.console import say
 
 RESULTS = Path("docs/results")
 """Default folder of the results."""
@@ -20,7 +20,7 @@ def write_results(path: Path, content: dict[str, Any]) -> None:
         path: the file; its folder is created if missing.
         content: the data.
     """
-    from framework.training.run import write_json
+    from nerfloom.training.run import write_json
 
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)

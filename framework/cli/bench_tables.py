@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.base.console import say
-from framework.base.errors import ConfigError, FlagError, shown
-from framework.cli.bench_results import RESULTS
-from framework.cli.common import check_weights, make_room
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.cli.bench_results import RESULTS
+from nerfloom.cli.common import check_weights, make_room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +47,8 @@ def measure_tables(flags: TablesFlags) -> None:
     Raises:
         ConfigError: if a table cannot be read, or a row failed.
     """
-    from framework.tools.benchmarks.table_text import listing, markdown
-    from framework.tools.benchmarks.tables import read_table, run_rows
+    from nerfloom.tools.benchmarks.table_text import listing, markdown
+    from nerfloom.tools.benchmarks.tables import read_table, run_rows
 
     if not flags.seconds_scale > 0:
         raise FlagError(f"--seconds-scale is {flags.seconds_scale}; it must be more than 0")

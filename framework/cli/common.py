@@ -10,16 +10,16 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import framework
-from framework.base.console import console, say
-from framework.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
-from framework.base.from_nerfstudio import KINDS
-from framework.base.registry import registered
-from framework.cli.flags import read_flags
-from framework.training.signals import exit_status, orderly_end
+import nerfloom
+from nerfloom.base.console import console, say
+from nerfloom.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
+from nerfloom.base.from_nerfstudio import KINDS
+from nerfloom.base.registry import registered
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.signals import exit_status, orderly_end
 
 if TYPE_CHECKING:
-    from framework.data.dataset import DataParser
+    from nerfloom.data.dataset import DataParser
 
 K = TypeVar("K")
 
@@ -94,7 +94,7 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
             break
     else:
         return arguments, None
-    from framework.base.registry import load_dataparser
+    from nerfloom.base.registry import load_dataparser
 
     found: Any = read_flags(
         load_dataparser(word), f"{command} {word}", arguments[index + 1 :], return_unknown_args=True
@@ -131,7 +131,7 @@ def check_weights(path: Path | None) -> None:
         ConfigError: if it cannot be used.
     """
     if path is not None:
-        from framework.evaluation.lpips import read_weights
+        from nerfloom.evaluation.lpips import read_weights
 
         read_weights(path)
 
@@ -179,12 +179,12 @@ def run_command(command: Callable[[list[str]], None]) -> None:
 
 def version() -> str:
     """Return the line that --version prints: the package's version, its folder, and the version of Python."""
-    folder = Path(framework.__file__).parent
-    return f"nerfloom {framework.__version__} from {folder} (Python {platform.python_version()})"
+    folder = Path(nerfloom.__file__).parent
+    return f"nerfloom {nerfloom.__version__} from {folder} (Python {platform.python_version()})"
 
 
 def _environment() -> str:
-    from framework.tools.environment import environment  # it loads torch, for which --version alone need not wait
+    from nerfloom.tools.environment import environment  # it loads torch, for which --version alone need not wait
 
     return environment()
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.base.errors import ConfigError, FlagError
-from framework.cli.common import check_weights, run_command
-from framework.cli.flags import read_flags
-from framework.training.run_path import check_data, check_writable
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.cli.common import check_weights, run_command
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import check_data, check_writable
 
 if TYPE_CHECKING:
-    from framework.tools.comparison.measures import Row
-    from framework.tools.comparison.plan import Plan
+    from nerfloom.tools.comparison.measures import Row
+    from nerfloom.tools.comparison.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    from framework.base.config import from_plain, read_yaml
+    from nerfloom.base.config import from_plain, read_yaml
 
     recipe, arguments = _recipe(arguments)
     default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
@@ -69,7 +69,7 @@ def _command(arguments: list[str]) -> None:
         check_data(flags.data)
     check_writable(flags.output_dir or Path("outputs"), "the comparison's folder")
     plan = plan_of(flags)
-    from framework.base.console import say
+    from nerfloom.base.console import say
 
     rows = compare(plan, flags.jobs)
     failed = [row.label for row in rows if row.failures]
@@ -94,8 +94,8 @@ def plan_of(flags: CompareFlags) -> Plan:
     Raises:
         ConfigError: if a flag's value is invalid, or flags contradict each other.
     """
-    from framework.data.data_folder import find_data
-    from framework.tools.comparison.plan import Conditions, Contender, Plan, split_words, views_for
+    from nerfloom.data.data_folder import find_data
+    from nerfloom.tools.comparison.plan import Conditions, Contender, Plan, split_words, views_for
 
     if flags.data is not None and not os.path.isdir(flags.data):
         flags = replace(flags, data=find_data(flags.data)[0])
@@ -127,11 +127,11 @@ def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
     Returns:
         A row of the table for each method.
     """
-    from framework.base.console import console, say
-    from framework.tools.comparison import plots
-    from framework.tools.comparison.measures import measure, rows_of
-    from framework.tools.comparison.report import console_table, write_report
-    from framework.tools.comparison.runner import run_jobs
+    from nerfloom.base.console import console, say
+    from nerfloom.tools.comparison import plots
+    from nerfloom.tools.comparison.measures import measure, rows_of
+    from nerfloom.tools.comparison.report import console_table, write_report
+    from nerfloom.tools.comparison.runner import run_jobs
 
     if not plots.available():
         say(f"the report will be {plots.MISSING}")

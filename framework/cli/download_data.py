@@ -6,11 +6,11 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.base.errors import FlagError
-from framework.cli.common import chosen_kind, run_command
-from framework.cli.flags import read_flags
-from framework.tools.downloads.catalogue import DATASETS
-from framework.training.signals import Stopped, signal_of
+from nerfloom.base.errors import FlagError
+from nerfloom.cli.common import chosen_kind, run_command
+from nerfloom.cli.flags import read_flags
+from nerfloom.tools.downloads.catalogue import DATASETS
+from nerfloom.training.signals import Stopped, signal_of
 
 USAGE = """\
 usage: ns-download-data NAME [--scenes SCENE ...] [--save-dir DIR] [flags]
@@ -50,7 +50,7 @@ def _command(arguments: list[str]) -> None:
         raise FlagError("--capture-name is nerfstudio's; here it is --scenes")
     description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"
     flags = read_flags(DownloadFlags, f"ns-download-data {name}", rest, description=description)
-    from framework.tools.downloads.install import announce, install
+    from nerfloom.tools.downloads.install import announce, install
 
     announce(name, dataset, flags.save_dir, flags.scenes)
     try:

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from framework.base.config import RaysPerPixel
-from framework.base.errors import ConfigError, FlagError
-from framework.cli.common import make_room, run_command, with_format, with_run
-from framework.cli.flags import read_flags
-from framework.training.run_path import check_writable, trained_run
+from nerfloom.base.config import RaysPerPixel
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.cli.common import make_room, run_command, with_format, with_run
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import check_writable, trained_run
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ def _command(arguments: list[str]) -> None:
         check_writable(flags.render_output_path, "pictures to")
     from contextlib import nullcontext
 
-    from framework.base.console import say
-    from framework.evaluation.error_bound import limited_error, measured_error, parse_error
-    from framework.evaluation.evaluator import evaluate
-    from framework.training.datasets import load_split
-    from framework.training.report import write_evaluation
-    from framework.training.splat_files import load_run_or_splats
+    from nerfloom.base.console import say
+    from nerfloom.evaluation.error_bound import limited_error, measured_error, parse_error
+    from nerfloom.evaluation.evaluator import evaluate
+    from nerfloom.training.datasets import load_split
+    from nerfloom.training.report import write_evaluation
+    from nerfloom.training.splat_files import load_run_or_splats
 
     trained = load_run_or_splats(
         flags.load_config,

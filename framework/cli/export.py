@@ -6,18 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.base.errors import ConfigError, DataError, FlagError
-from framework.base.extras import install_command
-from framework.cli.common import chosen_kind, make_room, run_command, with_run
-from framework.cli.export_flags import ExportFlags
-from framework.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
-from framework.cli.flags import read_flags
-from framework.training.run_path import trained_run
+from nerfloom.base.errors import ConfigError, DataError, FlagError
+from nerfloom.base.extras import install_command
+from nerfloom.cli.common import chosen_kind, make_room, run_command, with_run
+from nerfloom.cli.export_flags import ExportFlags
+from nerfloom.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import trained_run
 
 if TYPE_CHECKING:
-    from framework.cameras.poses import Placement
-    from framework.data.dataset import ParsedScene
-    from framework.training.trained import Trained
+    from nerfloom.cameras.poses import Placement
+    from nerfloom.data.dataset import ParsedScene
+    from nerfloom.training.trained import Trained
 
 USAGE = """\
 usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
@@ -104,7 +104,7 @@ def _command(arguments: list[str]) -> None:
     found = trained_run(flags.load_config, flags.load_checkpoint, flags.data)
     path = flags.output_dir / file.format_map(vars(flags))
     make_room(path)
-    from framework.training.trained import load_trained
+    from nerfloom.training.trained import load_trained
 
     trained = load_trained(found, flags.load_checkpoint, flags.device_type, flags.data)
     if trained.model.scene.warped:
@@ -117,13 +117,13 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
         raise FlagError("--num-points must be at least 1, --reach and --std-ratio at least 0")
     if flags.remove_outliers or flags.estimate_normals:
         _need_packages("--remove-outliers and --estimate-normals need", "; or set both to False")
-    from framework.base.console import say, track
-    from framework.base.device import seed_step
-    from framework.data.ply import write_points
-    from framework.export.neighbors import inliers, plane_normals
-    from framework.export.points import joined, num_views, picture_points, surface_points
-    from framework.ray_model import RayModel
-    from framework.training.datasets import load_split
+    from nerfloom.base.console import say, track
+    from nerfloom.base.device import seed_step
+    from nerfloom.data.ply import write_points
+    from nerfloom.export.neighbors import inliers, plane_normals
+    from nerfloom.export.points import joined, num_views, picture_points, surface_points
+    from nerfloom.ray_model import RayModel
+    from nerfloom.training.datasets import load_split
 
     model = trained.model
     dataset = load_split(trained.run, "train").to(model.device)
@@ -157,12 +157,12 @@ def _need_packages(what: str, otherwise: str = "") -> None:
 
 
 def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
-    from framework.base.console import say
-    from framework.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
-    from framework.export.colmap_text import images_folder, write_model
-    from framework.export.transforms import write_transforms
-    from framework.training.datasets import load_split
-    from framework.training.run import write_json
+    from nerfloom.base.console import say
+    from nerfloom.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
+    from nerfloom.export.colmap_text import images_folder, write_model
+    from nerfloom.export.transforms import write_transforms
+    from nerfloom.training.datasets import load_split
+    from nerfloom.training.run import write_json
 
     # Load the images too: cameras of unreadable images are not in the model.
     dataset = load_split(trained.run, "train").to(trained.model.device)
@@ -190,10 +190,10 @@ def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: P
 
 
 def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, path: Path) -> None:
-    from framework.base.console import say
-    from framework.export.occupancy import write_cells, write_grid
-    from framework.model import parts
-    from framework.samplers.base import SkipsCells
+    from nerfloom.base.console import say
+    from nerfloom.export.occupancy import write_cells, write_grid
+    from nerfloom.model import parts
+    from nerfloom.samplers.base import SkipsCells
 
     grids = parts(trained.model, SkipsCells)
     if not grids:
@@ -214,12 +214,12 @@ def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, pa
 def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
-    from framework.base.console import say
-    from framework.data.offsets import write_offset
-    from framework.geometry.local_origin import local_origin
-    from framework.splats.files import write_gaussians
-    from framework.splats.gaussians import HasGaussians
-    from framework.splats.transform import transformed
+    from nerfloom.base.console import say
+    from nerfloom.data.offsets import write_offset
+    from nerfloom.geometry.local_origin import local_origin
+    from nerfloom.splats.files import write_gaussians
+    from nerfloom.splats.gaussians import HasGaussians
+    from nerfloom.splats.transform import transformed
 
     if not isinstance(trained.model, HasGaussians):
         raise ConfigError(
@@ -242,7 +242,7 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
 
 
 def _web(flags: WebFlags, trained: Trained, placement: Placement, path: Path) -> None:
-    from framework.export.run_page import export_page
+    from nerfloom.export.run_page import export_page
 
     export_page(trained, path, flags.max_megabytes, flags.fit_seconds, flags.time)
 

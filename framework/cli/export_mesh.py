@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from framework.base.errors import ConfigError, FlagError
-from framework.base.extras import install_command
-from framework.cli.export_flags import ExportFlags
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.extras import install_command
+from nerfloom.cli.export_flags import ExportFlags
 
 if TYPE_CHECKING:
-    from framework.cameras.poses import Placement
-    from framework.export.lattice import Lattice
-    from framework.export.mesh import Mesh
-    from framework.export.meshing import Cleaning
-    from framework.export.texture import Texturing
-    from framework.training.trained import Trained
+    from nerfloom.cameras.poses import Placement
+    from nerfloom.export.lattice import Lattice
+    from nerfloom.export.mesh import Mesh
+    from nerfloom.export.meshing import Cleaning
+    from nerfloom.export.texture import Texturing
+    from nerfloom.training.trained import Trained
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
         ConfigError: if a flag is out of range, the method has no density, or there is no surface.
     """
     lattice, cleaning, texturing = _prepared(flags, trained, placement)
-    from framework.base.console import say
-    from framework.export.density import default_level
-    from framework.export.meshing import density_mesh
-    from framework.model import HasDensity
+    from nerfloom.base.console import say
+    from nerfloom.export.density import default_level
+    from nerfloom.export.meshing import density_mesh
+    from nerfloom.model import HasDensity
 
     model, level = trained.model, flags.isosurface_threshold
     if not isinstance(model, HasDensity):
@@ -116,8 +116,8 @@ def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -
     lattice, cleaning, texturing = _prepared(flags, trained, placement)
     if flags.max_num_views < 1:
         raise FlagError(f"--max-num-views is {flags.max_num_views}; it must be at least 1")
-    from framework.export.meshing import fused_mesh
-    from framework.training.datasets import load_split
+    from nerfloom.export.meshing import fused_mesh
+    from nerfloom.training.datasets import load_split
 
     start = time.monotonic()
     dataset = load_split(trained.run, "train").to(trained.model.device)
@@ -129,9 +129,9 @@ def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple
     """Return the lattice, what is kept and the texture, checked, and check that a mesh's packages are installed."""
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"a mesh needs packages that are not installed: {advice}")
-    from framework.export.lattice import lattice_of
-    from framework.export.meshing import Cleaning
-    from framework.export.texture import Texturing
+    from nerfloom.export.lattice import lattice_of
+    from nerfloom.export.meshing import Cleaning
+    from nerfloom.export.texture import Texturing
 
     cleaning = Cleaning(flags.num_components, flags.min_component_share, flags.target_num_faces)
     cleaning.check()
@@ -147,10 +147,10 @@ def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:
     """Write a mesh, and say what it is."""
-    from framework.base.console import say
-    from framework.export.mesh import closedness
-    from framework.export.mesh_files import write_mesh
-    from framework.export.meshing import in_input
+    from nerfloom.base.console import say
+    from nerfloom.export.mesh import closedness
+    from nerfloom.export.mesh_files import write_mesh
+    from nerfloom.export.meshing import in_input
 
     write_mesh(path, in_input(mesh, placement))
     counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closedness(mesh).sentence()}"

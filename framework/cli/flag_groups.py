@@ -20,14 +20,14 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from framework.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
-from framework.base.errors import ConfigError
-from framework.cli.flag_text import hide_none, plain
-from framework.data.dataset import DataParser
-from framework.samplers.background import BackgroundConfig
-from framework.samplers.choice import HierarchicalConfig, SamplingConfig
-from framework.scene.few_images import FewImagesConfig
-from framework.scene.motion import MotionConfig
+from nerfloom.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.flag_text import hide_none, plain
+from nerfloom.data.dataset import DataParser
+from nerfloom.samplers.background import BackgroundConfig
+from nerfloom.samplers.choice import HierarchicalConfig, SamplingConfig
+from nerfloom.scene.few_images import FewImagesConfig
+from nerfloom.scene.motion import MotionConfig
 
 OWN = "METHOD"
 """Placeholder of the method's name, whose group has all settings that no other group has."""

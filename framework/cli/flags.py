@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import redirect_stderr
 from typing import Any
 
-from framework.base.errors import FlagError
+from nerfloom.base.errors import FlagError
 
 FRAME = "╭╮╰╯│─"
 """What tyro draws boxes and rules with, unless the terminal has only ASCII."""
@@ -48,7 +48,7 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
     """
     import tyro
 
-    from framework.cli.flag_text import plain_flags
+    from nerfloom.cli.flag_text import plain_flags
 
     options = {"config": (tyro.conf.FlagConversionOff,), "registry": plain_flags(), **options}
     said = io.StringIO()

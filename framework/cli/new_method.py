@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from string import Template
 
-from framework.base.errors import ConfigError
-from framework.base.registry import registered
-from framework.cli.common import run_command
-from framework.cli.flags import read_flags
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import registered
+from nerfloom.cli.common import run_command
+from nerfloom.cli.flags import read_flags
 
 TEMPLATES = Path(__file__).parents[1] / "templates" / "method"
 SUFFIX = ".template"

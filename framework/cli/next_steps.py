@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from framework.base.extras import install_command
-from framework.data.scene import Scene
+from nerfloom.base.extras import install_command
+from nerfloom.data.scene import Scene
 
 
 def after_training(scene: Scene, folder: Path) -> list[str]:

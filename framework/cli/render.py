@@ -9,12 +9,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from framework.base.errors import ConfigError, FlagError
-from framework.base.from_nerfstudio import render_answer
-from framework.base.rendered_names import OutputName
-from framework.cli.common import chosen_kind, make_room, run_command, with_format, with_run
-from framework.cli.flags import read_flags
-from framework.cli.render_flags import (
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.from_nerfstudio import render_answer
+from nerfloom.base.rendered_names import OutputName
+from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
+from nerfloom.cli.flags import read_flags
+from nerfloom.cli.render_flags import (
     PATHS,
     USAGE,
     CameraPathFlags,
@@ -23,16 +23,16 @@ from framework.cli.render_flags import (
     TimeFlags,
     check_flags,
 )
-from framework.evaluation.video_suffixes import check_suffix
-from framework.training.run_path import trained_run
+from nerfloom.evaluation.video_suffixes import check_suffix
+from nerfloom.training.run_path import trained_run
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from framework.cli.render_paths import Views
-    from framework.evaluation.frames import Frames
-    from framework.training.splat_files import DataFormat
-    from framework.training.trained import Trained
+    from nerfloom.cli.render_paths import Views
+    from nerfloom.evaluation.frames import Frames
+    from nerfloom.training.splat_files import DataFormat
+    from nerfloom.training.trained import Trained
 
 
 def main() -> None:
@@ -66,13 +66,13 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     make_room(output / "render.json" if is_folder else output)
     from contextlib import nullcontext
 
-    from framework.base.console import say
-    from framework.cameras.view import View
-    from framework.evaluation.error_bound import limited_error, parse_error
-    from framework.evaluation.evaluator import evaluation_background
-    from framework.evaluation.frames import open_frames
-    from framework.evaluation.outputs import rendered_outputs
-    from framework.training.splat_files import load_run_or_splats
+    from nerfloom.base.console import say
+    from nerfloom.cameras.view import View
+    from nerfloom.evaluation.error_bound import limited_error, parse_error
+    from nerfloom.evaluation.evaluator import evaluation_background
+    from nerfloom.evaluation.frames import open_frames
+    from nerfloom.evaluation.outputs import rendered_outputs
+    from nerfloom.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
     rays = flags.outputs.rays_per_pixel
@@ -102,7 +102,7 @@ def _views(flags: Flags, trained: Trained) -> Views:
     """Return what is rendered, at its final size."""
     import torch
 
-    from framework.cli.render_paths import camera_path_views, dataset_views, path_views
+    from nerfloom.cli.render_paths import camera_path_views, dataset_views, path_views
 
     if isinstance(flags, CameraPathFlags):
         views = camera_path_views(flags, trained)
@@ -120,8 +120,8 @@ def _views(flags: Flags, trained: Trained) -> Views:
 
 def _facts(name: str, flags: Flags, trained: Trained, views: Views) -> dict[str, Any]:
     """Return everything that the pictures depend on, as plain data."""
-    from framework.base.config import to_plain
-    from framework.evaluation.frames import hash_of_file, hash_of_tensors
+    from nerfloom.base.config import to_plain
+    from nerfloom.evaluation.frames import hash_of_file, hash_of_tensors
 
     cameras = views.cameras
     numbers = [getattr(cameras, field.name) for field in dataclasses.fields(cameras)]
@@ -143,7 +143,7 @@ def _facts(name: str, flags: Flags, trained: Trained, views: Views) -> dict[str,
 
 def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
     """Refuse a folder that holds the images of another render."""
-    from framework.evaluation.frames import FACTS
+    from nerfloom.evaluation.frames import FACTS
 
     try:
         before = json.loads((folder / FACTS).read_text(encoding="utf-8"))
@@ -162,10 +162,10 @@ def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
 
 def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict[str, Any]) -> None:
     """Write the files that were asked for, and say where they are."""
-    from framework.base.console import say, track
-    from framework.evaluation.frames import FACTS, write_file
-    from framework.evaluation.outputs import DEPTHS, shown_output, side_by_side
-    from framework.evaluation.videos import write_images, write_strip, write_video
+    from nerfloom.base.console import say, track
+    from nerfloom.evaluation.frames import FACTS, write_file
+    from nerfloom.evaluation.outputs import DEPTHS, shown_output, side_by_side
+    from nerfloom.evaluation.videos import write_images, write_strip, write_video
 
     is_folder = not output.suffix
     names: list[str] = list(flags.outputs.rendered_output_names)
@@ -199,8 +199,8 @@ def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict
 
 def _colored_range(flags: Flags, frames: Frames, name: str) -> tuple[float, float]:
     """Return the distances at the ends of the colours of depth, and say them."""
-    from framework.base.console import say, track
-    from framework.evaluation.outputs import distance_range
+    from nerfloom.base.console import say, track
+    from nerfloom.evaluation.outputs import distance_range
 
     near, far = flags.outputs.depth_near_plane, flags.outputs.depth_far_plane
     if near is None or far is None:
@@ -212,10 +212,10 @@ def _colored_range(flags: Flags, frames: Frames, name: str) -> tuple[float, floa
 
 def _write_depths(flags: Flags, frames: Frames, folder: Path, stems: Sequence[str], name: str) -> None:
     """Write distances as numbers, and beside them what they mean."""
-    from framework.base.console import say, track
-    from framework.evaluation.frames import write_file
-    from framework.evaluation.outputs import largest_distance, opaque_distance
-    from framework.evaluation.videos import MOST, write_distances
+    from nerfloom.base.console import say, track
+    from nerfloom.evaluation.frames import write_file
+    from nerfloom.evaluation.outputs import largest_distance, opaque_distance
+    from nerfloom.evaluation.videos import MOST, write_distances
 
     packed = flags.files.depth_format == "png16"
     farthest = flags.outputs.depth_far_plane

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from framework.base.config import RaysPerPixel
-from framework.base.errors import FlagError
-from framework.base.rendered_names import OutputName
+from nerfloom.base.config import RaysPerPixel
+from nerfloom.base.errors import FlagError
+from nerfloom.base.rendered_names import OutputName
 
 USAGE = """\
 usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]

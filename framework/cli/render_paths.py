@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import ConfigError, FlagError
-from framework.cameras.camera_path import read_camera_path, read_transforms
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import looked_at
-from framework.cli.render_flags import (
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.cameras.camera_path import read_camera_path, read_transforms
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import looked_at
+from nerfloom.cli.render_flags import (
     CameraPathFlags,
     DatasetFlags,
     InterpolateFlags,
@@ -25,12 +25,12 @@ from framework.cli.render_flags import (
     SpiralFlags,
     TimeFlags,
 )
-from framework.data.dataset import Dataset, ParsedScene
-from framework.data.folds import in_order
-from framework.data.image_files import reduce_image
-from framework.data.pixels import composite
-from framework.evaluation.evaluator import evaluation_background
-from framework.evaluation.paths import (
+from nerfloom.data.dataset import Dataset, ParsedScene
+from nerfloom.data.folds import in_order
+from nerfloom.data.image_files import reduce_image
+from nerfloom.data.pixels import composite
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.evaluation.paths import (
     arc_of,
     focus_distance,
     interpolate,
@@ -40,8 +40,8 @@ from framework.evaluation.paths import (
     spiral,
     stretches,
 )
-from framework.training.datasets import load_split
-from framework.training.trained import Trained
+from nerfloom.training.datasets import load_split
+from nerfloom.training.trained import Trained
 
 
 @dataclass(frozen=True)

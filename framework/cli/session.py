@@ -10,30 +10,30 @@ from pathlib import Path
 
 import torch
 
-from framework.base.console import say
-from framework.base.device import choose_device, peak_memory
-from framework.base.errors import ConfigError, LostProcessError
-from framework.base.extras import install_command
-from framework.base.processes import from_first, joined_processes, processes
-from framework.cli.common import check_weights
-from framework.cli.next_steps import after_training
-from framework.data.dataset import Dataset
-from framework.data.residence import on_device
-from framework.evaluation.evaluator import evaluate
-from framework.model import StartsFromImages
-from framework.splats.gaussians import HasGaussians
-from framework.training.budget import evaluation_seconds
-from framework.training.checkpoint import FOLDER, list_checkpoints, load_newest
-from framework.training.curve import FEW
-from framework.training.datasets import first_split, load_split
-from framework.training.lock import sole_user
-from framework.training.machine import kernels
-from framework.training.outcome import Outcome
-from framework.training.report import write_evaluation, write_summary
-from framework.training.run import Run, create_folder, write_report, write_transforms
-from framework.training.signals import Stopped, handled, signal_of
-from framework.training.skipping import as_plain, lines, skip_report
-from framework.training.trainer import BetweenSteps, Trainer
+from nerfloom.base.console import say
+from nerfloom.base.device import choose_device, peak_memory
+from nerfloom.base.errors import ConfigError, LostProcessError
+from nerfloom.base.extras import install_command
+from nerfloom.base.processes import from_first, joined_processes, processes
+from nerfloom.cli.common import check_weights
+from nerfloom.cli.next_steps import after_training
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.residence import on_device
+from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.model import StartsFromImages
+from nerfloom.splats.gaussians import HasGaussians
+from nerfloom.training.budget import evaluation_seconds
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints, load_newest
+from nerfloom.training.curve import FEW
+from nerfloom.training.datasets import first_split, load_split
+from nerfloom.training.lock import sole_user
+from nerfloom.training.machine import kernels
+from nerfloom.training.outcome import Outcome
+from nerfloom.training.report import write_evaluation, write_summary
+from nerfloom.training.run import Run, create_folder, write_report, write_transforms
+from nerfloom.training.signals import Stopped, handled, signal_of
+from nerfloom.training.skipping import as_plain, lines, skip_report
+from nerfloom.training.trainer import BetweenSteps, Trainer
 
 PICTURES = 4
 """Maximum number of held-out views of which images are written at the end."""
@@ -202,7 +202,7 @@ def _viewer(trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:
     """Open the viewer of a run in training, if it is asked for."""
     if "viewer" not in trainer.config.vis:
         return nullcontext()
-    from framework.viewer.training_viewer import training_viewer
+    from nerfloom.viewer.training_viewer import training_viewer
 
     return training_viewer(trainer)
 

@@ -8,17 +8,17 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from framework.base.errors import ConfigError, FlagError, NerfloomError
-from framework.base.registry import registered
-from framework.cli.common import make_room, run_command
-from framework.cli.flags import read_flags
-from framework.training.run_path import check_data
+from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
+from nerfloom.base.registry import registered
+from nerfloom.cli.common import make_room, run_command
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import check_data
 
 if TYPE_CHECKING:
-    from framework.tools.stress.conditions import Condition
-    from framework.tools.stress.report import Result
-    from framework.tools.stress.trial import Budget
-    from framework.training.run import Run
+    from nerfloom.tools.stress.conditions import Condition
+    from nerfloom.tools.stress.report import Result
+    from nerfloom.tools.stress.trial import Budget
+    from nerfloom.training.run import Run
 
 USAGE = """\
 usage: ns-stress METHOD [METHOD ...] [--data DIR] [flags]
@@ -96,12 +96,12 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
     """
     if flags.data is not None:
         check_data(flags.data)
-    from framework.base.console import say
-    from framework.base.device import choose_device
-    from framework.tools.stress.report import Result, markdown, settings_of
-    from framework.tools.stress.scenes import ball_views, data_views
-    from framework.tools.stress.verdict import verdicts
-    from framework.training.machine import machine
+    from nerfloom.base.console import say
+    from nerfloom.base.device import choose_device
+    from nerfloom.tools.stress.report import Result, markdown, settings_of
+    from nerfloom.tools.stress.scenes import ball_views, data_views
+    from nerfloom.tools.stress.verdict import verdicts
+    from nerfloom.training.machine import machine
 
     runs, conditions = [_run(method, flags) for method in methods], _conditions(flags)
     budget, path = _budget(flags), _path(runs, flags)
@@ -126,8 +126,8 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 
 def _run(method: str, flags: StressFlags) -> Run:
     """Return the run that `ns-train` would start with the method and its flags."""
-    from framework.cli.train import run_of
-    from framework.tools.comparison.plan import split_words
+    from nerfloom.cli.train import run_of
+    from nerfloom.tools.comparison.plan import split_words
 
     words, data_flags = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
     if not words:
@@ -141,8 +141,8 @@ def _run(method: str, flags: StressFlags) -> Run:
 
 def _conditions(flags: StressFlags) -> list[Condition]:
     """Return the selected conditions, without those that cannot be applied to --data."""
-    from framework.base.console import say
-    from framework.tools.stress.conditions import select
+    from nerfloom.base.console import say
+    from nerfloom.tools.stress.conditions import select
 
     selected = select(flags.only)
     if flags.data is None:
@@ -154,7 +154,7 @@ def _conditions(flags: StressFlags) -> list[Condition]:
 
 
 def _budget(flags: StressFlags) -> Budget:
-    from framework.tools.stress.trial import Budget
+    from nerfloom.tools.stress.trial import Budget
 
     if flags.max_num_iterations < 1 or (flags.max_seconds is not None and not flags.max_seconds > 0):
         raise FlagError("--max-num-iterations must be at least 1, and --max-seconds more than 0")
@@ -178,7 +178,7 @@ def _data_name(flags: StressFlags) -> str:
 
 def _write(path: Path, flags: StressFlags, conditions: Sequence[Condition], results: Sequence[Result]) -> None:
     """Write the flags, the conditions and the outcomes so far."""
-    from framework.training.run import write_json
+    from nerfloom.training.run import write_json
 
     content = {
         "data": _data_name(flags),
@@ -195,8 +195,8 @@ def _print(results: Sequence[Result]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from framework.base.console import console, say
-    from framework.tools.stress.report import notes, table
+    from nerfloom.base.console import console, say
+    from nerfloom.tools.stress.report import notes, table
 
     head, *rows = table(results)
     grid = Table()

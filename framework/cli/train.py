@@ -9,15 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from framework.base.console import say
-from framework.base.errors import ConfigError, FlagError
-from framework.base.from_nerfstudio import flag_answer, taken, vis_answer
-from framework.base.registry import entry_of, registered, summary
-from framework.cli.common import run_command
-from framework.cli.flags import read_flags
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.from_nerfstudio import flag_answer, taken, vis_answer
+from nerfloom.base.registry import entry_of, registered, summary
+from nerfloom.cli.common import run_command
+from nerfloom.cli.flags import read_flags
 
 if TYPE_CHECKING:
-    from framework.training.run import Run
+    from nerfloom.training.run import Run
 
 USAGE = """\
 usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
@@ -39,15 +39,15 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return
-    from framework.cli.train_paths import check_paths  # here, so that the help above comes at once
-    from framework.training.run_path import config_file
+    from nerfloom.cli.train_paths import check_paths  # here, so that the help above comes at once
+    from nerfloom.training.run_path import config_file
 
     resumed, flags = _take(arguments, "--resume")
     recipe, flags = _take(flags, "--load-config")
     if resumed is not None:
         found = config_file(Path(resumed))
         check_paths(flags, found, found.parent)
-        from framework.cli.session import resume
+        from nerfloom.cli.session import resume
 
         resume(_parse_flags(_read_run(found), flags))
         return
@@ -64,7 +64,7 @@ def _command(arguments: list[str]) -> None:
         _check_method(method)
         check_paths(flags)
         run = _default_run(method)
-    from framework.cli.session import start
+    from nerfloom.cli.session import start
 
     start(_parse_flags(run, flags, fresh=True))
 
@@ -105,8 +105,8 @@ def _check_method(method: str) -> None:
 
 def _default_run(method: str) -> Run:
     """Return a run of a method with its default settings, without data."""
-    from framework.base.registry import load_dataparser, load_method
-    from framework.training.run import Run
+    from nerfloom.base.registry import load_dataparser, load_method
+    from nerfloom.training.run import Run
 
     return Run(method, load_method(method).config, "", load_dataparser("procedural")(), Path())
 
@@ -122,7 +122,7 @@ def run_of(method: str, flags: list[str]) -> Run:
 
 
 def _read_run(path: Path) -> Run:
-    from framework.training.run import read_run
+    from nerfloom.training.run import read_run
 
     return read_run(path)
 
@@ -132,10 +132,10 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
-    from framework.base.registry import load_dataparser
-    from framework.base.step_limit import limited_as_given
-    from framework.data.data_folder import find_data
-    from framework.training.run import run_folder
+    from nerfloom.base.registry import load_dataparser
+    from nerfloom.base.step_limit import limited_as_given
+    from nerfloom.data.data_folder import find_data
+    from nerfloom.training.run import run_folder
 
     flags, notes = taken(flags, set(_flag_names(run.config)))
     for note in notes:
@@ -181,7 +181,7 @@ def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any
     """
     import tyro
 
-    from framework.cli.flag_groups import RefusedSettings, grouped_flags
+    from nerfloom.cli.flag_groups import RefusedSettings, grouped_flags
 
     fields = [(name, Annotated[type(value), tyro.conf.arg(name="")]) for name, value in settings.items()]
     kind = dataclasses.make_dataclass("Flags", fields)

@@ -6,9 +6,9 @@ import os
 from itertools import pairwise
 from pathlib import Path
 
-from framework.base.config import TrainConfig, read_yaml
-from framework.base.errors import CheckpointError, DataError
-from framework.training.run_path import check_data, check_writable
+from nerfloom.base.config import TrainConfig, read_yaml
+from nerfloom.base.errors import CheckpointError, DataError
+from nerfloom.training.run_path import check_data, check_writable
 
 
 def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | None = None) -> None:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.base.errors import ConfigError
-from framework.base.extras import install_command
-from framework.base.machine_config import ViewerConfig
-from framework.cli.common import run_command, with_format, with_run
-from framework.cli.flags import read_flags
-from framework.training.run_path import trained_run
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.extras import install_command
+from nerfloom.base.machine_config import ViewerConfig
+from nerfloom.cli.common import run_command, with_format, with_run
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import trained_run
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ def _command(arguments: list[str]) -> None:
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
     found = trained_run(flags.load_config, flags.load_checkpoint, flags.data)
-    from framework.splats.files import is_splat_file
-    from framework.training.splat_files import load_run_or_splats
-    from framework.viewer.trained_viewer import view_trained
+    from nerfloom.splats.files import is_splat_file
+    from nerfloom.training.splat_files import load_run_or_splats
+    from nerfloom.viewer.trained_viewer import view_trained
 
     trained = load_run_or_splats(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
     follow = flags.load_checkpoint is None and not is_splat_file(found)

@@ -8,10 +8,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras
-from framework.data.pixel_set import PixelSet
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.pixel_set import PixelSet
 
 BLOCK = 1 << 20
 """Number of pixels tested at once."""

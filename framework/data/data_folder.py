@@ -10,12 +10,12 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from framework.base.console import say
-from framework.base.errors import ConfigError, DataError
-from framework.base.registry import load_dataparser, registered
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.registry import load_dataparser, registered
 
 if TYPE_CHECKING:
-    from framework.data.dataset import DataParser
+    from nerfloom.data.dataset import DataParser
 
 PARTS = re.compile(
     r"transforms(_train|_val|_test)?\.json|poses_bounds\.npy|(cameras|frames|images|points3D|rigs)\.(bin|txt)"

@@ -13,30 +13,30 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.base.splits import Split as Split
-from framework.cameras.cameras import Cameras
-from framework.cameras.ndc import NdcCameras
-from framework.cameras.poses import Placement
-from framework.cameras.view import View
-from framework.data.coverage import pixels_with_rays
-from framework.data.decoding import Decoded, ImageFiles, decode
-from framework.data.depths import read_depths
-from framework.data.image_files import image_size as image_size
-from framework.data.image_files import one_line as one_line
-from framework.data.image_files import read_image as read_image
-from framework.data.image_files import reduce_image as reduce_image
-from framework.data.light import APPEARANCE_STOPS, light_spread
-from framework.data.mapped_pixels import MappedPixels
-from framework.data.names_on_disk import nearest_on_disk
-from framework.data.parsed_scene import DataParser as DataParser
-from framework.data.parsed_scene import ParsedScene as ParsedScene
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_set import PixelSet
-from framework.data.scene import Scene
-from framework.data.sparse_depth import SparseDepth, sparse_depth
-from framework.data.travel import Travel
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.base.splits import Split as Split
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.ndc import NdcCameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.view import View
+from nerfloom.data.coverage import pixels_with_rays
+from nerfloom.data.decoding import Decoded, ImageFiles, decode
+from nerfloom.data.depths import read_depths
+from nerfloom.data.image_files import image_size as image_size
+from nerfloom.data.image_files import one_line as one_line
+from nerfloom.data.image_files import read_image as read_image
+from nerfloom.data.image_files import reduce_image as reduce_image
+from nerfloom.data.light import APPEARANCE_STOPS, light_spread
+from nerfloom.data.mapped_pixels import MappedPixels
+from nerfloom.data.names_on_disk import nearest_on_disk
+from nerfloom.data.parsed_scene import DataParser as DataParser
+from nerfloom.data.parsed_scene import ParsedScene as ParsedScene
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.scene import Scene
+from nerfloom.data.sparse_depth import SparseDepth, sparse_depth
+from nerfloom.data.travel import Travel
 
 Masks = Literal["auto", "ignored", "empty"]
 """Meaning of masked-out pixels: nothing is known about them, or nothing is there."""

@@ -17,15 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.console import say, track
-from framework.base.errors import DataError
-from framework.data.image_files import may_be_transparent, read_image, reduce_image
-from framework.data.light import light_of
-from framework.data.mapped_pixels import MappedPixels
-from framework.data.masks import read_mask
-from framework.data.pixel_cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
-from framework.data.pixel_set import PixelSet
-from framework.data.pixel_store import MemoryStore, PixelStore, drop_fourth, move
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import may_be_transparent, read_image, reduce_image
+from nerfloom.data.light import light_of
+from nerfloom.data.mapped_pixels import MappedPixels
+from nerfloom.data.masks import read_mask
+from nerfloom.data.pixel_cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixel_store import MemoryStore, PixelStore, drop_fourth, move
 
 WORKERS = min(os.cpu_count() or 1, 8)
 """Images decoded at once; each takes several times the memory of its pixels meanwhile."""

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.arrays import read_array
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras
-from framework.data.data_folder import IMAGE_SUFFIXES
-from framework.data.exr import depth_channel, read_channel, read_header
-from framework.data.image_files import Content, unreadable
+from nerfloom.base.arrays import read_array
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.data_folder import IMAGE_SUFFIXES
+from nerfloom.data.exr import depth_channel, read_channel, read_header
+from nerfloom.data.image_files import Content, unreadable
 
 T = TypeVar("T")
 

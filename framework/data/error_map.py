@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base.device import to_float64
-from framework.data.dataset import Dataset
+from nerfloom.base.device import to_float64
+from nerfloom.data.dataset import Dataset
 
 TILE = 8
 """Side of the square tiles that share one error, pixels."""

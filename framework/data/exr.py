@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.base.errors import DataError
+from nerfloom.base.errors import DataError
 
 MAGIC = b"\x76\x2f\x31\x01"
 TILED_OR_SEVERAL = 0x200 | 0x800 | 0x1000

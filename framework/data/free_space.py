@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base.evenly_spaced import evenly_spaced
-from framework.cameras.cameras import Cameras
-from framework.data.sparse_depth import SparseDepth
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.sparse_depth import SparseDepth
 
 CLEAR_SHARE = 0.7
 """Distance up to which space before a camera is taken to be empty, as a share of that of the nearest points it sees."""

@@ -10,8 +10,8 @@ import imageio.v3 as iio
 import numpy as np
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 
-from framework.base.errors import DataError
-from framework.data.data_folder import UNREAD_SUFFIXES
+from nerfloom.base.errors import DataError
+from nerfloom.data.data_folder import UNREAD_SUFFIXES
 
 # Pillow detects the format from the content, whatever the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False

@@ -7,8 +7,8 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from framework.base.errors import DataError
-from framework.data.image_files import Content, unreadable
+from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import Content, unreadable
 
 THRESHOLD = 128
 """Minimum grey value that counts as white."""

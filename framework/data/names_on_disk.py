@@ -18,8 +18,8 @@ from itertools import islice
 from pathlib import Path, PurePath
 from urllib.parse import unquote
 
-from framework.base.console import say
-from framework.data.data_folder import IMAGE_SUFFIXES
+from nerfloom.base.console import say
+from nerfloom.data.data_folder import IMAGE_SUFFIXES
 
 LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 """Endings that are tried, in this order, for a name without one."""

@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from framework.base.atomic import write_atomically
-from framework.base.errors import DataError, shown
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.errors import DataError, shown
 
 SUFFIX = ".offset.json"
 """What the name of a file's offset adds to that of the file."""

@@ -9,11 +9,11 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from framework.base.splits import Split
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
-from framework.data.scene import PoseSource
-from framework.data.tracks import Sightings
+from nerfloom.base.splits import Split
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.scene import PoseSource
+from nerfloom.data.tracks import Sightings
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class DataParser(ABC):
     a run whose placement it takes: a trained run gives its own if its images are not those of then.
     """
 
-    interface: ClassVar[int] = 1
+    interface: ClassVar[int] = 2
     """Version of the plugin interface for which the format was written (`registry.INTERFACE`)."""
 
     @classmethod

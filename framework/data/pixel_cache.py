@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.base.archives import uncompressed_size
-from framework.base.device import machine_memory
-from framework.base.errors import DataError
-from framework.base.user_cache import cache_folder
-from framework.data.pixel_store import FileStore
+from nerfloom.base.archives import uncompressed_size
+from nerfloom.base.device import machine_memory
+from nerfloom.base.errors import DataError
+from nerfloom.base.user_cache import cache_folder
+from nerfloom.data.pixel_store import FileStore
 
 FORMAT = 1
 """Version of the format; raised whenever the file's layout or the decoded values change."""

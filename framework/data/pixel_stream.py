@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.device import stream_seed
-from framework.base.processes import processes
-from framework.data.dataset import Dataset
+from nerfloom.base.device import stream_seed
+from nerfloom.base.processes import processes
+from nerfloom.data.dataset import Dataset
 
 MOST_STEPS = 64
 """Maximum number of steps whose pixels are read together."""

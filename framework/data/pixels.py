@@ -9,15 +9,15 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import CENTER
-from framework.cameras.view import View
-from framework.data.dataset import Dataset
-from framework.data.depths import ray_distances
-from framework.data.error_map import ErrorMap
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.given import check_indices
+from nerfloom.cameras.cameras import CENTER
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.depths import ray_distances
+from nerfloom.data.error_map import ErrorMap
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.given import check_indices
 
 Background = Literal["random", "white", "black"]
 """Kind of background."""

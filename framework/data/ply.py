@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.atomic import write_atomically
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.geometry.local_origin import local_origin, rounding
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.geometry.local_origin import local_origin, rounding
 
 TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",

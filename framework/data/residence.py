@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from framework.base.device import free_memory
-from framework.data.dataset import Dataset
+from nerfloom.base.device import free_memory
+from nerfloom.data.dataset import Dataset
 
 MOST = 0.5
 """Largest share of a device's free memory that images take; the rest is for the model and its steps."""

@@ -9,8 +9,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.base.checked import checked
-from framework.base.errors import shown
+from nerfloom.base.checked import checked
+from nerfloom.base.errors import shown
 
 PoseSource = Literal["exact", "photographs", "device"]
 """Source of the cameras' poses: known exactly, estimated from the images, or tracked by the device that took them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from framework.data.dataset import Dataset
+from nerfloom.data.dataset import Dataset
 
 
 def images_of(dataset: Dataset, scene: int | None) -> Tensor:

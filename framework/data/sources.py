@@ -10,15 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig, SourceViewsConfig, TrainConfig
-from framework.base.processes import processes
-from framework.cameras.cameras import subpixels
-from framework.cameras.view import View
-from framework.data.dataset import Dataset
-from framework.data.error_map import ErrorMap
-from framework.data.free_space import clear_distances
-from framework.data.pixel_stream import PixelStream
-from framework.data.pixels import (
+from nerfloom.base.config import RayConfig, SourceViewsConfig, TrainConfig
+from nerfloom.base.processes import processes
+from nerfloom.cameras.cameras import subpixels
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.error_map import ErrorMap
+from nerfloom.data.free_space import clear_distances
+from nerfloom.data.pixel_stream import PixelStream
+from nerfloom.data.pixels import (
     Background,
     LookUp,
     PixelBatch,
@@ -29,7 +29,7 @@ from framework.data.pixels import (
     known_distances,
     training_background,
 )
-from framework.data.sparse_depth import SparseDepth
+from nerfloom.data.sparse_depth import SparseDepth
 
 
 @dataclass(frozen=True)

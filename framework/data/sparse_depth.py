@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.data.tracks import Sightings
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.tracks import Sightings
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from fractions import Fraction
 
 import torch
 
-from framework.base.errors import ConfigError
-from framework.data.dataset import ParsedScene
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.dataset import ParsedScene
 
 
 def evenly_spread(total: int, count: int) -> list[int]:

@@ -7,13 +7,13 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from framework.base.config import Range, TrainConfig
-from framework.base.optimised import Optimised
-from framework.encodings.opening import Opening
-from framework.kernels.hash_grid import LOOK_UP, HashGridLayout, hash_grid
-from framework.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.memory import table
+from nerfloom.base.config import Range, TrainConfig
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.opening import Opening
+from nerfloom.kernels.hash_grid import LOOK_UP, HashGridLayout, hash_grid
+from nerfloom.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.kernels.hash_grid_lookup import TableGradient
+from nerfloom.kernels.memory import table
 
 FIRST_LEVELS = 4
 """Number of levels that are open at the start if they open one after the other, as in Neuralangelo (Li et al. 2023)."""

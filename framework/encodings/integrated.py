@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from framework.geometry.bounds import contract_gaussians
-from framework.geometry.points import Points
-from framework.kernels.integrated import integrated_encoding
+from nerfloom.geometry.bounds import contract_gaussians
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.integrated import integrated_encoding
 
 
 class IntegratedEncoding(nn.Module):

@@ -13,7 +13,7 @@ from typing import Any
 from torch import Tensor, nn, tensor
 from torch.nn.functional import pad
 
-from framework.base.device import HostValue
+from nerfloom.base.device import HostValue
 
 STEPS_PER_LEVEL = 2**10
 """Steps in which a level opens: each is a number that float32 holds exactly."""

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, relu
 
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.kernels.memory import require
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.kernels.memory import require
 
 MOST_LEVELS = 8
 """Maximum number of levels of an image encoder; a pixel of the eighth is 128 pixels wide."""

@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from framework.base import device as devices
-from framework.base.optimised import Optimised
-from framework.encodings.opening import Opening
-from framework.kernels.drawn_bands import drawn_bands
-from framework.kernels.memory import table
-from framework.kernels.plane_bands import Band, band_variation, plane_bands, variation
-from framework.kernels.planes import PlanesGradient, PlanesLayout, planes
+from nerfloom.base import device as devices
+from nerfloom.base.optimised import Optimised
+from nerfloom.encodings.opening import Opening
+from nerfloom.kernels.drawn_bands import drawn_bands
+from nerfloom.kernels.memory import table
+from nerfloom.kernels.plane_bands import Band, band_variation, plane_bands, variation
+from nerfloom.kernels.planes import PlanesGradient, PlanesLayout, planes
 
 BANDS = 16
 """Number of bands into which `FeaturePlanes.bands` divides the rows of a factor."""

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.evenly_spaced import evenly_spaced
-from framework.data.dataset import Dataset
-from framework.data.pixels import gather_batch
-from framework.fields.appearance import Appearance
-from framework.model import HasAppearance, Model, evaluating
-from framework.ray_model import RayModel
-from framework.rendering.losses import mean_squared_error
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels import gather_batch
+from nerfloom.fields.appearance import Appearance
+from nerfloom.model import HasAppearance, Model, evaluating
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.losses import mean_squared_error
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Steps of Adam, pixels per step, and learning rate, with which an appearance vector is fitted."""

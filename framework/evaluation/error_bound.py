@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from framework.base.console import track
-from framework.base.errors import ConfigError, FlagError
-from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluation_background, spread, timed_view
-from framework.model import Model, parts
-from framework.samplers.base import StopsEarly
+from nerfloom.base.console import track
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.data.dataset import Dataset
+from nerfloom.evaluation.evaluator import evaluation_background, spread, timed_view
+from nerfloom.model import Model, parts
+from nerfloom.samplers.base import StopsEarly
 
 MEASURED_VIEWS = 4
 """Maximum number of views on which the error is measured."""

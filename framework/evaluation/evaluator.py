@@ -15,22 +15,22 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from framework.base.config import AppearanceConfig
-from framework.base.console import say, track
-from framework.base.device import runs_ahead, wait_for
-from framework.base.errors import DataError
-from framework.base.meter import time_text
-from framework.cameras.view import View, every
-from framework.data.dataset import Dataset
-from framework.data.pixels import composite
-from framework.evaluation.appearance import appearance_of, fitted_appearance, right_half
-from framework.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
-from framework.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
-from framework.evaluation.statistics import statistics
-from framework.evaluation.view_files import Judged, ViewFiles
-from framework.kernels.ssim import WINDOW
-from framework.model import Model, RendersFromImages
-from framework.rendering.rendered import Picture
+from nerfloom.base.config import AppearanceConfig
+from nerfloom.base.console import say, track
+from nerfloom.base.device import runs_ahead, wait_for
+from nerfloom.base.errors import DataError
+from nerfloom.base.meter import time_text
+from nerfloom.cameras.view import View, every
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels import composite
+from nerfloom.evaluation.appearance import appearance_of, fitted_appearance, right_half
+from nerfloom.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
+from nerfloom.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
+from nerfloom.evaluation.statistics import statistics
+from nerfloom.evaluation.view_files import Judged, ViewFiles
+from nerfloom.kernels.ssim import WINDOW
+from nerfloom.model import Model, RendersFromImages
+from nerfloom.rendering.rendered import Picture
 
 T = TypeVar("T")
 

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from framework.base.atomic import write_atomically
-from framework.base.console import say, track
-from framework.base.errors import ConfigError
-from framework.evaluation.outputs import Arrays
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.outputs import Arrays
 
 FACTS = "render.json"
 """Name of the file that says what was rendered."""

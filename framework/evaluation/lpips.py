@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.base.archives import uncompressed_size
-from framework.base.errors import ConfigError
-from framework.base.extras import install_command
+from nerfloom.base.archives import uncompressed_size
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.extras import install_command
 
 NETWORK = "alex"
 """Name of the network whose features are compared, as the `lpips` package calls it."""

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.base.device import to_float64
-from framework.kernels.dispatch import Operation
-from framework.kernels.ssim import PHOTOMETRIC, SIMILARITY, WINDOW, structure, windows_inside
-from framework.kernels.ssim import ssim as similarity
-from framework.splats.resolution import halved
+from nerfloom.base.device import to_float64
+from nerfloom.kernels.dispatch import Operation
+from nerfloom.kernels.ssim import PHOTOMETRIC, SIMILARITY, WINDOW, structure, windows_inside
+from nerfloom.kernels.ssim import ssim as similarity
+from nerfloom.splats.resolution import halved
 
 MAX_PSNR = 100.0
 """PSNR of identical images, dB, instead of infinity, which JSON cannot hold."""

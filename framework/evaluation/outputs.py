@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.base.rendered_names import OutputName
-from framework.cameras.view import View
-from framework.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
-from framework.evaluation.panels import depth_range, viridis
-from framework.model import Model
-from framework.rendering.rendered import Picture
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.rendered_names import OutputName
+from nerfloom.cameras.view import View
+from nerfloom.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
+from nerfloom.evaluation.panels import depth_range, viridis
+from nerfloom.model import Model
+from nerfloom.rendering.rendered import Picture
 
 NAMES: tuple[str, ...] = get_args(OutputName)
 """Names of the outputs."""

@@ -10,7 +10,7 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from framework.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
+from nerfloom.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
 
 SMALLEST_WIDTH = 160
 """Minimum width of a panel, pixels; smaller images are enlarged by a whole number."""

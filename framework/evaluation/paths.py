@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.ndc import NdcCameras
-from framework.cameras.view import View
-from framework.geometry.alignment import nearest_rotations
-from framework.kernels.math import safe_normalize
-from framework.model import Model
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.ndc import NdcCameras
+from nerfloom.cameras.view import View
+from nerfloom.geometry.alignment import nearest_rotations
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.model import Model
 
 JUMP = 5.0
 """Ratio of the step between two neighbours to the median step from which a walk is said to jump."""

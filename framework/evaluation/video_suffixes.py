@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from framework.base.errors import ConfigError, FlagError
-from framework.base.extras import install_command
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.extras import install_command
 
 VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
 """Suffixes of files of several pictures."""

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.base.errors import ConfigError
-from framework.evaluation.frames import write_file
-from framework.evaluation.video_suffixes import VIDEO
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.frames import write_file
+from nerfloom.evaluation.video_suffixes import VIDEO
 
 QUALITY = 18
 """Constant rate factor of H.264; 18 is said to be visually lossless."""

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from framework.evaluation.images import write_image
-from framework.evaluation.panels import composed, view_panels
-from framework.rendering.rendered import Picture
+from nerfloom.evaluation.images import write_image
+from nerfloom.evaluation.panels import composed, view_panels
+from nerfloom.rendering.rendered import Picture
 
 WORST = "worst"
 """Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""

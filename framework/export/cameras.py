@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.base.splits import Split
-from framework.cameras.cameras import LENSES, Cameras, join_cameras
-from framework.cameras.carried import carried_poses
-from framework.cameras.poses import Placement
-from framework.data.dataset import ParsedScene
-from framework.model import Model, RefinesPoses
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.splits import Split
+from nerfloom.cameras.cameras import LENSES, Cameras, join_cameras
+from nerfloom.cameras.carried import carried_poses
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.dataset import ParsedScene
+from nerfloom.model import Model, RefinesPoses
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """Splits in the order in which their images are listed."""

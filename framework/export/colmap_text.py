@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.export.cameras import PosedFiles, coefficients, rational
-from framework.training.checkpoint import write_atomically
+from nerfloom.base.errors import ConfigError
+from nerfloom.export.cameras import PosedFiles, coefficients, rational
+from nerfloom.training.checkpoint import write_atomically
 
 ORDERS = {
     "PINHOLE": (),

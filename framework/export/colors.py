@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.evaluation.evaluator import evaluation_background
-from framework.export.density import evaluating
-from framework.geometry.rays import Rays
-from framework.ray_model import RayModel
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.export.density import evaluating
+from nerfloom.geometry.rays import Rays
+from nerfloom.ray_model import RayModel
 
 REACH = 3.0
 """Length of a ray before the surface and behind it, in cells."""

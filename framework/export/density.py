@@ -11,14 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.export.lattice import Lattice
-from framework.geometry.bounds import nested_boxes
-from framework.geometry.points import Points
-from framework.kernels.native import torch_on_one_thread
-from framework.kernels.occupancy import Occupancy
-from framework.model import HasDensity, Model, parts
-from framework.samplers.base import SkipsCells
+from nerfloom.base.errors import ConfigError
+from nerfloom.export.lattice import Lattice
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.model import HasDensity, Model, parts
+from nerfloom.samplers.base import SkipsCells
 
 BLOCK = 32
 """Cells along an edge of a block."""

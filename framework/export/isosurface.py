@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.export.lattice import Lattice
+from nerfloom.base.errors import ConfigError
+from nerfloom.export.lattice import Lattice
 
 SMALLEST = 1e-3
 """Minimum distance of a value from 0. A vertex is then never on a lattice point, so that its edge is known, and no

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.base.errors import FlagError
-from framework.cameras.poses import Placement
+from nerfloom.base.errors import FlagError
+from nerfloom.cameras.poses import Placement
 
 MAX_RESOLUTION = 1024
 """Maximum number of cells along the longest edge of the box."""

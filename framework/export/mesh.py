@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.export.texture import Texture
-from framework.kernels.math import safe_normalize
+from nerfloom.base.errors import ConfigError
+from nerfloom.export.texture import Texture
+from nerfloom.kernels.math import safe_normalize
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.console import say, track
-from framework.base.errors import ConfigError, FlagError
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
-from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluation_background
-from framework.export import density, tsdf
-from framework.export.colors import seen_colors, spread_colors
-from framework.export.isosurface import isosurface
-from framework.export.lattice import Lattice
-from framework.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
-from framework.export.texture import Texturing, painted
-from framework.model import Model
-from framework.ray_model import RayModel
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.dataset import Dataset
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.export import density, tsdf
+from nerfloom.export.colors import seen_colors, spread_colors
+from nerfloom.export.isosurface import isosurface
+from nerfloom.export.lattice import Lattice
+from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
+from nerfloom.export.texture import Texturing, painted
+from nerfloom.model import Model
+from nerfloom.ray_model import RayModel
 
 ColorFunction = Callable[[Tensor, Tensor], Tensor]
 """Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.console import track
+from nerfloom.base.console import track
 
 NEIGHBORS = 20
 """Number of nearest neighbours."""

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.data.dataset import Dataset
-from framework.data.pixels import draw_pixels
-from framework.evaluation.evaluator import evaluation_background
-from framework.kernels.math import safe_normalize
-from framework.model import Model
-from framework.ray_model import RayModel
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels import draw_pixels
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.model import Model
+from nerfloom.ray_model import RayModel
 
 OPAQUE = 0.5
 """Minimum opacity of a ray that ends on a surface."""

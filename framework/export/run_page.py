@@ -8,17 +8,17 @@ from statistics import fmean
 
 import torch
 
-from framework.base.console import say, track
-from framework.base.errors import ConfigError, FlagError, printable
-from framework.cameras.view import View
-from framework.data.dataset import Dataset
-from framework.data.folds import in_order
-from framework.data.pixels import composite
-from framework.evaluation.evaluator import evaluation_background, measure, spread, views_to_judge
-from framework.evaluation.metrics import psnr
-from framework.export.cameras import refined_cameras
-from framework.export.splat_fit import fit_gaussians
-from framework.export.web import (
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import ConfigError, FlagError, printable
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.folds import in_order
+from nerfloom.data.pixels import composite
+from nerfloom.evaluation.evaluator import evaluation_background, measure, spread, views_to_judge
+from nerfloom.evaluation.metrics import psnr
+from nerfloom.export.cameras import refined_cameras
+from nerfloom.export.splat_fit import fit_gaussians
+from nerfloom.export.web import (
     PageFacts,
     camera_rows,
     check_size,
@@ -28,14 +28,14 @@ from framework.export.web import (
     pinhole,
     upright,
 )
-from framework.ray_model import RayModel
-from framework.splats.drawing import DRAWN, draw_colors, splat_camera
-from framework.splats.gaussians import Gaussians, HasGaussians
-from framework.splats.look import OURS, Look
-from framework.splats.transform import transformed
-from framework.training.checkpoint import write_atomically
-from framework.training.datasets import first_split, load_split
-from framework.training.trained import Trained
+from nerfloom.ray_model import RayModel
+from nerfloom.splats.drawing import DRAWN, draw_colors, splat_camera
+from nerfloom.splats.gaussians import Gaussians, HasGaussians
+from nerfloom.splats.look import OURS, Look
+from nerfloom.splats.transform import transformed
+from nerfloom.training.checkpoint import write_atomically
+from nerfloom.training.datasets import first_split, load_split
+from nerfloom.training.trained import Trained
 
 NEAR, LEAST_NEAR = 0.2, 1e-3
 """Smallest depth at which a centre is drawn, as a fraction of the scene's near distance and in scene units."""

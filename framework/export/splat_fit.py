@@ -19,27 +19,27 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from framework.base.console import say, track
-from framework.base.device import seed_step, wait_for
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluation_background
-from framework.export.cameras import refined_cameras
-from framework.export.points import joined, surface_points
-from framework.geometry.alignment import nearest_rotations
-from framework.kernels.native import torch_on_one_thread
-from framework.kernels.splat_project import SplatCamera
-from framework.kernels.ssim import photometric_loss
-from framework.ray_model import RayModel
-from framework.splats.drawing import DRAWN, draw, on_image, splat_camera
-from framework.splats.gaussians import MAX_DEGREE, Gaussians
-from framework.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
-from framework.splats.mcmc import moved
-from framework.splats.start import from_points
-from framework.training.optim import Adam
-from framework.training.step import backward
+from nerfloom.base.console import say, track
+from nerfloom.base.device import seed_step, wait_for
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.export.cameras import refined_cameras
+from nerfloom.export.points import joined, surface_points
+from nerfloom.geometry.alignment import nearest_rotations
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.splat_project import SplatCamera
+from nerfloom.kernels.ssim import photometric_loss
+from nerfloom.ray_model import RayModel
+from nerfloom.splats.drawing import DRAWN, draw, on_image, splat_camera
+from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
+from nerfloom.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
+from nerfloom.splats.mcmc import moved
+from nerfloom.splats.start import from_points
+from nerfloom.training.optim import Adam
+from nerfloom.training.step import backward
 
 PICTURES_SHARE = 0.45
 """Share of the budget in which pictures are rendered; the others are steps."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.base.console import say, track
-from framework.base.errors import ConfigError, FlagError
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import ConfigError, FlagError
 
 SMALLEST, LARGEST = 64, 16_384
 """Bounds of a texture's edge, in texels."""

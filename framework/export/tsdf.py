@@ -16,12 +16,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.errors import FlagError
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.export.lattice import Lattice
-from framework.geometry.lenses import project
-from framework.model import Model
+from nerfloom.base.errors import FlagError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.export.lattice import Lattice
+from nerfloom.geometry.lenses import project
+from nerfloom.model import Model
 
 BLOCK = 16
 """Cells along an edge of a block."""

@@ -21,14 +21,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import framework
-from framework.base.errors import ConfigError, DataError, FlagError
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import looked_at, rotation_between
-from framework.splats.budget import fitted_spz
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import Look
-from framework.splats.spz import encoded, out_of_range, read_spz
+import nerfloom
+from nerfloom.base.errors import ConfigError, DataError, FlagError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import looked_at, rotation_between
+from nerfloom.splats.budget import fitted_spz
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import Look
+from nerfloom.splats.spz import encoded, out_of_range, read_spz
 
 LARGEST = 32.0
 """Maximum size of a page in millions of bytes; larger ones are refused by some phones."""
@@ -179,12 +179,12 @@ def page(payload: bytes, facts: PageFacts) -> str:
         payload: content of the file.
         facts: what the page knows besides.
     """
-    folder = files("framework.export") / "page"
+    folder = files("nerfloom.export") / "page"
     plain = json.dumps(asdict(facts), separators=(",", ":"), allow_nan=False)
     parts = {
         "title": html.escape(facts.title),
         "about": html.escape(facts.about),
-        "version": html.escape(framework.__version__),
+        "version": html.escape(nerfloom.__version__),
         "style": (folder / "viewer.css").read_text(encoding="utf-8"),
         "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS),
         "facts": plain.replace("<", "\\u003c"),  # no name ends the element

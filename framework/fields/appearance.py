@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from framework.base.optimised import Optimised
+from nerfloom.base.optimised import Optimised
 
 AFFINE = 12
 """Length of a vector that is an affine transform of colours."""

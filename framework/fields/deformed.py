@@ -7,11 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from framework.fields.base import MLP, Field
-from framework.fields.nerf import encoded_times
-from framework.geometry.points import Points
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.frequency import frequency_encoding
+from nerfloom.fields.base import MLP, Field
+from nerfloom.fields.nerf import encoded_times
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.frequency import frequency_encoding
 
 
 class DeformedField(Field):

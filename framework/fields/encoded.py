@@ -8,16 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.opening import Opening
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.appearance import Appearance
-from framework.fields.base import MLP, Field
-from framework.geometry.points import Points
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.kernels.trace import GridDensity
-from framework.kernels.traced_colors import GridColor
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.encodings.opening import Opening
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.appearance import Appearance
+from nerfloom.fields.base import MLP, Field
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.trace import GridDensity
+from nerfloom.kernels.traced_colors import GridColor
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""

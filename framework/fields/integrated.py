@@ -7,11 +7,11 @@ from typing import ClassVar
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from framework.encodings.integrated import IntegratedEncoding
-from framework.fields.base import MLP, Field
-from framework.geometry.points import Footprint, Points
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.mlp import MAX_WIDTH
+from nerfloom.encodings.integrated import IntegratedEncoding
+from nerfloom.fields.base import MLP, Field
+from nerfloom.geometry.points import Footprint, Points
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.mlp import MAX_WIDTH
 
 DENSITY_BIAS = -1.0
 """Added to the density before softplus, which starts the scene half transparent (Mip-NeRF, supplement)."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.encoded import EncodedField
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.encoded import EncodedField
 
 
 class InvertedField(EncodedField):

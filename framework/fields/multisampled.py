@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.encodings.multisampled import MultisampledHashGrid
-from framework.fields.encoded import BoxField, DensityField, EncodedField
-from framework.geometry.multisamples import fixed_pattern, hashed_pattern
-from framework.geometry.points import Points
-from framework.kernels.multisamples import unit_multisamples
+from nerfloom.encodings.multisampled import MultisampledHashGrid
+from nerfloom.fields.encoded import BoxField, DensityField, EncodedField
+from nerfloom.geometry.multisamples import fixed_pattern, hashed_pattern
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.multisamples import unit_multisamples
 
 
 class MultisampledDensity(DensityField):

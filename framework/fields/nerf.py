@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from framework.encodings.opening import Opening
-from framework.fields.base import MLP, Field
-from framework.geometry.points import Points
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.frequency import frequency_encoding
+from nerfloom.encodings.opening import Opening
+from nerfloom.fields.base import MLP, Field
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.frequency import frequency_encoding
 
 
 class NeRFField(Field):

@@ -7,12 +7,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from framework.fields.base import MLP, Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import ray_sum
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.math import safe_normalize
+from nerfloom.fields.base import MLP, Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import ray_sum
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.math import safe_normalize
 
 FREQUENCIES = 2
 """Number of frequencies of the positions' encoding."""

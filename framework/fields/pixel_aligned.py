@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import relu, softplus
 
-from framework.encodings.pixel_aligned import SourceViews
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.memory import require
+from nerfloom.encodings.pixel_aligned import SourceViews
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.memory import require
 
 
 class ResidualBlock(nn.Module):

@@ -7,10 +7,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from framework.encodings.multisampled import MultisampledHashGrid
-from framework.fields.encoded import BoxField, DensityField, EncodedField
-from framework.geometry.points import Footprint, Points
-from framework.kernels.multisamples import ball_deviations, frustum_balls, unit_balls
+from nerfloom.encodings.multisampled import MultisampledHashGrid
+from nerfloom.fields.encoded import BoxField, DensityField, EncodedField
+from nerfloom.geometry.points import Footprint, Points
+from nerfloom.kernels.multisamples import ball_deviations, frustum_balls, unit_balls
 
 
 class SizedGrid(BoxField):

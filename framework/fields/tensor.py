@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.base import MLP, Field
-from framework.geometry.bounds import to_unit_box
-from framework.geometry.points import Points
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.mlp import mlp
-from framework.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.base import MLP, Field
+from nerfloom.geometry.bounds import to_unit_box
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.mlp import mlp
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
 """Three groups: a plane, and the line across it (equation 4)."""

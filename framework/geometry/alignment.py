@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.base.errors import DataError
+from nerfloom.base.errors import DataError
 
 
 def align(estimated: Tensor, given: Tensor) -> tuple[float, Tensor, Tensor]:

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from framework.geometry.limits import at_least
+from nerfloom.geometry.limits import at_least
 
 
 def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:

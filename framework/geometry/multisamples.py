@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.geometry.points import Frustums, frames
+from nerfloom.geometry.points import Frustums, frames
 
 THIRDS_OF_PI = (0, 2, 4, 3, 5, 1)
 """Angle of each point around the axis, from the near end to the far one, in units of pi / 3."""
@@ -41,7 +41,7 @@ def hashed_pattern(frustums: Frustums) -> Pattern:
     """Return rotations that look random, half of them mirrored; for training.
 
     They are a hash of both ends of a frustum, which are random themselves, so that those of the same frustum are the
-    same again: what a march has evaluated in waves need not be evaluated another time (`framework.kernels.kept`).
+    same again: what a march has evaluated in waves need not be evaluated another time (`nerfloom.kernels.kept`).
 
     Args:
         frustums: N frustums.

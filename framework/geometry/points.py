@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
+from nerfloom.geometry.rays import Rays, Samples
 
 Footprint = Literal["none", "radius", "gaussian", "frustum"]
 """Kind of a point's size that a field needs: none, radius of the pixel's cone, mean and covariance of the cone's
@@ -41,7 +41,7 @@ class Points:
     """N points at which a field is evaluated."""
 
     positions: Tensor
-    """(N, 3) scene coordinates, or (N, 4) points of an inverted sphere (`framework.geometry.spheres`)."""
+    """(N, 3) scene coordinates, or (N, 4) points of an inverted sphere (`nerfloom.geometry.spheres`)."""
     times: Tensor | None = None
     """(N,) times in [0, 1]; None for a static scene."""
     radii: Tensor | None = None

@@ -88,7 +88,7 @@ class CoarseLevel:
     """The coarse level of hierarchical sampling, which is rendered and supervised too."""
 
     field: Any
-    """The field that was sampled (`framework.Field`)."""
+    """The field that was sampled (`nerfloom.Field`)."""
     samples: Samples
     """Its samples on the same rays, with density and features."""
 

@@ -20,7 +20,7 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays
+from nerfloom.geometry.rays import Rays
 
 
 def nearest_to_centre(origins: Tensor, directions: Tensor, sphere: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TORCH, TRITON, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TORCH, TRITON, Operation
+from nerfloom.kernels.triton_kernels import later
 
 _sparse = native.Function("adam_sparse", "pppppqifddfi", "q")
 _dense = native.Function("adam_dense", "ppppppifddfi")

@@ -14,8 +14,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import Composited, composite
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import Composited, composite
 
 
 def alpha_depth(alpha: Tensor) -> Tensor:

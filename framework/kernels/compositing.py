@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.geometry.rays import Samples
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.given import check_offsets
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.given import check_offsets
+from nerfloom.kernels.triton_kernels import later
 
 MAX_PADDED = 2**26
 """Maximum number of values of rays that are padded to the longest, so that they are added up in one pass."""

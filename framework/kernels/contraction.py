@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.geometry.bounds import contract
-from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.bounds import contract
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.triton_kernels import later
 
 
 def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
@@ -22,7 +22,7 @@ def contract_to_unit_reference(positions: Tensor, box: Tensor) -> Tensor:
 def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
     """Contract all of space into [0, 1]^3, where the ellipsoid inside `box` takes half of the width.
 
-    mip-NeRF 360 (Barron et al. 2022), equation 10 (`framework.geometry.bounds.contract`), scaled so that its ball of
+    mip-NeRF 360 (Barron et al. 2022), equation 10 (`nerfloom.geometry.bounds.contract`), scaled so that its ball of
     radius 2 fits into the cube.
 
     Args:

@@ -16,7 +16,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from framework.kernels import native, triton_kernels
+from nerfloom.kernels import native, triton_kernels
 
 P = ParamSpec("P")
 R = TypeVar("R")

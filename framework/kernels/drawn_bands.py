@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.kernels.planes_layout import PlanesLayout
+from nerfloom.kernels.planes_layout import PlanesLayout
 
 Rows = tuple[int, int, int]
 """Group, factor in the group, and number of rows of a band."""

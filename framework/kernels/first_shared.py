@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
 
 LEVELS, CELLS = 3, 32
 """Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, all is shared."""

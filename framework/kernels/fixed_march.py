@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.geometry.rays import Rays
-from framework.kernels.compositing import bounded_sum, optical_depth
-from framework.kernels.dispatch import TRITON, Operation
-from framework.kernels.march import RUN, step_range
-from framework.kernels.occupancy import Occupancy
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.compositing import bounded_sum, optical_depth
+from nerfloom.kernels.dispatch import TRITON, Operation
+from nerfloom.kernels.march import RUN, step_range
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.triton_kernels import later
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def fill(
 ) -> Filled:
     """Return the steps of rays whose middle is in an occupied cell of one box, in a fixed number of slots.
 
-    They are those of `framework.kernels.march.candidates`, for even steps.
+    They are those of `nerfloom.kernels.march.candidates`, for even steps.
 
     Args:
         rays: R rays, R > 0.

@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.triton_kernels import later
 
 MAX_FREQUENCIES = 32
 """Maximum number of frequencies. In float32 the sines of the highest ones are noise already with fewer."""

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.geometry.limits import between
-from framework.kernels import native
-from framework.kernels.dispatch import FEW_OPERATIONS, TRITON
-from framework.kernels.hash_grid_layout import HashGridLayout as HashGridLayout
-from framework.kernels.hash_grid_lookup import LookUp, TableGradient, fits
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.limits import between
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import FEW_OPERATIONS, TRITON
+from nerfloom.kernels.hash_grid_layout import HashGridLayout as HashGridLayout
+from nerfloom.kernels.hash_grid_lookup import LookUp, TableGradient, fits
+from nerfloom.kernels.triton_kernels import later
 
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the hash (equation 4)."""

@@ -7,8 +7,8 @@ from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
-from framework.base.errors import ConfigError, shown
-from framework.kernels import native
+from nerfloom.base.errors import ConfigError, shown
+from nerfloom.kernels import native
 
 MAX_LEVELS = 64
 """Maximum number of levels."""

@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, memory, native
-from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.hash_grid_layout import HashGridLayout
+from nerfloom.kernels import kept, memory, native
+from nerfloom.kernels.deferred import Parts, waiting
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.hash_grid_layout import HashGridLayout
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class TableGradient:
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
     ) -> int:  # fmt: skip
-        """Update `table` (E, F) by `framework.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
+        """Update `table` (E, F) by `nerfloom.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
 
         `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
         """

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.compositing import exclusive_cumsum, optical_depth
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import native
+from nerfloom.kernels.compositing import exclusive_cumsum, optical_depth
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.triton_kernels import later
 
 EPS = 1e-7
 """Added to weights in a denominator, so that the loss of intervals with weight 0 is finite."""

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from framework.kernels.rows import gather_rows, joined, take_rows
+from nerfloom.kernels.rows import gather_rows, joined, take_rows
 
 CLOSE, ALMOST_ZERO = 1e-4, 1e-6
 """Relative and absolute tolerance of equal inputs, since torch's rounding depends on the batch size."""

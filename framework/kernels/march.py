@@ -19,17 +19,17 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.geometry.bounds import intersect_box
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.compositing import bounded_sum, optical_depth
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.occupancy import Occupancy as Occupancy
-from framework.kernels.occupancy import refresh_occupancy as refresh_occupancy
-from framework.kernels.ray_order import SORT_BY_RAY as SORT_BY_RAY
-from framework.kernels.ray_order import sort_by_ray as sort_by_ray
-from framework.kernels.ray_order import sort_by_ray_reference as sort_by_ray_reference
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.compositing import bounded_sum, optical_depth
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.occupancy import Occupancy as Occupancy
+from nerfloom.kernels.occupancy import refresh_occupancy as refresh_occupancy
+from nerfloom.kernels.ray_order import SORT_BY_RAY as SORT_BY_RAY
+from nerfloom.kernels.ray_order import sort_by_ray as sort_by_ray
+from nerfloom.kernels.ray_order import sort_by_ray_reference as sort_by_ray_reference
+from nerfloom.kernels.triton_kernels import later
 
 RUN = 8
 """Number of steps that the reference tests together."""

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.geometry.limits import at_least
+from nerfloom.geometry.limits import at_least
 
 MAX_LOG_DENSITY = 15.0
 """Maximum log-density; larger ones are clipped."""

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.device import machine_memory
-from framework.base.errors import ConfigError
+from nerfloom.base.device import machine_memory
+from nerfloom.base.errors import ConfigError
 
 HUGE_PAGE = 2**21
 """Size of a huge page in bytes."""

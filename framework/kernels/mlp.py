@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.math import split_density
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.math import split_density
 
 T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
@@ -231,7 +231,7 @@ def density_mlp(
 ) -> tuple[Tensor, Tensor]:
     """Return the density (N,) and the outputs (N, D_out) of a network whose first output is the log-density.
 
-    It is `framework.kernels.math.split_density` of `mlp`, without passes of its own over the outputs and their
+    It is `nerfloom.kernels.math.split_density` of `mlp`, without passes of its own over the outputs and their
     gradient.
 
     Args:

@@ -14,11 +14,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.dispatch import FEW_OPERATIONS
-from framework.kernels.downweighting import level_weights
-from framework.kernels.hash_grid import HashGridLayout, corners, hash_grid
-from framework.kernels.hash_grid_lookup import LookUp, TableGradient
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import FEW_OPERATIONS
+from nerfloom.kernels.downweighting import level_weights
+from nerfloom.kernels.hash_grid import HashGridLayout, corners, hash_grid
+from nerfloom.kernels.hash_grid_lookup import LookUp, TableGradient
 
 
 def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:

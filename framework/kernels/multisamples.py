@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from framework.geometry.bounds import contract, contraction_scale
-from framework.geometry.multisamples import NUM_MULTISAMPLES, STD_SCALE, Pattern, multisamples
-from framework.geometry.points import Frustums, conical_frustums
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from nerfloom.geometry.bounds import contract, contraction_scale
+from nerfloom.geometry.multisamples import NUM_MULTISAMPLES, STD_SCALE, Pattern, multisamples
+from nerfloom.geometry.points import Frustums, conical_frustums
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
 
 
 def unit_multisamples_reference(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: bool) -> Tensor:

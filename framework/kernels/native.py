@@ -25,11 +25,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.device import cpu_features
-from framework.base.errors import ConfigError
-from framework.base.extras import reinstall_command
-from framework.kernels.sources import fingerprint
+from nerfloom.base.console import say
+from nerfloom.base.device import cpu_features
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.extras import reinstall_command
+from nerfloom.kernels.sources import fingerprint
 
 SOURCES = Path(__file__).parent / "csrc"
 FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")

@@ -16,10 +16,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from framework.geometry.bounds import nested_boxes
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.triton_kernels import later
 
 BLOCK = 4
 """Cells along an edge of a block, which is a cell of the coarser level."""

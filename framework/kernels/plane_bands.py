@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, Operation
-from framework.kernels.planes_layout import PlanesLayout
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, Operation
+from nerfloom.kernels.planes_layout import PlanesLayout
 
 if TYPE_CHECKING:
-    from framework.kernels.planes import PlanesGradient
+    from nerfloom.kernels.planes import PlanesGradient
 
 Band = tuple[int, int, int, int]
 """Group, factor in the group, first row, and number of rows."""

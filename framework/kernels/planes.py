@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from framework.geometry.limits import between
-from framework.kernels import kept, memory, native
-from framework.kernels.adam import sparse_adam
-from framework.kernels.deferred import Parts, waiting
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.plane_bands import Shape, add_variation_gradient
-from framework.kernels.planes_layout import PlanesLayout as PlanesLayout
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.limits import between
+from nerfloom.kernels import kept, memory, native
+from nerfloom.kernels.adam import sparse_adam
+from nerfloom.kernels.deferred import Parts, waiting
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from nerfloom.kernels.plane_bands import Shape, add_variation_gradient
+from nerfloom.kernels.planes_layout import PlanesLayout as PlanesLayout
+from nerfloom.kernels.triton_kernels import later
 
 MAX_HELD = 2**26
 """Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
@@ -114,7 +114,7 @@ class PlanesGradient:
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
     ) -> int | Tensor:  # fmt: skip
-        """Update `table` (E, F) by `framework.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
+        """Update `table` (E, F) by `nerfloom.kernels.adam.sparse_adam` with this gradient, and discard the gradient.
 
         `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
         """

@@ -10,8 +10,8 @@ from typing import Any
 
 from torch import Tensor
 
-from framework.base.errors import ConfigError, shown
-from framework.kernels import native
+from nerfloom.base.errors import ConfigError, shown
+from nerfloom.kernels import native
 
 MAX_GROUPS, MAX_FACTORS = 64, 6
 """Maximum number of groups, and of factors of a group."""

@@ -11,13 +11,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays
-from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.hash_grid import hash_grid
-from framework.kernels.intervals import interval_weights
-from framework.kernels.mlp import density_mlp, multiplies_bf16
-from framework.kernels.trace import DENSITY, GridDensity, density_arguments, has_compiled_parts
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.hash_grid import hash_grid
+from nerfloom.kernels.intervals import interval_weights
+from nerfloom.kernels.mlp import density_mlp, multiplies_bf16
+from nerfloom.kernels.trace import DENSITY, GridDensity, density_arguments, has_compiled_parts
 
 
 def proposal_weights(rays: Rays, t: Tensor, density: GridDensity) -> Tensor:

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, INT64, TRITON, Operation
-from framework.kernels.given import check_indices
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, INT64, TRITON, Operation
+from nerfloom.kernels.given import check_indices
+from nerfloom.kernels.triton_kernels import later
 
 
 def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:

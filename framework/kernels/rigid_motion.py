@@ -14,8 +14,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from framework.kernels.dispatch import TORCH, Operation
-from framework.kernels.math import cross_matrix
+from nerfloom.kernels.dispatch import TORCH, Operation
+from nerfloom.kernels.math import cross_matrix
 
 SMALL = 0.25
 """Squared angle below which the factors are their series, which neither divide by 0 nor cancel."""

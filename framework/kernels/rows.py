@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, INT64, Operation
-from framework.kernels.given import check_indices
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, INT64, Operation
+from nerfloom.kernels.given import check_indices
 
 _gather = native.Function("gather_rows", "ppipipqpi")
 

@@ -1,7 +1,7 @@
 """Projections of balls into an image with alpha, for the visual hull (Laurentini 1994).
 
 They determine which balls the image shows to be empty, and which pixels may show the others: see
-`framework.scene.silhouettes`.
+`nerfloom.scene.silhouettes`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.kernels import native
-from framework.kernels.dispatch import BOOL, CPP, Operation
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import BOOL, CPP, Operation
 
 _sums = native.Function("opaque_sums", "pqqp")
 _hold = native.Function("hold_balls", "pqfpffffpqqiipi")

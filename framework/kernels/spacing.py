@@ -12,9 +12,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from framework.geometry.limits import at_least
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from nerfloom.geometry.limits import at_least
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
 
 LADDER_PREMULTIPLIER = 2.0
 """Factor of distances, in units of the scene's scale, before the power ladder: Zip-NeRF."""

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from nerfloom.kernels.triton_kernels import later
 
 MAX_LEVELS = 4
 """Maximum number of bands."""

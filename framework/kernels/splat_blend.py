@@ -27,11 +27,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.splat_project import CUT, DISTANCE, OPACITY, REACH_X, RECORD, RGB, X, Y
-from framework.kernels.splat_tiles import TILE, TileLists
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from nerfloom.kernels.splat_project import CUT, DISTANCE, OPACITY, REACH_X, RECORD, RGB, X, Y
+from nerfloom.kernels.splat_tiles import TILE, TileLists
+from nerfloom.kernels.triton_kernels import later
 
 ABSOLUTE_X, ABSOLUTE_Y = CUT, REACH_X
 """Columns of the records' gradient with the sums of absolute gradients of x and y."""

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.splat_project import DEGREES, MIN_ALPHA, RECORD, SplatCamera, project_gaussians, sort_keys
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.splat_project import DEGREES, MIN_ALPHA, RECORD, SplatCamera, project_gaussians, sort_keys
 
 PACK = 16
 """Gaussians in a block."""

@@ -22,11 +22,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.geometry.lenses import Distortion, distort
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.spherical_harmonics import spherical_harmonics_reference
-from framework.kernels.triton_kernels import later
+from nerfloom.geometry.lenses import Distortion, distort
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics_reference
+from nerfloom.kernels.triton_kernels import later
 
 RECORD = 16
 """Values of a Gaussian on the image."""

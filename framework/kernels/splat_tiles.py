@@ -11,10 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, X, Y
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
+from nerfloom.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, X, Y
+from nerfloom.kernels.triton_kernels import later
 
 TILE = 16
 """Pixels along a tile's edge."""

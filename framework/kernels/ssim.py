@@ -27,9 +27,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, TRITON, Operation
-from framework.kernels.triton_kernels import later
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.triton_kernels import later
 
 WINDOW = 11
 """Pixels along each side of the window."""
@@ -42,7 +42,7 @@ C1, C2 = 0.01**2, 0.03**2
 def ssim(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the mean structural similarity of an image and its target: 1 where they are equal.
 
-    The definition is that of `framework.evaluation.metrics.ssim`, which is for measuring: in float64, without gradient.
+    The definition is that of `nerfloom.evaluation.metrics.ssim`, which is for measuring: in float64, without gradient.
     Values that are NaN make the result NaN.
 
     Args:

@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.device import to_float64
-from framework.kernels import native
-from framework.kernels.dispatch import CPP, Operation
+from nerfloom.base.device import to_float64
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
 
 EPS = 1e-5
 """Added to proposed weights in a denominator. The paper's code has 1.2e-7 and clips gradients, which we do not: what a

@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, native
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
-from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.march import CompiledMarch, March
-from framework.kernels.mlp import DENSITY_NETWORK, density_mlp, multiplies_bf16
-from framework.kernels.rows import gather_rows
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
+from nerfloom.kernels.hash_grid_lookup import TableGradient
+from nerfloom.kernels.march import CompiledMarch, March
+from nerfloom.kernels.mlp import DENSITY_NETWORK, density_mlp, multiplies_bf16
+from nerfloom.kernels.rows import gather_rows
 
 WAVES = (4, 4, 4, 4, 8, 16, 32, 128)
 """Samples per ray in each wave of a trace; the last size repeats. They begin smaller than those of a march: within one

@@ -13,14 +13,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels import native
-from framework.kernels.compositing import composite
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.march import March
-from framework.kernels.mlp import NETWORK, mlp, multiplies_bf16
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.kernels.trace import DENSITY, PATH, GridDensity, arguments, is_compiled, network_arguments, trace
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels import native
+from nerfloom.kernels.compositing import composite
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.march import March
+from nerfloom.kernels.mlp import NETWORK, mlp, multiplies_bf16
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.trace import DENSITY, PATH, GridDensity, arguments, is_compiled, network_arguments, trace
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from framework.kernels import kept, native
-from framework.kernels.dispatch import CPP, Operation
-from framework.kernels.hash_grid import hash_grid
-from framework.kernels.march import March
-from framework.kernels.mlp import multiplies_bf16
-from framework.kernels.trace import DENSITY, PATH, GridDensity, arguments, network_arguments
-from framework.kernels.traced_colors import GridColor, has_compiled_networks, traced_colors_reference
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.hash_grid import hash_grid
+from nerfloom.kernels.march import March
+from nerfloom.kernels.mlp import multiplies_bf16
+from nerfloom.kernels.trace import DENSITY, PATH, GridDensity, arguments, network_arguments
+from nerfloom.kernels.traced_colors import GridColor, has_compiled_networks, traced_colors_reference
 
 MAX_RAYS = 256
 """Maximum number of rays of a pixel in the compiled form."""

@@ -9,18 +9,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.data.scene import Scene
-from framework.fields.base import Field
-from framework.geometry.rays import Rays, Samples
-from framework.geometry.spheres import InvertedRays, distances_behind
-from framework.rendering.rendered import Rendered
-from framework.rendering.renderer import Renderer
-from framework.rendering.volume import VolumeRenderer, volume_renderer
-from framework.samplers.background import BackgroundConfig, foreground_sphere
-from framework.samplers.base import Sampler
-from framework.samplers.choice import HierarchicalConfig
-from framework.samplers.hierarchical import HierarchicalSampler
-from framework.samplers.uniform import LAST_INTERVAL, UniformSampler
+from nerfloom.data.scene import Scene
+from nerfloom.fields.base import Field
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.geometry.spheres import InvertedRays, distances_behind
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.renderer import Renderer
+from nerfloom.rendering.volume import VolumeRenderer, volume_renderer
+from nerfloom.samplers.background import BackgroundConfig, foreground_sphere
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.choice import HierarchicalConfig
+from nerfloom.samplers.hierarchical import HierarchicalSampler
+from nerfloom.samplers.uniform import LAST_INTERVAL, UniformSampler
 
 
 class SphereRenderer(Renderer):

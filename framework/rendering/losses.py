@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import distortion, ray_sum
-from framework.kernels.spacing import to_disparity
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import distortion, ray_sum
+from nerfloom.kernels.spacing import to_disparity
 
 WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""

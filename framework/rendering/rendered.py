@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
+from nerfloom.geometry.rays import Samples
 
 
 @dataclass(frozen=True)

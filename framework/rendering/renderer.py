@@ -6,10 +6,10 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor, nn
 
-from framework.base.optimised import Optimised
-from framework.fields.base import Field
-from framework.geometry.rays import Rays, Samples
-from framework.rendering.rendered import Rendered
+from nerfloom.base.optimised import Optimised
+from nerfloom.fields.base import Field
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.rendering.rendered import Rendered
 
 
 class Renderer(nn.Module, ABC):

@@ -5,16 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.fields.base import Field, HasGridColor
-from framework.geometry.rays import Rays
-from framework.kernels.trace import GridDensity
-from framework.kernels.traced_colors import GridColor, traced_colors
-from framework.kernels.traced_error import PixelTargets, TracedError, traced_error
-from framework.rendering.rendered import Rendered
-from framework.rendering.renderer import Renderer
-from framework.rendering.volume import VolumeRenderer, mean_distance
-from framework.samplers.base import Sampler
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.fields.base import Field, HasGridColor
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.trace import GridDensity
+from nerfloom.kernels.traced_colors import GridColor, traced_colors
+from nerfloom.kernels.traced_error import PixelTargets, TracedError, traced_error
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.renderer import Renderer
+from nerfloom.rendering.volume import VolumeRenderer, mean_distance
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.occupancy import OccupancySampler
 
 
 def error_of_traced(

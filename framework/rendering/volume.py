@@ -9,18 +9,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig
-from framework.data.scene import Scene
-from framework.fields.base import Field, HasAlpha
-from framework.geometry.points import sample_points
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.alpha import composite_alpha
-from framework.kernels.compositing import Composited, composite
-from framework.kernels.math import scale_gradient
-from framework.kernels.thinning import thinned
-from framework.rendering.rendered import Rendered
-from framework.rendering.renderer import Renderer
-from framework.samplers.proposal import half_edge
+from nerfloom.base.config import RayConfig
+from nerfloom.data.scene import Scene
+from nerfloom.fields.base import Field, HasAlpha
+from nerfloom.geometry.points import sample_points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.alpha import composite_alpha
+from nerfloom.kernels.compositing import Composited, composite
+from nerfloom.kernels.math import scale_gradient
+from nerfloom.kernels.thinning import thinned
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.renderer import Renderer
+from nerfloom.samplers.proposal import half_edge
 
 
 class VolumeRenderer(Renderer):

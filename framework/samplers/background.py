@@ -11,11 +11,11 @@ from typing import ClassVar, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from framework.base.config import Range
-from framework.base.decisions import Choice, Decision, fill
-from framework.base.errors import ConfigError
-from framework.data.scene import Scene
-from framework.samplers.choice import SamplingConfig, sampler_choice
+from nerfloom.base.config import Range
+from nerfloom.base.decisions import Choice, Decision, fill
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.scene import Scene
+from nerfloom.samplers.choice import SamplingConfig, sampler_choice
 
 MARGIN = 1.1
 """Radius of the sphere, in units of the distance of the farthest camera from its centre, as in NeRF++'s own code."""

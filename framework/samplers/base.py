@@ -7,11 +7,11 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
-from framework.base.optimised import Optimised
-from framework.base.protocols import SeesRegistered
-from framework.base.step_kind import StepKind
-from framework.fields.base import DensityFunction, Field
-from framework.geometry.rays import Rays, Samples
+from nerfloom.base.optimised import Optimised
+from nerfloom.base.protocols import SeesRegistered
+from nerfloom.base.step_kind import StepKind
+from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.geometry.rays import Rays, Samples
 
 
 class Sampler(nn.Module, ABC):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.fields.base import DensityFunction
-from framework.geometry.points import Points
+from nerfloom.fields.base import DensityFunction
+from nerfloom.geometry.points import Points
 
 CHUNK = 2**15
 """Number of positions that are evaluated at once."""

@@ -9,19 +9,19 @@ from typing import ClassVar, Literal, TypeVar
 
 from torch import Tensor
 
-from framework.base.config import Auto, Range, RayConfig
-from framework.base.decisions import Choice, Decision, fill
-from framework.base.device import device_kind, relative_speed
-from framework.base.errors import ConfigError
-from framework.data.scene import Scene
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.base import Field
-from framework.fields.encoded import DensityField
-from framework.samplers.base import Sampler
-from framework.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
-from framework.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
-from framework.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
-from framework.scene.motion import MotionConfig, vertices_in_time
+from nerfloom.base.config import Auto, Range, RayConfig
+from nerfloom.base.decisions import Choice, Decision, fill
+from nerfloom.base.device import device_kind, relative_speed
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.scene import Scene
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.base import Field
+from nerfloom.fields.encoded import DensityField
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
+from nerfloom.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
+from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
+from nerfloom.scene.motion import MotionConfig, vertices_in_time
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""

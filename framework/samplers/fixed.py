@@ -8,19 +8,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from framework.fields.base import HasAlpha
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.alpha import alpha_depth
-from framework.kernels.fixed_march import Placed, fill, longest_ray, reach
-from framework.kernels.march import Occupancy, Wave
-from framework.samplers.room import Room
+from nerfloom.fields.base import HasAlpha
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.alpha import alpha_depth
+from nerfloom.kernels.fixed_march import Placed, fill, longest_ray, reach
+from nerfloom.kernels.march import Occupancy, Wave
+from nerfloom.samplers.room import Room
 
 SHORTEST = 1e-10
 """Length by which the optical depth of an empty slot is divided, scene units."""
 
 
 class Steps(NamedTuple):
-    """Steps of rays through a grid, as `framework.kernels.fixed_march.fill` takes them."""
+    """Steps of rays through a grid, as `nerfloom.kernels.fixed_march.fill` takes them."""
 
     occupancy: Occupancy
     """The grid, of one box."""

@@ -7,14 +7,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.base.step_kind import StepKind
-from framework.fields.base import Field
-from framework.geometry.points import sample_points
-from framework.geometry.rays import CoarseLevel, Rays, Samples
-from framework.kernels.intervals import interval_weights, resample
-from framework.samplers.base import Sampler
-from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
-from framework.samplers.uniform import samples_from_points, stratified_points
+from nerfloom.base.step_kind import StepKind
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import sample_points
+from nerfloom.geometry.rays import CoarseLevel, Rays, Samples
+from nerfloom.kernels.intervals import interval_weights, resample
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from nerfloom.samplers.uniform import samples_from_points, stratified_points
 
 LEAST_COARSE = 3
 """Minimum number of stratified samples per ray; fine samples are drawn from the weights between first and last."""

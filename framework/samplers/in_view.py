@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View, every
-from framework.geometry.bounds import cell_corners
-from framework.kernels.silhouettes import Photograph, pixels_under_balls
-from framework.samplers.base import Sampler
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View, every
+from nerfloom.geometry.bounds import cell_corners
+from nerfloom.kernels.silhouettes import Photograph, pixels_under_balls
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.occupancy import OccupancySampler
 
 LEAST = 2**14
 """Minimum number of pixels of a view; to find those of a smaller one takes as long as their rays."""

@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.base.step_kind import StepKind
-from framework.data.scene import Scene
-from framework.fields.base import DensityFunction, Field
-from framework.geometry.rays import Rays, Samples
-from framework.geometry.spheres import intersect_sphere
-from framework.samplers.background import BackgroundConfig, foreground, foreground_sphere
-from framework.samplers.base import Sampler
-from framework.samplers.choice import make_sampler
+from nerfloom.base.step_kind import StepKind
+from nerfloom.data.scene import Scene
+from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.geometry.spheres import intersect_sphere
+from nerfloom.samplers.background import BackgroundConfig, foreground, foreground_sphere
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.choice import make_sampler
 
 
 class InsideSphere(Sampler):

@@ -16,25 +16,25 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from framework.base import device as devices
-from framework.base.errors import ConfigError, shown
-from framework.base.step_kind import StepKind
-from framework.fields.base import DensityFunction, Field, HasAlpha, HasGridDensity
-from framework.geometry.bounds import nested_boxes
-from framework.geometry.points import interval_points
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.alpha import alpha_depth
-from framework.kernels.fixed_march import most_steps
-from framework.kernels.given import is_followed
-from framework.kernels.kept import Waves
-from framework.kernels.march import RUN, March, Occupancy, Wave, march, refresh_occupancy
-from framework.kernels.occupancy import own_cells
-from framework.kernels.rows import gather_rows
-from framework.kernels.trace import trace
-from framework.samplers.base import Sampler
-from framework.samplers.cells import beside, densities_over_time, places
-from framework.samplers.fixed import Steps, attached, sample_into_slots
-from framework.samplers.room import Room
+from nerfloom.base import device as devices
+from nerfloom.base.errors import ConfigError, shown
+from nerfloom.base.step_kind import StepKind
+from nerfloom.fields.base import DensityFunction, Field, HasAlpha, HasGridDensity
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.geometry.points import interval_points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.alpha import alpha_depth
+from nerfloom.kernels.fixed_march import most_steps
+from nerfloom.kernels.given import is_followed
+from nerfloom.kernels.kept import Waves
+from nerfloom.kernels.march import RUN, March, Occupancy, Wave, march, refresh_occupancy
+from nerfloom.kernels.occupancy import own_cells
+from nerfloom.kernels.rows import gather_rows
+from nerfloom.kernels.trace import trace
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.cells import beside, densities_over_time, places
+from nerfloom.samplers.fixed import Steps, attached, sample_into_slots
+from nerfloom.samplers.room import Room
 
 MAX_CELLS = 512
 """Maximum number of cells along an axis; the state of 512^3 cells takes 0.8 GB."""
@@ -290,7 +290,7 @@ class OccupancySampler(Sampler):
         """Mark cells as empty, permanently.
 
         Args:
-            hull: (L n^3,) or (T n^3,) bool (`framework.scene.silhouettes`), False for these cells; or, with slices of
+            hull: (L n^3,) or (T n^3,) bool (`nerfloom.scene.silhouettes`), False for these cells; or, with slices of
                 time, (n^3,) for all of them.
         """
         own = own_cells(self.levels, self.resolution).to(hull.device)

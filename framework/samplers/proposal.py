@@ -18,21 +18,21 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from framework.base.device import StepValue
-from framework.base.optimised import Optimised
-from framework.base.step_kind import StepKind
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import DensityFunction, Field, HasGridDensity
-from framework.fields.encoded import DensityField
-from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Footprint, Points, sample_points
-from framework.geometry.rays import Histogram, Rays, Samples
-from framework.kernels.intervals import interval_weights, proposal_excess, resample
-from framework.kernels.proposals import proposal_weights
-from framework.kernels.spacing import spacing
-from framework.kernels.step_functions import blurred_excess
-from framework.kernels.trace import GridDensity
-from framework.samplers.base import Sampler
+from nerfloom.base.device import StepValue
+from nerfloom.base.optimised import Optimised
+from nerfloom.base.step_kind import StepKind
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import DensityFunction, Field, HasGridDensity
+from nerfloom.fields.encoded import DensityField
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.points import Footprint, Points, sample_points
+from nerfloom.geometry.rays import Histogram, Rays, Samples
+from nerfloom.kernels.intervals import interval_weights, proposal_excess, resample
+from nerfloom.kernels.proposals import proposal_weights
+from nerfloom.kernels.spacing import spacing
+from nerfloom.kernels.step_functions import blurred_excess
+from nerfloom.kernels.trace import GridDensity
+from nerfloom.samplers.base import Sampler
 
 ANNEALING_SLOPE = 10.0
 """Parameter b of the annealing of weights w^(b x / ((b - 1) x + 1)), where x is the fraction of `anneal_steps` done."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.fields.base import Field
-from framework.geometry.rays import Rays, Samples
-from framework.samplers.base import Sampler
+from nerfloom.fields.base import Field
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.samplers.base import Sampler
 
 LAST_INTERVAL = 1e10
 """Length of the last interval, scene units, as in the authors' code: the last sample stands for all behind it."""

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import nearest_point
-from framework.kernels.native import torch_on_one_thread
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import nearest_point
+from nerfloom.kernels.native import torch_on_one_thread
 
 REACH = 3.0
 """Half the side of the cube around the point that cameras look at outside which no matter is assumed, in the largest

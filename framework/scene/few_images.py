@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeVar
 
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
-from framework.base.decisions import Choice, Decision, fill
-from framework.base.errors import ConfigError
-from framework.data.scene import Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
+from nerfloom.base.decisions import Choice, Decision, fill
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.scene import Scene
 
 FEW, FEW_WITH_ALPHA = 12, 8
 """Number of training images up to which there are few: of a capture, and of images whose alpha shows what is empty."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from framework.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
-from framework.base.decisions import Choice
-from framework.data.scene import Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
+from nerfloom.base.decisions import Choice
+from nerfloom.data.scene import Scene
 
 TIMES_A_VERTEX, LEAST_VERTICES, MOST_VERTICES = 6, 3, 2**10
 """Times of images for each vertex along an axis of time, and the minimum and maximum number of vertices. The paper's

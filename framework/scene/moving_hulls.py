@@ -2,7 +2,7 @@
 
 A transparent pixel says that its ray is empty at the time of its image. At another moment, a ball is empty if the image
 shows the larger one to be empty that matter could have come from: its radius is greater by what matter moves meanwhile
-(`framework.scene.speed`). So a cell may be occupied at a moment if no image shows the ball around it to be empty and
+(`nerfloom.scene.speed`). So a cell may be occupied at a moment if no image shows the ball around it to be empty and
 some `WITNESSES` of the images about that moment show matter in its direction.
 """
 
@@ -15,8 +15,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from framework.data.travel import Travel
-from framework.scene.silhouettes import Silhouettes, held_cells
+from nerfloom.data.travel import Travel
+from nerfloom.scene.silhouettes import Silhouettes, held_cells
 
 NEAREST = 32
 """Number of images that are asked about a moment: those since which, or until which, matter moves least."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from framework.base.decisions import Decision
-from framework.data.dataset import Dataset
-from framework.data.light import light_spread
+from nerfloom.base.decisions import Decision
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.light import light_spread
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
+from nerfloom.cameras.cameras import Cameras
 
 BLOCK = 4
 """Cells along an edge of the cubes that are tested as one."""

@@ -12,11 +12,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from framework.cameras.cameras import Cameras
-from framework.geometry.bounds import nested_boxes
-from framework.geometry.rays import Rays
-from framework.kernels.first_shared import CELLS, LEVELS, first_shared
-from framework.kernels.native import torch_on_one_thread
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.first_shared import CELLS, LEVELS, first_shared
+from nerfloom.kernels.native import torch_on_one_thread
 
 BLOCK = 4
 """Cells along an edge of the cubes that are tested before their cells are."""

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.data.dataset import Dataset
-from framework.data.pixel_set import PixelSet
-from framework.geometry.bounds import cell_corners
-from framework.kernels.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.geometry.bounds import cell_corners
+from nerfloom.kernels.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
 
 COARSEST = 8
 """Maximum side of the first cubes tested, cells."""

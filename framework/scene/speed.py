@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.data.travel import Travel
-from framework.geometry.bounds import intersect_box
-from framework.scene.moving_hulls import nearest
-from framework.scene.silhouettes import Silhouettes, held_balls
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.travel import Travel
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.scene.moving_hulls import nearest
+from nerfloom.scene.silhouettes import Silhouettes, held_balls
 
 LEAST_IMAGES, LEAST_TIMES = 24, 8
 """Minimum number of images, and of their different times; from fewer, no speed is found."""

@@ -12,11 +12,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import OURS, Look
-from framework.splats.ply import ply_size
-from framework.splats.spz import BITS, encoded, rounded_harmonics
+from nerfloom.base.errors import ConfigError
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import OURS, Look
+from nerfloom.splats.ply import ply_size
+from nerfloom.splats.spz import BITS, encoded, rounded_harmonics
 
 COARSER_BITS = (4, 3)
 """Bits of harmonics in SPZ files where `BITS` are too many."""

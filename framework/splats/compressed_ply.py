@@ -23,10 +23,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.errors import DataError
-from framework.data.ply import PlyElement, PlyHeader, read_columns
-from framework.kernels.splat_project import DC, DEGREES
-from framework.splats.gaussians import Gaussians
+from nerfloom.base.errors import DataError
+from nerfloom.data.ply import PlyElement, PlyHeader, read_columns
+from nerfloom.kernels.splat_project import DC, DEGREES
+from nerfloom.splats.gaussians import Gaussians
 
 CHUNK = 256
 """Gaussians in a chunk."""

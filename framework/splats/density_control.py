@@ -11,10 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from framework.base.processes import add_up
-from framework.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
-from framework.kernels.splat_project import OPACITY, rotation_matrices
-from framework.splats.gaussians import Gaussians
+from nerfloom.base.processes import add_up
+from nerfloom.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
+from nerfloom.kernels.splat_project import OPACITY, rotation_matrices
+from nerfloom.splats.gaussians import Gaussians
 
 GRADIENT = 8e-4
 """Mean gradient of the image position, of images whose longer side is 2 units, from which a Gaussian is not enough."""

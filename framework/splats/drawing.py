@@ -7,17 +7,17 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import every
-from framework.geometry.lenses import LENSES, Distortion
-from framework.kernels.splat_blend import CHANNELS, Blended, blend
-from framework.kernels.splat_project import SplatCamera, project_gaussians, sort_keys
-from framework.kernels.splat_tiles import tile_lists
-from framework.rendering.rendered import Picture
-from framework.splats.gaussians import MAX_DEGREE, Gaussians
-from framework.splats.look import OURS, Look
-from framework.splats.room import Room
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import every
+from nerfloom.geometry.lenses import LENSES, Distortion
+from nerfloom.kernels.splat_blend import CHANNELS, Blended, blend
+from nerfloom.kernels.splat_project import SplatCamera, project_gaussians, sort_keys
+from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
+from nerfloom.splats.look import OURS, Look
+from nerfloom.splats.room import Room
 
 DRAWN = ("pinhole", "opencv", "fisheye")
 """Camera models that Gaussians can be drawn for."""

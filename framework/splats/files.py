@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from framework.base.atomic import write_atomically
-from framework.base.errors import ConfigError, DataError
-from framework.splats.budget import fitted_ply, fitted_spz
-from framework.splats.gaussians import Gaussians, Splats
-from framework.splats.look import ELSEWHERE, OURS, Look
-from framework.splats.ply import read_ply, write_ply
-from framework.splats.splat import read_splat
-from framework.splats.spz import MAGIC, encoded, out_of_range, read_spz
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.splats.budget import fitted_ply, fitted_spz
+from nerfloom.splats.gaussians import Gaussians, Splats
+from nerfloom.splats.look import ELSEWHERE, OURS, Look
+from nerfloom.splats.ply import read_ply, write_ply
+from nerfloom.splats.splat import read_splat
+from nerfloom.splats.spz import MAGIC, encoded, out_of_range, read_spz
 
 SUFFIXES = (".ply", ".spz")
 """Suffixes of files that can be written."""

@@ -9,10 +9,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from framework.cameras.view import View
-from framework.kernels.splat_project import DEGREES
-from framework.rendering.rendered import Picture
-from framework.splats.look import Look
+from nerfloom.cameras.view import View
+from nerfloom.kernels.splat_project import DEGREES
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.look import Look
 
 MAX_DEGREE = max(DEGREES)
 """Highest degree of the spherical harmonics that colours are made of."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from framework.base.optimised import RowChange
-from framework.splats.gaussians import MAX_DEGREE, Gaussians
+from nerfloom.base.optimised import RowChange
+from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 
 USUAL_STEPS = 30_000
 """Steps of a run of 3D Gaussian Splatting, for which its learning rates are."""

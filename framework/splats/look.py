@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from framework.base.console import say
-from framework.base.errors import DataError, printable
-from framework.kernels.splat_project import BLUR
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError, printable
+from nerfloom.kernels.splat_project import BLUR
 
 Sort = Literal["distance", "depth"]
 """What Gaussians are sorted by: distance from the camera, or depth along its optical axis."""

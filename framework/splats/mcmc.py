@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base import device as devices
-from framework.kernels.splat_project import rotation_matrices
-from framework.splats.gaussians import Gaussians
+from nerfloom.base import device as devices
+from nerfloom.kernels.splat_project import rotation_matrices
+from nerfloom.splats.gaussians import Gaussians
 
 DEAD = 0.005
 """Opacity from which on a Gaussian is of no use."""

@@ -10,9 +10,9 @@ is a part of the Gaussian (Yu et al. 2024, section 4.1). With f for it, scales a
 stored times the root of the ratio of the products of s^2 and of s^2 + f^2. So they are read, and images are antialiased
 with the blur of that method, 0.1 pixels^2 (section 4.2, and kernel_size of its code).
 
-How the Gaussians are drawn stands in comments (`framework.splats.look`).
+How the Gaussians are drawn stands in comments (`nerfloom.splats.look`).
 
-Harmonics have the order and the signs of `framework.kernels.spherical_harmonics`, and are evaluated at the direction
+Harmonics have the order and the signs of `nerfloom.kernels.spherical_harmonics`, and are evaluated at the direction
 from the camera to the Gaussian: in utils/sh_utils.py of https://github.com/graphdeco-inria/gaussian-splatting degree 1
 is -C1 y, C1 z, -C1 x with C1 = 0.4886025119029199, and degrees 2 and 3 are equal too for unit directions, constant by
 constant (Sloan 2008, with the Condon-Shortley phase). So coefficients are stored as they are.
@@ -28,12 +28,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.data.ply import PlyElement, header_text, read_columns, read_header, vertices, write_columns
-from framework.splats.compressed_ply import is_compressed, read_compressed
-from framework.splats.gaussians import MAX_DEGREE, Gaussians, Splats
-from framework.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.ply import PlyElement, header_text, read_columns, read_header, vertices, write_columns
+from nerfloom.splats.compressed_ply import is_compressed, read_compressed
+from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
+from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
 
 SURE = 16.0
 """Logit that stands for an opacity of 1, whose logit is infinite; other programs write it so. -SURE stands for 0."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.cameras.view import every
-from framework.kernels import native
-from framework.kernels.splat_packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
-from framework.kernels.splat_project import MIN_ALPHA, SplatCamera
-from framework.splats.drawing import draw, draw_colors
-from framework.splats.gaussians import Gaussians
-from framework.splats.start import morton
+from nerfloom.cameras.view import every
+from nerfloom.kernels import native
+from nerfloom.kernels.splat_packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
+from nerfloom.kernels.splat_project import MIN_ALPHA, SplatCamera
+from nerfloom.splats.drawing import draw, draw_colors
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.start import morton
 
 MORTON_CELLS = 2**20
 """Cells along an axis by which Gaussians are sorted."""

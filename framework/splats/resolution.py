@@ -8,7 +8,7 @@ from collections import Counter
 import torch
 from torch import Tensor
 
-from framework.base.pace import Pace, StepTimes
+from nerfloom.base.pace import Pace, StepTimes
 
 REDUCED_SHARE = 0.4
 """Share of the budget for reduced images where there are enough steps at full size."""

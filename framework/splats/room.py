@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from framework.base import device as devices
-from framework.kernels.splat_tiles import TileLists
+from nerfloom.base import device as devices
+from nerfloom.kernels.splat_tiles import TileLists
 
 HEADROOM = 1.3
 """Room that is given, in units of the most that an image has needed."""

@@ -6,15 +6,15 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
-from framework.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from framework.base.decisions import Choice, Decision, fill, is_open
-from framework.base.device import device_kind, relative_speed
-from framework.base.processes import processes
-from framework.data.scene import Scene
-from framework.splats.gaussians import MAX_DEGREE
-from framework.splats.learning import MOST_STEPS, number_for, rate_factor
-from framework.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
-from framework.splats.resolution import REDUCED_SHARE
+from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.decisions import Choice, Decision, fill, is_open
+from nerfloom.base.device import device_kind, relative_speed
+from nerfloom.base.processes import processes
+from nerfloom.data.scene import Scene
+from nerfloom.splats.gaussians import MAX_DEGREE
+from nerfloom.splats.learning import MOST_STEPS, number_for, rate_factor
+from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
+from nerfloom.splats.resolution import REDUCED_SHARE
 
 PIXELS_PER_SECOND = 25 * 400 * 400
 """Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.errors import DataError
-from framework.kernels.splat_project import DC
-from framework.splats.gaussians import Gaussians
-from framework.splats.ply import usable
+from nerfloom.base.errors import DataError
+from nerfloom.kernels.splat_project import DC
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.ply import usable
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 """A Gaussian."""

@@ -18,7 +18,7 @@ RDF, number for number. (Converters that leave axes alone exist.) With y and z a
 and the harmonics that are odd in y and z together (`SIGNS`).
 
 **How they are drawn.** The lowest bit of the flags says that the Gaussians were trained with antialiasing. What else
-`framework.splats.look` says stands in the comment of the gzip file (RFC 1952, FCOMMENT), which other programs skip.
+`nerfloom.splats.look` says stands in the comment of the gzip file (RFC 1952, FCOMMENT), which other programs skip.
 
 **Versions.** Version 2 is written, since some programs read no other, and 2 and 3 are read. With 8 bits of x, y and z,
 w has no bits to speak of where it is near 0, and such a rotation may be off by twelve degrees. But a Gaussian has 24
@@ -40,13 +40,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.atomic import write_atomically
-from framework.base.console import say
-from framework.base.errors import ConfigError, DataError
-from framework.splats.gaussians import MAX_DEGREE, Gaussians, Splats
-from framework.splats.look import ELSEWHERE, OURS, Look, comments, look_of
-from framework.splats.ply import usable
-from framework.splats.transform import quaternion_product
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
+from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, look_of
+from nerfloom.splats.ply import usable
+from nerfloom.splats.transform import quaternion_product
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")

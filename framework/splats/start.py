@@ -7,16 +7,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import ConfigError
-from framework.base.evenly_spaced import evenly_spaced
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import Dataset
-from framework.data.scene import Scene
-from framework.geometry.bounds import cell_corners
-from framework.kernels.splat_project import DC
-from framework.scene.silhouettes import Silhouettes, visual_hull
-from framework.splats.gaussians import Gaussians
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.scene import Scene
+from nerfloom.geometry.bounds import cell_corners
+from nerfloom.kernels.splat_project import DC
+from nerfloom.scene.silhouettes import Silhouettes, visual_hull
+from nerfloom.splats.gaussians import Gaussians
 
 OPACITY = 0.1
 """Of every Gaussian at the start."""

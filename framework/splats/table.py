@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from framework.base.optimised import Optimised
+from nerfloom.base.optimised import Optimised
 
 
 class Table(nn.Module):

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from framework.kernels.spherical_harmonics import spherical_harmonics_reference
-from framework.splats.gaussians import Gaussians
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics_reference
+from nerfloom.splats.gaussians import Gaussians
 
 DIRECTIONS = 64
 """Number of directions at which harmonics are compared; 16 unknowns need at least as many."""

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import framework
-from framework.base.extras import EXTRAS, install_command
+import nerfloom
+from nerfloom.base.extras import EXTRAS, install_command
 
 PACKAGES = ("numpy", "tyro", "rich", "imageio", "pillow", "PyYAML", "pycolmap", "tensorboard", "jinja2", "triton")
 """Packages whose versions are listed beside torch's."""
@@ -45,10 +45,10 @@ def _said(value: Callable[[], str]) -> str:
 
 
 def _nerfloom() -> str:
-    from framework.training.machine import commit
+    from nerfloom.training.machine import commit
 
     here = commit()
-    return f"{framework.__version__} from {Path(framework.__file__).parent}" + (f", commit {here}" if here else "")
+    return f"{nerfloom.__version__} from {Path(nerfloom.__file__).parent}" + (f", commit {here}" if here else "")
 
 
 def _torch() -> str:
@@ -59,7 +59,7 @@ def _torch() -> str:
 
 
 def _kernels() -> str:
-    from framework.kernels import native, triton_kernels
+    from nerfloom.kernels import native, triton_kernels
 
     built = sorted(path.stem for path in native.FOLDER.glob(f"*{native.SUFFIX}"))
     triton = "can be used" if triton_kernels.available() else "cannot be used"
@@ -67,9 +67,9 @@ def _kernels() -> str:
 
 
 def _cpu() -> str:
-    from framework.base.device import cpu_features, num_cores
-    from framework.kernels.native import NEEDS
-    from framework.training.machine import processor
+    from nerfloom.base.device import cpu_features, num_cores
+    from nerfloom.kernels.native import NEEDS
+    from nerfloom.training.machine import processor
 
     relevant = {feature for needs in NEEDS.values() for feature in needs}
     sets = ", ".join(sorted(cpu_features() & relevant)) or "none of the instruction sets that kernels are built for"
@@ -89,7 +89,7 @@ def _gpu() -> str:
 
 
 def _memory() -> str:
-    from framework.base.device import machine_memory
+    from nerfloom.base.device import machine_memory
 
     memory = machine_memory()
     return f"{memory / 1e9:.1f} GB" if memory < float("inf") else "unknown"

@@ -10,9 +10,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from framework.base.config import TrainConfig
-from framework.base.console import track
-from framework.data.dataset import Dataset
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.console import track
+from nerfloom.data.dataset import Dataset
 
 PASSES = 16
 """Maximum number of times that rays are drawn, of which some end on no surface."""
@@ -50,10 +50,10 @@ def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: f
     Returns:
         The points; there are fewer than `count` where rays end on no surface, and possibly none.
     """
-    from framework.base.registry import load_method
-    from framework.export.points import SurfacePoints, joined, surface_points
-    from framework.training.run import Run
-    from framework.training.trainer import Trainer
+    from nerfloom.base.registry import load_method
+    from nerfloom.export.points import SurfacePoints, joined, surface_points
+    from nerfloom.training.run import Run
+    from nerfloom.training.trainer import Trainer
 
     method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
     # instant-ngp's settings and rates are those of its few seconds; nerfacto's are not (docs/notes/splatting.md).

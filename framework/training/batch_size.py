@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from framework.base.config import RayConfig
-from framework.base.pace import Pace
+from nerfloom.base.config import RayConfig
+from nerfloom.base.pace import Pace
 
 SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples or on the time."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 
-from framework.base.config import TrainConfig
-from framework.training.state import State
+from nerfloom.base.config import TrainConfig
+from nerfloom.training.state import State
 
 EVALUATION_SHARE, EVALUATION_SECONDS = 0.5, 10.0
 """Maximum time of an evaluation that nobody has asked for, as a fraction of that of training; and what it may always

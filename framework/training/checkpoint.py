@@ -18,11 +18,11 @@ from typing import Any
 import torch
 from torch.torch_version import TorchVersion
 
-from framework.base.archives import uncompressed_size
-from framework.base.atomic import write_atomically as write_atomically
-from framework.base.console import say
-from framework.base.errors import CheckpointError
-from framework.training.run_path import CHECKPOINTS
+from nerfloom.base.archives import uncompressed_size
+from nerfloom.base.atomic import write_atomically as write_atomically
+from nerfloom.base.console import say
+from nerfloom.base.errors import CheckpointError
+from nerfloom.training.run_path import CHECKPOINTS
 
 FOLDER = CHECKPOINTS
 """Name of the checkpoints' folder in a run's folder."""

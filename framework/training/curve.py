@@ -15,12 +15,12 @@ from dataclasses import asdict, astuple, dataclass
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from framework.base.device import runs_ahead
-from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import Measured, evaluation_background, measure_view, spread, views_to_judge
-from framework.model import Model
-from framework.training.progress import StepReport
-from framework.training.run import finite_or_null
+from nerfloom.base.device import runs_ahead
+from nerfloom.data.dataset import Dataset
+from nerfloom.evaluation.evaluator import Measured, evaluation_background, measure_view, spread, views_to_judge
+from nerfloom.model import Model
+from nerfloom.training.progress import StepReport
+from nerfloom.training.run import finite_or_null
 
 FEW = 3
 """Maximum number of images that are evaluated between evaluations of all images."""

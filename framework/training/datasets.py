@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.data.dataset import Dataset, Split, load_dataset
-from framework.data.pixel_cache import PixelMemory
-from framework.evaluation.evaluator import spread
-from framework.training.run import Run
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import Dataset, Split, load_dataset
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.evaluation.evaluator import spread
+from nerfloom.training.run import Run
 
 
 def load_split(run: Run, split: Split, most: int | None = None) -> Dataset:

@@ -24,12 +24,12 @@ from typing import Any, Generic, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import ConfigError
-from framework.base.processes import processes
-from framework.base.step_kind import StepKind
-from framework.data.sources import BatchSource
-from framework.model import Model
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.processes import processes
+from nerfloom.base.step_kind import StepKind
+from nerfloom.data.sources import BatchSource
+from nerfloom.model import Model
 
 T = TypeVar("T")
 WARM_UP = 3

@@ -8,17 +8,17 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-from framework.base.console import say
-from framework.data.dataset import Dataset
-from framework.data.pixels import composite
-from framework.evaluation.evaluator import evaluate, evaluation_background, timed_view
-from framework.evaluation.panels import composed, view_panels
-from framework.model import Model
-from framework.training.budget import evaluation_seconds
-from framework.training.curve import FewImages, Point, in_order, rows
-from framework.training.progress import StepReport, TensorBoard
-from framework.training.run import Run, write_report
-from framework.training.state import State
+from nerfloom.base.console import say
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels import composite
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background, timed_view
+from nerfloom.evaluation.panels import composed, view_panels
+from nerfloom.model import Model
+from nerfloom.training.budget import evaluation_seconds
+from nerfloom.training.curve import FewImages, Point, in_order, rows
+from nerfloom.training.progress import StepReport, TensorBoard
+from nerfloom.training.run import Run, write_report
+from nerfloom.training.state import State
 
 PICTURE_SHARE = 0.1
 """Maximum time for TensorBoard's images, as a fraction of the training time."""

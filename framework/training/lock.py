@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from framework.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError
 
 LOCK = ".lock"
 """Name of the locked file. It names the process that holds the lock; unlocked, it means nothing."""

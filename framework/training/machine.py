@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 
-import framework
-from framework.base.device import machine_memory
-from framework.kernels import native, triton_kernels
+import nerfloom
+from nerfloom.base.device import machine_memory
+from nerfloom.kernels import native, triton_kernels
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "nerfloom": framework.__version__,
+        "nerfloom": nerfloom.__version__,
         "commit": commit(),
     }
 
@@ -61,7 +61,7 @@ def processor() -> str:
 
 def commit() -> str | None:
     """Return the commit of the running checkout, with + if files differ from it; None for an installed package."""
-    root = Path(framework.__file__).parents[1]
+    root = Path(nerfloom.__file__).parents[1]
     if not (root / ".git").exists():
         return None
     try:

@@ -1,7 +1,7 @@
 """Gradients of several processes: each takes the mean of all before the optimiser's step.
 
 `torch.nn.parallel.DistributedDataParallel` does so in hooks of autograd, which never run for tables whose gradient is
-deferred (`framework.kernels.deferred`). So the gradients are summed explicitly: large tables where they are, and all
+deferred (`nerfloom.kernels.deferred`). So the gradients are summed explicitly: large tables where they are, and all
 other parameters in one tensor, as each exchange takes time of its own.
 """
 
@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.base.errors import LostProcessError
-from framework.base.processes import add_up, gathered, processes
-from framework.training.optim import Adam
+from nerfloom.base.errors import LostProcessError
+from nerfloom.base.processes import add_up, gathered, processes
+from nerfloom.training.optim import Adam
 
 LARGE = 2**18
 """Number of elements from which a gradient is summed on its own."""

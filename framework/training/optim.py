@@ -8,20 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.config import TrainConfig
-from framework.base.device import StepValue
-from framework.base.optimised import DefersGradient, ParameterGroup, RowChange
-from framework.kernels.adam import all_finite, dense_adam, sparse_adam
-from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.memory import require, table
-from framework.kernels.planes import PlanesGradient
-from framework.model import Model, parts
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.device import StepValue
+from nerfloom.base.optimised import DefersGradient, ParameterGroup, RowChange
+from nerfloom.kernels.adam import all_finite, dense_adam, sparse_adam
+from nerfloom.kernels.hash_grid_lookup import TableGradient
+from nerfloom.kernels.memory import require, table
+from nerfloom.kernels.planes import PlanesGradient
+from nerfloom.model import Model, parts
 
 
 class Adam:
     """Adam (Kingma and Ba 2015), and a sparse one for groups with `sparse` set.
 
-    A sparse group holds tables (E, F) of which a step uses few entries (`framework.kernels.adam`). The gradient of a
+    A sparse group holds tables (E, F) of which a step uses few entries (`nerfloom.kernels.adam`). The gradient of a
     table is the one that the backward pass left in `deferred`, or else `grad`.
 
     Groups and states have the form of PyTorch's optimisers, but this is none of them: making one imports PyTorch's

@@ -10,31 +10,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig, TrainConfig
-from framework.base.console import say
-from framework.base.decisions import Decision
-from framework.base.errors import ConfigError
-from framework.base.registry import load_method
-from framework.cameras.ndc import NdcCameras
-from framework.cameras.upright import sideways_up
-from framework.data.dataset import Dataset
-from framework.data.folds import angle_between, folds, thumbnail
-from framework.data.pixel_set import PixelSet
-from framework.data.pixels import training_background
-from framework.geometry.bounds import nested_boxes
-from framework.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
-from framework.ray_model import RayModel
-from framework.samplers.base import SkipsCells
-from framework.samplers.choice import SamplingConfig
-from framework.samplers.occupancy import OccupancySampler
-from framework.scene.motion import MotionConfig
-from framework.scene.moving_hulls import moving_box, moving_hulls
-from framework.scene.profile import SceneProfile
-from framework.scene.seen_cells import seen_cells
-from framework.scene.silhouettes import Silhouettes, pixels_near, visual_hull
-from framework.scene.speed import LEAST_IMAGES, LEAST_TIMES, travel_of
-from framework.training.ray_starts import nearest_shown, starts_checked
-from framework.training.speed import with_speed
+from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.console import say
+from nerfloom.base.decisions import Decision
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import load_method
+from nerfloom.cameras.ndc import NdcCameras
+from nerfloom.cameras.upright import sideways_up
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.folds import angle_between, folds, thumbnail
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels import training_background
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
+from nerfloom.ray_model import RayModel
+from nerfloom.samplers.base import SkipsCells
+from nerfloom.samplers.choice import SamplingConfig
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.scene.motion import MotionConfig
+from nerfloom.scene.moving_hulls import moving_box, moving_hulls
+from nerfloom.scene.profile import SceneProfile
+from nerfloom.scene.seen_cells import seen_cells
+from nerfloom.scene.silhouettes import Silhouettes, pixels_near, visual_hull
+from nerfloom.scene.speed import LEAST_IMAGES, LEAST_TIMES, travel_of
+from nerfloom.training.ray_starts import nearest_shown, starts_checked
+from nerfloom.training.speed import with_speed
 
 
 def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:

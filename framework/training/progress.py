@@ -13,8 +13,8 @@ import torch
 from rich.progress import BarColumn, Progress, TextColumn
 from torch import Tensor
 
-from framework.base.console import SECONDS_BETWEEN_LINES, console, say
-from framework.base.meter import UNKNOWN, left_text, time_text
+from nerfloom.base.console import SECONDS_BETWEEN_LINES, console, say
+from nerfloom.base.meter import UNKNOWN, left_text, time_text
 
 SECONDS_BETWEEN_STATES = 0.1
 """Seconds between changes of the progress bar, which shows losses: reading them means to wait for a GPU."""

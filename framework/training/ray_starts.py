@@ -7,16 +7,16 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig, TrainConfig
-from framework.base.decisions import Decision
-from framework.base.evenly_spaced import evenly_spaced
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import looked_at
-from framework.data.dataset import Dataset
-from framework.data.free_space import before_points
-from framework.method import SHARED_BY
-from framework.samplers.choice import SamplingConfig
-from framework.scene.shared_space import SharedSpace, share_cut_off
+from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.decisions import Decision
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import looked_at
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.free_space import before_points
+from nerfloom.method import SHARED_BY
+from nerfloom.samplers.choice import SamplingConfig
+from nerfloom.scene.shared_space import SharedSpace, share_cut_off
 
 MOST_CUT_OFF = 0.002
 """Maximum share of a reconstruction's points that rays may miss where they start late."""

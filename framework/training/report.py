@@ -6,14 +6,14 @@ from pathlib import Path
 
 import torch
 
-from framework.base.device import peak_memory
-from framework.base.errors import ConfigError
-from framework.evaluation.evaluator import Evaluation
-from framework.ray_model import RayModel
-from framework.training.machine import kernels, machine
-from framework.training.outcome import Outcome
-from framework.training.run import Run, finite_or_null, write_json, write_report
-from framework.training.trainer import Trainer
+from nerfloom.base.device import peak_memory
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.evaluator import Evaluation
+from nerfloom.ray_model import RayModel
+from nerfloom.training.machine import kernels, machine
+from nerfloom.training.outcome import Outcome
+from nerfloom.training.run import Run, finite_or_null, write_json, write_report
+from nerfloom.training.trainer import Trainer
 
 SUMMARY = "summary.json"
 """Name of the summary in a run's folder."""

@@ -26,18 +26,18 @@ from typing import Any
 
 import yaml
 
-from framework.base.config import TrainConfig, from_plain, read_yaml, to_plain
-from framework.base.console import say
-from framework.base.errors import ConfigError, DataError
-from framework.base.registry import load_dataparser, load_method
-from framework.base.step_limit import limited_as_given
-from framework.cameras.camera_path import read_transforms
-from framework.cameras.poses import Placement
-from framework.data.data_folder import find_data
-from framework.data.dataset import DataParser, Dataset, ParsedScene, Split
-from framework.data.training_images import chosen_images
-from framework.training.checkpoint import write_atomically
-from framework.training.run_path import CONFIG, config_file
+from nerfloom.base.config import TrainConfig, from_plain, read_yaml, to_plain
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.base.step_limit import limited_as_given
+from nerfloom.cameras.camera_path import read_transforms
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.data_folder import find_data
+from nerfloom.data.dataset import DataParser, Dataset, ParsedScene, Split
+from nerfloom.data.training_images import chosen_images
+from nerfloom.training.checkpoint import write_atomically
+from nerfloom.training.run_path import CONFIG, config_file
 
 TRANSFORMS = "dataparser_transforms.json"
 """Name of the placement in a run's folder."""

@@ -7,8 +7,8 @@ import os
 import tempfile
 from pathlib import Path
 
-from framework.base.console import say
-from framework.base.errors import CheckpointError, ConfigError, DataError, nearest
+from nerfloom.base.console import say
+from nerfloom.base.errors import CheckpointError, ConfigError, DataError, nearest
 
 CONFIG = "config.yml"
 """Name of the settings in a run's folder."""

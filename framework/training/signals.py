@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
-from framework.base.console import console
+from nerfloom.base.console import console
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM)
 NOTED = b"stopping after this step; again to stop at once, without saving\n"

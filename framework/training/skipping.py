@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from framework.base.device import wait_for
-from framework.data.pixels import draw_batch
-from framework.geometry.rays import Rays
-from framework.kernels.occupancy import own_cells
-from framework.model import evaluating, parts
-from framework.ray_model import RayModel
-from framework.samplers.base import SkipsCells
-from framework.samplers.occupancy import OccupancySampler
-from framework.splats.resolution import ImageSizes
-from framework.splats.room import Room as SplatRoom
+from nerfloom.base.device import wait_for
+from nerfloom.data.pixels import draw_batch
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.occupancy import own_cells
+from nerfloom.model import evaluating, parts
+from nerfloom.ray_model import RayModel
+from nerfloom.samplers.base import SkipsCells
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.splats.resolution import ImageSizes
+from nerfloom.splats.room import Room as SplatRoom
 
 if TYPE_CHECKING:
-    from framework.training.trainer import Trainer
+    from nerfloom.training.trainer import Trainer
 
 PROBE_RAYS, WARM_UP_RAYS = 1024, 64
 """Number of random training rays on which the savings are measured, and of those that are rendered before."""

@@ -8,13 +8,13 @@ from typing import TypeVar
 
 import torch
 
-from framework.base.config import TrainConfig
-from framework.base.decisions import Decision
-from framework.base.device import device_kind, relative_speed
-from framework.base.processes import processes
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.encoded import EncodedField
-from framework.geometry.points import Points
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.decisions import Decision
+from nerfloom.base.device import device_kind, relative_speed
+from nerfloom.base.processes import processes
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.geometry.points import Points
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 SAMPLES = 2**14

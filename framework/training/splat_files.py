@@ -8,23 +8,23 @@ from typing import Any, Literal
 
 import torch
 
-from framework.base.config import RaysPerPixel, TrainConfig
-from framework.base.console import say
-from framework.base.device import choose_device
-from framework.base.errors import ConfigError, DataError
-from framework.base.machine_config import MachineConfig
-from framework.base.registry import load_dataparser, load_method
-from framework.data.data_folder import find_data
-from framework.data.dataset import DataParser, ParsedScene, load_dataset
-from framework.data.offsets import offset_file, read_offset
-from framework.data.pixel_cache import PixelMemory
-from framework.data.scene import Scene
-from framework.geometry.local_origin import local_origin, rounding
-from framework.splats.files import is_splat_file, read_gaussians
-from framework.splats.gaussians import Gaussians, TakesGaussians
-from framework.splats.transform import transformed
-from framework.training.run import Run
-from framework.training.trained import Trained, build_model, load_trained
+from nerfloom.base.config import RaysPerPixel, TrainConfig
+from nerfloom.base.console import say
+from nerfloom.base.device import choose_device
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.data.data_folder import find_data
+from nerfloom.data.dataset import DataParser, ParsedScene, load_dataset
+from nerfloom.data.offsets import offset_file, read_offset
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.scene import Scene
+from nerfloom.geometry.local_origin import local_origin, rounding
+from nerfloom.splats.files import is_splat_file, read_gaussians
+from nerfloom.splats.gaussians import Gaussians, TakesGaussians
+from nerfloom.splats.transform import transformed
+from nerfloom.training.run import Run
+from nerfloom.training.trained import Trained, build_model, load_trained
 
 METHOD = "gaussian-splatting"
 """Method that draws the Gaussians of a file."""

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from framework.base.processes import gathered, processes
-from framework.training.curve import Entry
+from nerfloom.base.processes import gathered, processes
+from nerfloom.training.curve import Entry
 
 FIRST_SAMPLES_PER_RAY = 256.0
 """Initial estimate of samples per ray, if the batch size depends on it."""

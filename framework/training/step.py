@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.device import AFTER_STEP, BEFORE_STEP, shared_stream
-from framework.kernels.given import is_bad_here
-from framework.model import Loss, Model
-from framework.training.mean_gradients import mean_gradients
-from framework.training.optim import Adam, set_learning_rate
+from nerfloom.base.device import AFTER_STEP, BEFORE_STEP, shared_stream
+from nerfloom.kernels.given import is_bad_here
+from nerfloom.model import Loss, Model
+from nerfloom.training.mean_gradients import mean_gradients
+from nerfloom.training.optim import Adam, set_learning_rate
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,17 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from framework.base.config import AppearanceConfig, RayConfig, RaysPerPixel, TrainConfig
-from framework.base.device import choose_device
-from framework.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
-from framework.base.registry import load_method
-from framework.cameras.poses import Placement
-from framework.data.data_folder import find_data
-from framework.data.scene import Scene
-from framework.model import Model, RendersFromImages
-from framework.training.checkpoint import FOLDER, find_newest, load_checkpoint
-from framework.training.datasets import load_split
-from framework.training.run import Run, read_run
+from nerfloom.base.config import AppearanceConfig, RayConfig, RaysPerPixel, TrainConfig
+from nerfloom.base.device import choose_device
+from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
+from nerfloom.base.registry import load_method
+from nerfloom.cameras.poses import Placement
+from nerfloom.data.data_folder import find_data
+from nerfloom.data.scene import Scene
+from nerfloom.model import Model, RendersFromImages
+from nerfloom.training.checkpoint import FOLDER, find_newest, load_checkpoint
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, read_run
 
 
 @dataclass(frozen=True)

@@ -14,33 +14,33 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.checked import checked
-from framework.base.config import RayConfig, TrainConfig, to_plain
-from framework.base.console import say
-from framework.base.device import BEFORE_STEP, seed_step
-from framework.base.errors import CheckpointError, DivergenceError
-from framework.base.pace import Pace
-from framework.base.processes import alone, from_first, processes
-from framework.data.dataset import Dataset
-from framework.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
-from framework.evaluation.metrics import MAX_PSNR
-from framework.kernels.native import torch_on_one_thread
-from framework.model import KeepsPace, StartsFromImages
-from framework.scene.profile import SceneProfile
-from framework.training.batch_size import BatchSize
-from framework.training.budget import reason_to_stop, spent
-from framework.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
-from framework.training.graphs import kind_of_step, make_graphs
-from framework.training.held_out import HeldOut
-from framework.training.optim import first_non_finite, make_optimizer
-from framework.training.outcome import Outcome
-from framework.training.preparation import decided, profile_of, show_images, skip_empty
-from framework.training.progress import ProgressBar, StepReport, TensorBoard
-from framework.training.run import Run
-from framework.training.signals import stop_signals
-from framework.training.state import State, agree
-from framework.training.step import StepResult, learn, schedule, train_step
-from framework.training.trained import build_model, restore_model
+from nerfloom.base.checked import checked
+from nerfloom.base.config import RayConfig, TrainConfig, to_plain
+from nerfloom.base.console import say
+from nerfloom.base.device import BEFORE_STEP, seed_step
+from nerfloom.base.errors import CheckpointError, DivergenceError
+from nerfloom.base.pace import Pace
+from nerfloom.base.processes import alone, from_first, processes
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
+from nerfloom.evaluation.metrics import MAX_PSNR
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.model import KeepsPace, StartsFromImages
+from nerfloom.scene.profile import SceneProfile
+from nerfloom.training.batch_size import BatchSize
+from nerfloom.training.budget import reason_to_stop, spent
+from nerfloom.training.checkpoint import FOLDER, checkpoint_path, load_checkpoint, load_newest, save_checkpoint
+from nerfloom.training.graphs import kind_of_step, make_graphs
+from nerfloom.training.held_out import HeldOut
+from nerfloom.training.optim import first_non_finite, make_optimizer
+from nerfloom.training.outcome import Outcome
+from nerfloom.training.preparation import decided, profile_of, show_images, skip_empty
+from nerfloom.training.progress import ProgressBar, StepReport, TensorBoard
+from nerfloom.training.run import Run
+from nerfloom.training.signals import stop_signals
+from nerfloom.training.state import State, agree
+from nerfloom.training.step import StepResult, learn, schedule, train_step
+from nerfloom.training.trained import build_model, restore_model
 
 STEPS_PER_LOG = 25
 """Steps between points of TensorBoard's curves, and between readings of errors from a device."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.evaluation.outputs import Arrays, distance_range
-from framework.viewer.canvas import enlarged, paste
-from framework.viewer.drawing import colored
-from framework.viewer.pace import Piece, Rays, Speed, Waiting, refinement
-from framework.viewer.request import Request
+from nerfloom.evaluation.outputs import Arrays, distance_range
+from nerfloom.viewer.canvas import enlarged, paste
+from nerfloom.viewer.drawing import colored
+from nerfloom.viewer.pace import Piece, Rays, Speed, Waiting, refinement
+from nerfloom.viewer.request import Request
 
 ROUGH_QUALITY, FINE_QUALITY = 70, 95
 """Quality of JPEG files while a picture is coarse, and when it is finished."""

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from framework.viewer.photographs import Photographs
-from framework.viewer.request import number_in, quaternion_of
+from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.request import number_in, quaternion_of
 
 if TYPE_CHECKING:
     import viser

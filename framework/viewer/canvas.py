@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from framework.evaluation.outputs import Arrays
-from framework.viewer.pace import Piece
-from framework.viewer.request import smaller
+from nerfloom.evaluation.outputs import Arrays
+from nerfloom.viewer.pace import Piece
+from nerfloom.viewer.request import smaller
 
 
 def enlarged(kept: Arrays, width: int, height: int) -> dict[str, np.ndarray]:

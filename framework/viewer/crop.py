@@ -8,15 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import CENTER, Cameras
-from framework.cameras.view import View
-from framework.geometry.bounds import intersect_box
-from framework.geometry.rays import Rays
-from framework.model import Model
-from framework.ray_model import RayModel
-from framework.rendering.rendered import Picture
-from framework.splats.gaussians import RendersGaussians
-from framework.viewer.request import Crop
+from nerfloom.cameras.cameras import CENTER, Cameras
+from nerfloom.cameras.view import View
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.rays import Rays
+from nerfloom.model import Model
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.gaussians import RendersGaussians
+from nerfloom.viewer.request import Crop
 
 BY_RAYS = "Only what is inside the box is rendered, so that what lies behind its walls is seen."
 BY_CENTERS = "Only Gaussians whose centre is inside the box are drawn, so that what lies behind its walls is seen."

@@ -9,17 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.device import wait_for
-from framework.cameras.ndc import Ndc
-from framework.cameras.view import View
-from framework.evaluation.appearance import appearance_of, shown_appearance
-from framework.evaluation.evaluator import evaluation_background
-from framework.evaluation.outputs import Arrays, distance_range, kept_outputs, rendered_outputs, shown_output
-from framework.rendering.rendered import Picture
-from framework.viewer.crop import picture_within
-from framework.viewer.pace import Piece
-from framework.viewer.request import Request
-from framework.viewer.subject import Subject
+from nerfloom.base.device import wait_for
+from nerfloom.cameras.ndc import Ndc
+from nerfloom.cameras.view import View
+from nerfloom.evaluation.appearance import appearance_of, shown_appearance
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.evaluation.outputs import Arrays, distance_range, kept_outputs, rendered_outputs, shown_output
+from nerfloom.rendering.rendered import Picture
+from nerfloom.viewer.crop import picture_within
+from nerfloom.viewer.pace import Piece
+from nerfloom.viewer.request import Request
+from nerfloom.viewer.subject import Subject
 
 NAMES = {"rgb": "rgb", "depth": "median_depth", "accumulation": "accumulation", "normals": "normals", "error": "error"}
 """Output of a request -> what is kept of a picture for it."""

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from framework.cameras.camera_path import CameraPath, Keyframe
-from framework.cameras.poses import Placement
-from framework.geometry.alignment import nearest_rotations
+from nerfloom.cameras.camera_path import CameraPath, Keyframe
+from nerfloom.cameras.poses import Placement
+from nerfloom.geometry.alignment import nearest_rotations
 
 MOST_KEYFRAMES = 500
 """Maximum number of cameras of a path."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.model import Model, parts
-from framework.samplers.base import SkipsCells
+from nerfloom.model import Model, parts
+from nerfloom.samplers.base import SkipsCells
 
 MOST_CELLS = 40_000
 """Maximum number of cells that are shown."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
-from framework.viewer.request import smaller
+from nerfloom.viewer.request import smaller
 
 STRIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Strides of coarse pictures, pixels."""

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from framework.base.console import say
-from framework.cameras.poses import looked_at
-from framework.viewer.browser import Browser
-from framework.viewer.camera_panel import CameraPanel
-from framework.viewer.drawing import draw
-from framework.viewer.pace import Piece
-from framework.viewer.panel import Panel
-from framework.viewer.path_panel import PathPanel
-from framework.viewer.photographs import Photographs
-from framework.viewer.reports import curve, heading
-from framework.viewer.request import Pose, Request
-from framework.viewer.studio import Studio
-from framework.viewer.subject import Subject
+from nerfloom.base.console import say
+from nerfloom.cameras.poses import looked_at
+from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.camera_panel import CameraPanel
+from nerfloom.viewer.drawing import draw
+from nerfloom.viewer.pace import Piece
+from nerfloom.viewer.panel import Panel
+from nerfloom.viewer.path_panel import PathPanel
+from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.reports import curve, heading
+from nerfloom.viewer.request import Pose, Request
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import Subject
 
 if TYPE_CHECKING:
     import viser

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from framework.evaluation.appearance import appearance_of
-from framework.viewer.crop import meaning
-from framework.viewer.occupancy import shown_cells
-from framework.viewer.request import (
+from nerfloom.evaluation.appearance import appearance_of
+from nerfloom.viewer.crop import meaning
+from nerfloom.viewer.occupancy import shown_cells
+from nerfloom.viewer.request import (
     FARTHEST,
     OUTPUTS,
     Crop,
@@ -22,7 +22,7 @@ from framework.viewer.request import (
     pose_of,
     size_of,
 )
-from framework.viewer.studio import Studio
+from nerfloom.viewer.studio import Studio
 
 if TYPE_CHECKING:
     import viser

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from framework.base.child import python_command
-from framework.base.console import say
-from framework.cameras.camera_path import CameraPath, Keyframe, write_camera_path
-from framework.viewer.camera_panel import move_camera
-from framework.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
-from framework.viewer.request import Request, number_in
-from framework.viewer.subject import Subject
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
+from nerfloom.viewer.camera_panel import move_camera
+from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
+from nerfloom.viewer.request import Request, number_in
+from nerfloom.viewer.subject import Subject
 
 if TYPE_CHECKING:
     import viser
@@ -189,7 +189,7 @@ class PathPanel:
             return
         output = file.with_name(video_suffix(file.stem))
         words = ["--camera-path-filename", file, "--output-path", output]
-        command = python_command("framework.cli.render", "camera-path", self._subject().run.folder, *words)
+        command = python_command("nerfloom.cli.render", "camera-path", self._subject().run.folder, *words)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         self._renders[:] = [process]
         self._note.content = f"Rendering {output.name} ..."

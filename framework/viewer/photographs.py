@@ -13,17 +13,17 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import NerfloomError
-from framework.cameras.cameras import Cameras
-from framework.cameras.ndc import Ndc, NdcCameras
-from framework.cameras.view import View
-from framework.data.dataset import ParsedScene
-from framework.data.image_files import Content, read_image
-from framework.data.pixels import composite
-from framework.evaluation.evaluator import spread
-from framework.training.run import Run
-from framework.viewer.request import Pose
+from nerfloom.base.console import say
+from nerfloom.base.errors import NerfloomError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.ndc import Ndc, NdcCameras
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import ParsedScene
+from nerfloom.data.image_files import Content, read_image
+from nerfloom.data.pixels import composite
+from nerfloom.evaluation.evaluator import spread
+from nerfloom.training.run import Run
+from nerfloom.viewer.request import Pose
 
 MOST = 200
 """Maximum number of cameras that are shown."""

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from framework.training.run import Run
+from nerfloom.training.run import Run
 
 LARGEST_REPORT = 2**24
 """Maximum size of a report, bytes."""

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.ndc import Ndc, NdcCameras
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.ndc import Ndc, NdcCameras
 
 FARTHEST = 1e6
 """Maximum coordinate of a camera, scene units."""

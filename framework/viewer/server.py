@@ -12,9 +12,9 @@ from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from framework.base.console import say
-from framework.base.errors import ConfigError, FlagError
-from framework.base.extras import install_command
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.extras import install_command
 
 if TYPE_CHECKING:
     import viser

@@ -7,16 +7,16 @@ import time
 from collections.abc import Callable
 from typing import cast
 
-from framework.base.console import say
-from framework.base.errors import NerfloomError
-from framework.cameras.ndc import Ndc
-from framework.evaluation.outputs import Arrays
-from framework.ray_model import RayModel
-from framework.viewer.browser import Browser
-from framework.viewer.drawing import Truth, draw
-from framework.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
-from framework.viewer.request import Request, smaller
-from framework.viewer.subject import Subject
+from nerfloom.base.console import say
+from nerfloom.base.errors import NerfloomError
+from nerfloom.cameras.ndc import Ndc
+from nerfloom.evaluation.outputs import Arrays
+from nerfloom.ray_model import RayModel
+from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.drawing import Truth, draw
+from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
+from nerfloom.viewer.request import Request, smaller
+from nerfloom.viewer.subject import Subject
 
 REST = 0.15
 """Seconds without a new request after which a picture is refined."""

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.base.errors import NerfloomError
-from framework.cameras.poses import Placement
-from framework.model import Model
-from framework.training.checkpoint import FOLDER, list_checkpoints
-from framework.training.run import Run
-from framework.training.trained import Trained, load_trained
-from framework.training.trainer import Trainer
+from nerfloom.base.errors import NerfloomError
+from nerfloom.cameras.poses import Placement
+from nerfloom.model import Model
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints
+from nerfloom.training.run import Run
+from nerfloom.training.trained import Trained, load_trained
+from nerfloom.training.trainer import Trainer
 
 
 @dataclass(frozen=True)

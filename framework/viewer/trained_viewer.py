@@ -6,14 +6,14 @@ import os
 import time
 from pathlib import Path
 
-from framework.base.console import say
-from framework.cameras.ndc import Ndc
-from framework.training.trained import Trained
-from framework.viewer.page import Page
-from framework.viewer.photographs import Photographs
-from framework.viewer.server import close_server, open_server
-from framework.viewer.studio import Studio
-from framework.viewer.subject import newer_checkpoint, of_trained, reloaded
+from nerfloom.base.console import say
+from nerfloom.cameras.ndc import Ndc
+from nerfloom.training.trained import Trained
+from nerfloom.viewer.page import Page
+from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.server import close_server, open_server
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import newer_checkpoint, of_trained, reloaded
 
 SECONDS_PER_LOOK = 2.0
 """Seconds between looks for a newer checkpoint."""

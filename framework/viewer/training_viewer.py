@@ -11,16 +11,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from framework.cameras.ndc import NdcCameras
-from framework.training.curve import in_order
-from framework.training.progress import StepReport
-from framework.training.trainer import BetweenSteps, Trainer
-from framework.viewer.pace import Share
-from framework.viewer.page import Page
-from framework.viewer.photographs import Photographs
-from framework.viewer.server import close_server, open_server
-from framework.viewer.studio import Studio
-from framework.viewer.subject import of_trainer
+from nerfloom.cameras.ndc import NdcCameras
+from nerfloom.training.curve import in_order
+from nerfloom.training.progress import StepReport
+from nerfloom.training.trainer import BetweenSteps, Trainer
+from nerfloom.viewer.pace import Share
+from nerfloom.viewer.page import Page
+from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.server import close_server, open_server
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import of_trainer
 
 if TYPE_CHECKING:
     import viser

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from framework.cli.bench import KINDS, USAGE, main
+from nerfloom.cli.bench import KINDS, USAGE, main
 from tests.cli.helpers import called
 from tests.conftest import Refused
 
 
 def test_help_lists_every_benchmark_in_a_line_without_torch() -> None:
-    shown = "from framework.cli.bench import main; sys.argv[1:] = ['--help']; main()"
+    shown = "from nerfloom.cli.bench import main; sys.argv[1:] = ['--help']; main()"
     code = f"import sys; {shown}; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     *lines, torch_is_loaded = done.stdout.splitlines()

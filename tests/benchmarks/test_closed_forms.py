@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.tools.benchmarks.closed_forms import (
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.tools.benchmarks.closed_forms import (
     BOX,
     Ball,
     Blobs,

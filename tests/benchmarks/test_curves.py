@@ -7,13 +7,13 @@ from threading import Event
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.base.registry import registered
-from framework.cli.bench import main
-from framework.tools.benchmarks import curves
-from framework.tools.comparison import runner
-from framework.tools.comparison.plan import Conditions, Contender, Job
-from framework.tools.comparison.runner import Failure
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import registered
+from nerfloom.cli.bench import main
+from nerfloom.tools.benchmarks import curves
+from nerfloom.tools.comparison import runner
+from nerfloom.tools.comparison.plan import Conditions, Contender, Job
+from nerfloom.tools.comparison.runner import Failure
 from tests.comparison.runs import finish
 from tests.conftest import Refused
 

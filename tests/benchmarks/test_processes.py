@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.base import child
-from framework.tools.benchmarks import processes
+from nerfloom.tools.benchmarks import processes
 
 
 def test_each_kind_is_started_with_its_processes_and_its_share_of_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,7 +29,7 @@ def test_each_kind_is_started_with_its_processes_and_its_share_of_the_batch(monk
     ]
     batches = [(count, command[command.index("--samples-per-batch") + 1]) for count, command in started]
     assert batches == [("1", "1000"), ("4", "1000"), ("4", "250")] * 2
-    assert all(str(Path(child.__file__)) in command for command in commands)
+    assert all("nerfloom.cli.train" in command for command in commands)
     assert [row["seed"] for row in rows] == [0, 0, 0, 1, 1, 1]
     assert {row["seconds to 10 dB"] for row in rows} == {1.0}
     assert {row["seconds to 30 dB"] for row in rows} == {None}

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.cli.bench import main
-from framework.cli.train import run_of
-from framework.tools.benchmarks.table_text import LOADING, estimate
-from framework.tools.benchmarks.tables import Row, read_table
-from framework.tools.comparison import runner
-from framework.tools.comparison.plan import Conditions, Job
-from framework.tools.comparison.runner import Failure
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.bench import main
+from nerfloom.cli.train import run_of
+from nerfloom.tools.benchmarks.table_text import LOADING, estimate
+from nerfloom.tools.benchmarks.tables import Row, read_table
+from nerfloom.tools.comparison import runner
+from nerfloom.tools.comparison.plan import Conditions, Job
+from nerfloom.tools.comparison.runner import Failure
 from tests.comparison.runs import finish
 from tests.conftest import Refused
 from tests.site.commands import found
@@ -119,11 +119,12 @@ def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.M
     def here(data: Path | None, named: str | None = None) -> tuple[Path | None, str]:
         return (data, named or formats[data.name]) if data and data.name in formats else found(data, named)
 
-    monkeypatch.setattr("framework.data.data_folder.find_data", here)
+    monkeypatch.setattr("nerfloom.data.data_folder.find_data", here)
     rows = read_table(path, Path("data"), Path("runs")).rows
     understood: dict[str, Row] = {row.job.contender.label: row for row in rows}
     for row in understood.values():
-        _, _, _, method, *flags = row.job.train_command(row.conditions)
+        words = row.job.train_command(row.conditions)
+        method, *flags = words[words.index("nerfloom.cli.train") + 1 :]
         run = run_of(method, flags)
         assert run.config.max_seconds == row.seconds
         assert run.config.machine.seed == row.job.seed
@@ -234,7 +235,7 @@ def test_a_table_that_is_stopped_goes_on(tmp_path: Path) -> None:
     words = [
         sys.executable,
         "-m",
-        "framework.cli.bench",
+        "nerfloom.cli.bench",
         "tables",
         "--tables",
         str(write(tmp_path, f"rows: [{block}]")),

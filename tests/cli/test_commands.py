@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from framework.base.errors import ConfigError, DataError
-from framework.cli.train import _default_run, _parse_flags
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.cli.train import _default_run, _parse_flags
 from tests.cli.helpers import TINY_NGP, called, command
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import framework
-from framework.cli import evaluate, export, process_data, render
-from framework.cli import train as train_command
-from framework.training.run import read_run
+import nerfloom
+from nerfloom.cli import evaluate, export, process_data, render
+from nerfloom.cli import train as train_command
+from nerfloom.training.run import read_run
 from tests.cli.helpers import TINY_NGP, called, train
 from tests.conftest import Refused, ball_view
 
@@ -26,12 +26,12 @@ def trained(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_every_command_has_a_version(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    commands = [point for point in entry_points(group="console_scripts") if point.value.startswith("framework.cli.")]
+    commands = [point for point in entry_points(group="console_scripts") if point.value.startswith("nerfloom.cli.")]
     assert len(commands) >= 9
     for command in commands:
         monkeypatch.setattr(sys, "argv", [command.name, "--version"])
         command.load()()
-        assert capsys.readouterr().out.startswith(f"nerfloom {framework.__version__} from ")
+        assert capsys.readouterr().out.startswith(f"nerfloom {nerfloom.__version__} from ")
 
 
 @pytest.mark.medium

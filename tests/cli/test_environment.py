@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-import framework
-from framework.base import device
-from framework.cli import train
-from framework.kernels import native
-from framework.tools import environment as described
+import nerfloom
+from nerfloom.base import device
+from nerfloom.cli import train
+from nerfloom.kernels import native
+from nerfloom.tools import environment as described
 
 
 def table(text: str) -> dict[str, str]:
@@ -25,7 +25,7 @@ def test_it_says_what_a_report_needs(monkeypatch: pytest.MonkeyPatch, capsys: py
     train.main()
     rows = table(capsys.readouterr().out)
     assert {"nerfloom", "Python", "torch", "kernels", "CPU", "GPU", "memory", "system", "packages"} < set(rows)
-    assert rows["nerfloom"].startswith(f"{framework.__version__} from ")
+    assert rows["nerfloom"].startswith(f"{nerfloom.__version__} from ")
     assert rows["Python"].startswith(".".join(map(str, sys.version_info[:3])))
     assert rows["torch"].startswith(f"{torch.__version__}, ")
     assert rows["kernels"].startswith(f"{native.variant()} on the CPU")
@@ -48,7 +48,7 @@ def test_a_broken_installation_is_what_it_is_for(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.medium
 def test_the_version_alone_does_not_load_torch() -> None:
     code = (
-        "import sys; sys.argv = ['ns-train', '--version']; from framework.cli.train import main; main();"
+        "import sys; sys.argv = ['ns-train', '--version']; from nerfloom.cli.train import main; main();"
         "sys.exit('torch' in sys.modules)"
     )
     root = Path(__file__).parents[2]

@@ -16,10 +16,10 @@ import yaml
 from PIL import Image
 from torch import Tensor
 
-from framework.cameras.view import View
-from framework.cli.evaluate import main
-from framework.ray_model import RayModel
-from framework.rendering.rendered import Picture
+from nerfloom.cameras.view import View
+from nerfloom.cli.evaluate import main
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.rendered import Picture
 from tests.cli.helpers import called, train
 from tests.conftest import Refused
 
@@ -97,7 +97,7 @@ def test_an_image_that_is_not_finite_is_named_and_the_others_are_measured(
 
 
 def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.base.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("nerfloom.base.extras.find_spec", lambda name: None)
     found = evaluate(monkeypatch, finished, "--max-images", 1)
     assert (found["results"]["lpips"], found["results"]["lpips_std"]) == (None, None)
     advice = "absent: give a file of weights by --lpips-weights (docs/commands.md), or pip install lpips torchvision, "

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import Placement
-from framework.cameras.refinement import PoseRefinement
-from framework.cli.export import main
-from framework.data.ply import read_points, write_points
-from framework.export.cameras import camera_list, refined_cameras
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.cli.export import main
+from nerfloom.data.ply import read_points, write_points
+from nerfloom.export.cameras import camera_list, refined_cameras
 from tests.conftest import Refused
 from tests.training.helpers import tiny_trainer
 

@@ -11,7 +11,7 @@ from tests.cli.helpers import TINY_NGP
 
 FIRST_STEP = """
 import sys
-from framework.training.trainer import Trainer
+from nerfloom.training.trainer import Trainer
 
 train_step = Trainer.train_step
 
@@ -24,7 +24,7 @@ def first_step(self):
     raise Stepped
 
 Trainer.train_step = first_step
-from framework.cli.train import main
+from nerfloom.cli.train import main
 
 words = sys.argv[1:]
 for vis in ("none", "tensorboard"):
@@ -53,7 +53,7 @@ def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Pat
     assert done.returncode == 0, done.stderr
     without, with_files = (set(line.split()) for line in done.stdout.splitlines())
     for imported in (without, with_files):
-        assert "framework.training.step" in imported
+        assert "nerfloom.training.step" in imported
         assert imported & SLOW == set()
 
 

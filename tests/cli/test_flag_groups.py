@@ -9,13 +9,13 @@ from typing import Any, get_type_hints
 import pytest
 import tyro
 
-from framework.base import registry
-from framework.base.config import AUTO, Auto, RayConfig, TrainConfig
-from framework.base.registry import load_dataparser, load_method
-from framework.cli.flag_groups import DECIDED, GROUPS, grouped_flags
-from framework.cli.flag_text import plain_flags
-from framework.cli.train import run_of
-from framework.samplers.choice import SamplingConfig
+from nerfloom.base import registry
+from nerfloom.base.config import AUTO, Auto, RayConfig, TrainConfig
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.cli.flag_groups import DECIDED, GROUPS, grouped_flags
+from nerfloom.cli.flag_text import plain_flags
+from nerfloom.cli.train import run_of
+from nerfloom.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import tyro
 
-from framework.cli.flags import in_one_line, read_flags
-from framework.cli.viewer import ViewerFlags
+from nerfloom.cli.flags import in_one_line, read_flags
+from nerfloom.cli.viewer import ViewerFlags
 from tests.cli.helpers import called
 
 COMMANDS = {
@@ -37,7 +37,7 @@ def said(name: str, *words: object) -> str:
 
 def test_all_commands_are_tried() -> None:
     points = entry_points(group="console_scripts")
-    assert sorted(COMMANDS) == sorted(point.name for point in points if point.value.startswith("framework.cli."))
+    assert sorted(COMMANDS) == sorted(point.name for point in points if point.value.startswith("nerfloom.cli."))
 
 
 @pytest.mark.parametrize("name", COMMANDS)

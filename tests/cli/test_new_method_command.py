@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.cli.new_method import TEMPLATES, check_name, main, package_of
-from framework.tools.testing import assert_method
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.new_method import TEMPLATES, check_name, main, package_of
+from nerfloom.tools.testing import assert_method
 from tests.conftest import Refused
 
 ROOT = Path(__file__).parents[2]
@@ -86,7 +86,7 @@ def test_names_that_are_none(name: str) -> None:
 def test_names_that_are_taken() -> None:
     with pytest.raises(ConfigError, match="there is a method 'instant-ngp' already"):
         check_name("instant-ngp")
-    for name in ("lambda", "torch", "framework", "json"):
+    for name in ("lambda", "torch", "nerfloom", "json"):
         with pytest.raises(ConfigError, match=f"the method's module would be '{name}'"):
             check_name(name)
     check_name("my-method-2")

@@ -8,9 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
-from framework.cameras.cameras import Cameras
-from framework.cli.render import main
-from framework.cli.render_paths import walk_past
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cli.render import main
+from nerfloom.cli.render_paths import walk_past
 from tests.conftest import EditJson, Refused
 from tests.training.helpers import tiny_trainer
 

@@ -16,11 +16,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework import Picture, RayModel, View
-from framework.cameras.camera_path import CameraPath, write_camera_path
-from framework.cli import render as render_command
-from framework.evaluation import frames
-from framework.training.trained import load_trained
+from nerfloom import Picture, RayModel, View
+from nerfloom.cameras.camera_path import CameraPath, write_camera_path
+from nerfloom.cli import render as render_command
+from nerfloom.evaluation import frames
+from nerfloom.training.trained import load_trained
 from tests.cli.helpers import called, command, train
 from tests.conftest import EditJson, Refused
 from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, poses, to_scene, write_capture

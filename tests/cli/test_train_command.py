@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 
-from framework.base.registry import load_method
-from framework.cli.train import _default_run, _parse_flags, main
-from framework.training.run import Run, create_folder
+from nerfloom.base.registry import load_method
+from nerfloom.cli.train import _default_run, _parse_flags, main
+from nerfloom.training.run import Run, create_folder
 from tests.cli.helpers import TINY_NGP, called, run
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
@@ -136,7 +136,7 @@ def test_a_recipe_for_another_method(shared_tiny: Path, tmp_path: Path, refused:
 def started(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> Run:
     """The run that a command line would start."""
     runs: list[Run] = []
-    monkeypatch.setattr("framework.cli.session.start", runs.append)
+    monkeypatch.setattr("nerfloom.cli.session.start", runs.append)
     monkeypatch.setattr(sys, "argv", ["ns-train", *map(str, arguments)])
     main()
     return runs[0]
@@ -188,7 +188,7 @@ def test_help_of_a_method_states_its_own_defaults(shared_tiny: Path) -> None:
 
 def test_help_loads_nothing_heavy() -> None:
     code = (
-        "import sys; sys.argv = ['ns-train', '--help']; from framework.cli.train import main; main(); "
+        "import sys; sys.argv = ['ns-train', '--help']; from nerfloom.cli.train import main; main(); "
         "print([name for name in ('torch', 'numpy', 'tyro', 'methods', 'dataparsers') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -7,9 +7,9 @@ from statistics import stdev
 
 import pytest
 
-from framework.tools.comparison.measures import measure, pareto, rows_of, whole_levels
-from framework.tools.comparison.report import level_table
-from framework.tools.comparison.runner import is_done
+from nerfloom.tools.comparison.measures import measure, pareto, rows_of, whole_levels
+from nerfloom.tools.comparison.report import level_table
+from nerfloom.tools.comparison.runner import is_done
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.cli.compare import CompareFlags, plan_of
-from framework.tools.comparison.crops import VIEWS
-from framework.tools.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.compare import CompareFlags, plan_of
+from nerfloom.tools.comparison.crops import VIEWS
+from nerfloom.tools.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
 
@@ -59,7 +59,8 @@ def test_conditions_must_end_somewhere() -> None:
 
 def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(tmp_path: Path) -> None:
     job = Job(Contender.of("vanilla-nerf --machine.seed 7"), 43, tmp_path / "runs")
-    words = job.train_command(CONDITIONS)[3:]
+    words = job.train_command(CONDITIONS)
+    words = words[words.index("nerfloom.cli.train") + 1 :]
     assert words[0] == "vanilla-nerf"
     assert words[-4:] == ["--machine.seed", "7", "--downscale-factor", "2"]
     given = dict(zip(words[1::2], words[2::2], strict=False))
@@ -72,7 +73,7 @@ def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(t
     assert folder == job.folder
     job.folder.mkdir(parents=True)
     (job.folder / "config.yml").write_text("")
-    assert job.train_command(CONDITIONS)[3:] == ["--resume", str(job.folder)]
+    assert job.train_command(CONDITIONS)[-2:] == ["--resume", str(job.folder)]
     steps = replace(CONDITIONS, max_seconds=None, max_num_iterations=100)
     command = Job(Contender.of("kplanes"), 43, tmp_path / "runs").train_command(steps)
     assert command[command.index("--steps-per-eval-all-images") + 1] == "12"

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from framework import Cameras, ParsedScene
+from nerfloom import Cameras, ParsedScene
 
 FX, FY, CX, CY = 50.0, 52.0, 21.0, 14.0
 WIDTH, HEIGHT = 40, 30

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from framework import ParsedScene
+from nerfloom import ParsedScene
 
 SIZE = (60, 40)
 """Width and height of the photographs that the cameras were fitted to."""

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from framework.base.errors import DataError
-from framework.data.dataset import Split, load_dataset, read_image, reduce_image
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import Split, load_dataset, read_image, reduce_image
+from nerfloom.dataparsers.blender import Blender
 from tests.conftest import EditJson
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework.base.errors import DataError
-from framework.data.dataset import DataParser, load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import DataParser, load_dataset
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.conftest import write_tiny
 from tests.dataparsers.captures import FX, poses, worst_miss, write_capture, write_images
 from tests.dataparsers.test_polycam import write_polycam

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.colmap import Colmap
-from dataparsers.colmap_model import read_model
-from dataparsers.llff import Llff
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras
-from framework.cameras.poses import NEAR, estimate_near
-from framework.data.dataset import load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import NEAR, estimate_near
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.colmap_model import read_model
+from nerfloom.dataparsers.llff import Llff
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pycolmap = pytest.importorskip("pycolmap")

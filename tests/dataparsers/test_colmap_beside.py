@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataparsers.colmap import Colmap
-from dataparsers.nerfstudio import Nerfstudio
-from framework import ParsedScene
-from framework.data.dataset import load_dataset
+from nerfloom import ParsedScene
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.dataparsers.sparse_models import SIZE, Capture, make_capture, misses, write_colmap, write_images
 
 ALL = Nerfstudio(eval_mode="all")

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from dataparsers.dnerf import DNeRF
-from framework.base.errors import DataError
-from framework.data.data_folder import find_data
-from framework.data.dataset import Split, load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.data.data_folder import find_data
+from nerfloom.data.dataset import Split, load_dataset
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.dataparsers.dnerf import DNeRF
 from tests.conftest import EditJson
 
 

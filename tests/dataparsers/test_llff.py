@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.colmap import Colmap
-from dataparsers.llff import Llff
-from framework.base.errors import DataError
-from framework.cameras.poses import NEAR
-from framework.data.dataset import load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.poses import NEAR
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.llff import Llff
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_images
 
 FOCAL = 55.0

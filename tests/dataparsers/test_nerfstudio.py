@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework.base.errors import DataError
-from framework.data.dataset import Split, load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import Split, load_dataset
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.dataparsers.captures import (
     CX,
     CY,
@@ -163,7 +163,7 @@ def seen_through(model: str, right: float, down: float, ahead: float) -> tuple[f
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR", "ORTHOPHOTO"])
 def test_rays_through_lenses_meet_the_points_that_are_seen(capture: Path, model: str) -> None:
-    pytest.importorskip("framework.geometry.lenses")
+    pytest.importorskip("nerfloom.geometry.lenses")
     edit(capture, lambda c: c.update(camera_model=model, **CURVED))
     scene = ALL.parse(capture, "train")
     placed, worst = to_scene(scene, POINTS), 0.0

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from dataparsers.colmap import Colmap
-from dataparsers.llff import Llff
-from dataparsers.phototourism import Phototourism
-from framework.base.errors import DataError
-from framework.data.dataset import load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.llff import Llff
+from nerfloom.dataparsers.phototourism import Phototourism
 from tests.dataparsers.sparse_models import Capture, make_capture, misses, write_colmap, write_images
 
 pytest.importorskip("pycolmap")

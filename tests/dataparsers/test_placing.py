@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dataparsers.llff import Llff
-from dataparsers.nerfstudio import Nerfstudio
-from framework.cameras.poses import enlargement, nearest_point
+from nerfloom.cameras.poses import enlargement, nearest_point
+from nerfloom.dataparsers.llff import Llff
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.dataparsers.captures import FX, FY, write_capture
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.polycam import Polycam
-from framework.base.errors import DataError
+from nerfloom.base.errors import DataError
+from nerfloom.dataparsers.polycam import Polycam
 from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, poses, worst_miss, write_images
 
 STAMPS = [str(48_000_000_000 + 33_000_000 * index) for index in range(9)]

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.procedural import Procedural
-from dataparsers.procedural.many import REACH, random_parts, scene_numbers, write_scenes
-from dataparsers.procedural.scene import LIGHT, PARTS, inside, trace, trace_rows
-from dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
-from framework.base.errors import DataError
-from framework.data.dataset import load_dataset
-from framework.evaluation.evaluator import views_to_judge
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.procedural import Procedural
+from nerfloom.dataparsers.procedural.many import REACH, random_parts, scene_numbers, write_scenes
+from nerfloom.dataparsers.procedural.scene import LIGHT, PARTS, inside, trace, trace_rows
+from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
+from nerfloom.evaluation.evaluator import views_to_judge
 
 
 def camera_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

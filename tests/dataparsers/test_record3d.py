@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.record3d import Record3D
-from dataparsers.rotations import rotations
-from framework.base.errors import DataError
-from framework.data.dataset import load_dataset
+from nerfloom.base.errors import DataError
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.record3d import Record3D
+from nerfloom.dataparsers.rotations import rotations
 from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, poses, worst_miss, write_images
 
 COUNT = 12

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from dataparsers.dnerf import DNeRF
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import ParsedScene, Split, load_dataset
-from framework.scene.enclosing_box import enclosing_box
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import ParsedScene, Split, load_dataset
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.dataparsers.dnerf import DNeRF
+from nerfloom.scene.enclosing_box import enclosing_box
 
 BALLS = np.array([[0.2, 0.1, -0.1, 0.5], [-0.5, 0.3, 0.2, 0.25], [0.1, -0.6, 0.4, 0.2]])
 """Centres and radii."""

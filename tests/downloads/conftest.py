@@ -2,7 +2,7 @@
 
 import pytest
 
-from framework.tools.downloads import fetch
+from nerfloom.tools.downloads import fetch
 
 
 @pytest.fixture(autouse=True)

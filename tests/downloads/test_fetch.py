@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from framework.base.errors import DataError
-from framework.tools.downloads import fetch as fetching
-from framework.tools.downloads.catalogue import Source
-from framework.tools.downloads.fetch import SourceError, fetch
+from nerfloom.base.errors import DataError
+from nerfloom.tools.downloads import fetch as fetching
+from nerfloom.tools.downloads.catalogue import Source
+from nerfloom.tools.downloads.fetch import SourceError, fetch
 from tests.downloads.server import Served, serving
 
 CONTENT = random.Random(0).randbytes(3_000_000)

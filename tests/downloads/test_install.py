@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError, DataError
-from framework.cli import download_data
-from framework.data.data_folder import find_data
-from framework.tools.downloads import install as installing
-from framework.tools.downloads.catalogue import DATASETS, Archive, Dataset, Source, sources_table
-from framework.tools.downloads.install import announce, install
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.cli import download_data
+from nerfloom.data.data_folder import find_data
+from nerfloom.tools.downloads import install as installing
+from nerfloom.tools.downloads.catalogue import DATASETS, Archive, Dataset, Source, sources_table
+from nerfloom.tools.downloads.install import announce, install
 from tests.conftest import Refused
 from tests.downloads.server import Served, serving
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.evaluation.error_bound import limited_error, measured_error, parse_error
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.error_bound import limited_error, measured_error, parse_error
 from tests.training.helpers import tiny_trainer
 
 

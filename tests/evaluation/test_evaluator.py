@@ -9,21 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig
-from framework.cameras.cameras import Cameras, subpixels
-from framework.cameras.view import View
-from framework.data.pixels import PixelBatch
-from framework.data.scene import Scene
-from framework.data.sources import PixelSource, Request
-from framework.evaluation import evaluator
-from framework.evaluation.evaluator import Evaluation, evaluate, evaluation_background
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays, Samples
-from framework.ray_model import RayModel
-from framework.rendering.rendered import Rendered
-from framework.rendering.renderer import Renderer
-from framework.samplers.uniform import UniformSampler
+from nerfloom.base.config import RayConfig
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.cameras.view import View
+from nerfloom.data.pixels import PixelBatch
+from nerfloom.data.scene import Scene
+from nerfloom.data.sources import PixelSource, Request
+from nerfloom.evaluation import evaluator
+from nerfloom.evaluation.evaluator import Evaluation, evaluate, evaluation_background
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.renderer import Renderer
+from nerfloom.samplers.uniform import UniformSampler
 from tests.training.helpers import tiny_trainer
 
 SIZE = 12

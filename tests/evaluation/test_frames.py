@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from framework.base.errors import ConfigError
-from framework.evaluation.frames import Frames, hash_of_file, hash_of_tensors, key_of, open_frames
-from framework.evaluation.outputs import Arrays
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.frames import Frames, hash_of_file, hash_of_tensors, key_of, open_frames
+from nerfloom.evaluation.outputs import Arrays
 
 
 class Renderer:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from framework.evaluation.images import ERROR_AT_WHITE, error_map, heat, write_image
+from nerfloom.evaluation.images import ERROR_AT_WHITE, error_map, heat, write_image
 
 
 def test_a_written_image_reads_back_rounded(tmp_path: Path) -> None:

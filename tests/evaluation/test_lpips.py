@@ -10,8 +10,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 from torch.nn import functional
 
-from framework.base.errors import ConfigError
-from framework.evaluation.lpips import SHAPES, SMALLEST_OF_LPIPS, load_lpips, read_weights
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.lpips import SHAPES, SMALLEST_OF_LPIPS, load_lpips, read_weights
 
 Arrays = dict[str, np.ndarray]
 CPU = torch.device("cpu")

@@ -9,8 +9,8 @@ from scipy.ndimage import correlate1d
 from skimage.metrics import structural_similarity
 from torch.nn import functional
 
-from framework.evaluation.metrics import ms_ssim, psnr, quick_ssim, ssim
-from framework.kernels.ssim import PHOTOMETRIC
+from nerfloom.evaluation.metrics import ms_ssim, psnr, quick_ssim, ssim
+from nerfloom.kernels.ssim import PHOTOMETRIC
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.3])

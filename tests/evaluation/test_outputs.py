@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework.base.errors import ConfigError
-from framework.evaluation.outputs import (
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation.outputs import (
     NAMES,
     distance_range,
     kept_outputs,
@@ -14,7 +14,7 @@ from framework.evaluation.outputs import (
     shown_output,
     side_by_side,
 )
-from framework.rendering.rendered import Picture
+from nerfloom.rendering.rendered import Picture
 
 
 def picture(**changes: object) -> Picture:

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.evaluation.images import ERROR_AT_WHITE
-from framework.evaluation.panels import VIRIDIS, composed, depth_range, view_panels, viridis
+from nerfloom.evaluation.images import ERROR_AT_WHITE
+from nerfloom.evaluation.panels import VIRIDIS, composed, depth_range, view_panels, viridis
 
 
 def view(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

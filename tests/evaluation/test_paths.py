@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework import Picture, View
-from framework.cameras.cameras import Cameras, check_pose
-from framework.cameras.ndc import Ndc, NdcCameras
-from framework.cameras.poses import looked_at
-from framework.evaluation.paths import (
+from nerfloom import Picture, View
+from nerfloom.cameras.cameras import Cameras, check_pose
+from nerfloom.cameras.ndc import Ndc, NdcCameras
+from nerfloom.cameras.poses import looked_at
+from nerfloom.evaluation.paths import (
     Arc,
     arc_of,
     focus_distance,

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from framework.base import extras
-from framework.base.errors import ConfigError
-from framework.evaluation import videos
-from framework.evaluation.video_suffixes import check_suffix
-from framework.evaluation.videos import (
+from nerfloom.base import extras
+from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation import videos
+from nerfloom.evaluation.video_suffixes import check_suffix
+from nerfloom.evaluation.videos import (
     write_distances,
     write_images,
     write_strip,

@@ -11,17 +11,17 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from dataparsers.blender import Blender
-from dataparsers.colmap import Colmap, read_images
-from dataparsers.colmap_model import read_model
-from dataparsers.nerfstudio import Nerfstudio
-from dataparsers.reading import read_json, read_pose
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import DataParser, ParsedScene
-from framework.export.cameras import PosedFiles, all_cameras, orthonormal, posed_files
-from framework.export.colmap_text import images_folder, quaternion, write_model
-from framework.export.transforms import transforms, write_transforms
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import DataParser, ParsedScene
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.dataparsers.colmap import Colmap, read_images
+from nerfloom.dataparsers.colmap_model import read_model
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.dataparsers.reading import read_json, read_pose
+from nerfloom.export.cameras import PosedFiles, all_cameras, orthonormal, posed_files
+from nerfloom.export.colmap_text import images_folder, quaternion, write_model
+from nerfloom.export.transforms import transforms, write_transforms
 from tests.cli.helpers import train
 
 SPLITS = ("train", "val", "test")

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from dataparsers.procedural.scene import inside, signed_distance, trace
-from framework.export.mesh import Mesh
-from framework.tools.benchmarks.chamfer import (
+from nerfloom.dataparsers.procedural.scene import inside, signed_distance, trace
+from nerfloom.export.mesh import Mesh
+from nerfloom.tools.benchmarks.chamfer import (
     distance_to_triangles,
     distances_to_mesh,
     mesh_sample,

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.export.density import LatticeDensity, default_level
-from framework.export.lattice import lattice_of
-from framework.export.mesh import closedness
-from framework.export.meshing import Cleaning, density_mesh
-from framework.geometry.points import Points
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.export.density import LatticeDensity, default_level
+from nerfloom.export.lattice import lattice_of
+from nerfloom.export.mesh import closedness
+from nerfloom.export.meshing import Cleaning, density_mesh
+from nerfloom.geometry.points import Points
+from nerfloom.samplers.occupancy import OccupancySampler
 
 pytest.importorskip("skimage")
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.cameras.poses import Placement
-from framework.export import isosurface as module
-from framework.export.isosurface import isosurface
-from framework.export.lattice import Lattice, lattice_of
-from framework.export.mesh import Mesh, closedness, vertex_normals, without_degenerate
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.poses import Placement
+from nerfloom.export import isosurface as module
+from nerfloom.export.isosurface import isosurface
+from nerfloom.export.lattice import Lattice, lattice_of
+from nerfloom.export.mesh import Mesh, closedness, vertex_normals, without_degenerate
 
 pytest.importorskip("skimage")
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework.export.colors import spread_colors
-from framework.export.mesh import (
+from nerfloom.export.colors import spread_colors
+from nerfloom.export.mesh import (
     Mesh,
     closedness,
     components,
@@ -16,7 +16,7 @@ from framework.export.mesh import (
     simplified,
     vertex_normals,
 )
-from framework.export.mesh_files import write_mesh
+from nerfloom.export.mesh_files import write_mesh
 
 trimesh = pytest.importorskip("trimesh")
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from framework.cameras.poses import Placement
-from framework.cameras.view import View
-from framework.data.ply import read_points
-from framework.export.mesh import closedness
-from framework.export.neighbors import inliers, mean_distances, plane_normals
-from framework.export.occupancy import boxes_mesh, cell_centers, write_cells, write_grid
-from framework.export.points import joined, picture_points
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.view import View
+from nerfloom.data.ply import read_points
+from nerfloom.export.mesh import closedness
+from nerfloom.export.neighbors import inliers, mean_distances, plane_normals
+from nerfloom.export.occupancy import boxes_mesh, cell_centers, write_cells, write_grid
+from nerfloom.export.points import joined, picture_points
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.export.test_tsdf import RADIUS, Ball, around
 
 pytest.importorskip("scipy")

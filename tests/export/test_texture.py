@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.export.mesh import Mesh, vertex_normals
-from framework.export.mesh_files import write_mesh
-from framework.export.texture import Atlas, Texturing, painted
+from nerfloom.base.errors import ConfigError
+from nerfloom.export.mesh import Mesh, vertex_normals
+from nerfloom.export.mesh_files import write_mesh
+from nerfloom.export.texture import Atlas, Texturing, painted
 
 trimesh = pytest.importorskip("trimesh")
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.export.isosurface import isosurface
-from framework.export.lattice import lattice_of
-from framework.export.mesh import Mesh, closedness, vertex_normals
-from framework.export.tsdf import BLOCK, FusedDistance, rendered_views, stride_for
-from framework.rendering.rendered import Picture
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.export.isosurface import isosurface
+from nerfloom.export.lattice import lattice_of
+from nerfloom.export.mesh import Mesh, closedness, vertex_normals
+from nerfloom.export.tsdf import BLOCK, FusedDistance, rendered_views, stride_for
+from nerfloom.rendering.rendered import Picture
 
 pytest.importorskip("skimage")
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])

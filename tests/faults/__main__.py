@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from framework.training.machine import machine
+from nerfloom.training.machine import machine
 from tests.faults import campaign
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from framework.training.checkpoint import FOLDER, list_checkpoints
-from framework.training.lock import LOCK
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints
+from nerfloom.training.lock import LOCK
 from tests.conftest import write_tiny
 from tests.faults.inside import INJECTED
 from tests.faults.runs import PATIENCE, curve, ended, new_run, readable_steps, start, wait_for_checkpoint

@@ -9,8 +9,8 @@ from itertools import count, cycle
 
 import numpy as np
 
-from framework.cli.train import main
-from framework.data.mapped_pixels import MappedPixels
+from nerfloom.cli.train import main
+from nerfloom.data.mapped_pixels import MappedPixels
 
 INJECTED = "injected"
 DAY = 86_400.0

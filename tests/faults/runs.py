@@ -7,8 +7,8 @@ import sys
 import time
 from pathlib import Path
 
-from framework.base.errors import CheckpointError
-from framework.training.checkpoint import FOLDER, list_checkpoints, load_checkpoint
+from nerfloom.base.errors import CheckpointError
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints, load_checkpoint
 from tests.cli.helpers import TINY_NGP
 
 ROOT = Path(__file__).parents[2]
@@ -36,7 +36,7 @@ def start(*arguments: object, world: str | None = None) -> subprocess.Popen[str]
     Args:
         world: what is wrong around it, a key of `tests.faults.inside.WORLDS`.
     """
-    program = ["framework.cli.train"] if world is None else ["tests.faults.inside", world]
+    program = ["nerfloom.cli.train"] if world is None else ["tests.faults.inside", world]
     words = [sys.executable, "-m", *program, *map(str, arguments)]
     # Threads that spin while they wait make a step fifty times slower where the cores are shared.
     environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}

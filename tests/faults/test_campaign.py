@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.training.checkpoint import FOLDER, list_checkpoints
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints
 from tests.faults import campaign
 from tests.faults.campaign import Injected, Report, Stage
 from tests.faults.runs import ended, wait_for_checkpoint

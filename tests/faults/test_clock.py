@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.cli.session import start
-from framework.training.checkpoint import list_checkpoints, load_newest
-from framework.training.run import run_folder
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.session import start
+from nerfloom.training.checkpoint import list_checkpoints, load_newest
+from nerfloom.training.run import run_folder
 from tests.training.helpers import tiny_run, tiny_trainer
 
 ROOT = Path(__file__).parents[2]
@@ -77,7 +77,7 @@ def test_a_time_that_comes_twice_names_no_folder_twice(
         def now(cls, tz: tzinfo | None = None) -> "Stopped":
             return cls(2026, 10, 25, 2, 30)
 
-    monkeypatch.setattr("framework.training.run.datetime", Stopped)
+    monkeypatch.setattr("nerfloom.training.run.datetime", Stopped)
     settings = {"output_dir": tmp_path, "max_num_iterations": 1, "max_eval_images": 0}
     a_run = tiny_run("instant-ngp", shared_tiny, tmp_path, **settings)
     first, second = (replace(a_run, folder=run_folder(a_run.method, a_run.config)) for _ in range(2))

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.cli.session import resume
-from framework.training.checkpoint import list_checkpoints, load_checkpoint
-from framework.training.run import read_run
-from framework.training.trained import load_trained
+from nerfloom.cli.session import resume
+from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint
+from nerfloom.training.run import read_run
+from nerfloom.training.trained import load_trained
 from tests.training.helpers import tiny_trainer
 
 

@@ -14,14 +14,14 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from framework.base.errors import CheckpointError, ConfigError
-from framework.cli import evaluate as eval_command
-from framework.cli.session import resume
-from framework.cli.session import start as start_session
-from framework.evaluation.evaluator import evaluate
-from framework.evaluation.images import write_image
-from framework.training.checkpoint import FOLDER, write_atomically
-from framework.training.run import create_folder, read_run, write_report
+from nerfloom.base.errors import CheckpointError, ConfigError
+from nerfloom.cli import evaluate as eval_command
+from nerfloom.cli.session import resume
+from nerfloom.cli.session import start as start_session
+from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.evaluation.images import write_image
+from nerfloom.training.checkpoint import FOLDER, write_atomically
+from nerfloom.training.run import create_folder, read_run, write_report
 from tests.conftest import Refused
 from tests.faults.conftest import Disk
 from tests.faults.runs import ended, readable_steps, start

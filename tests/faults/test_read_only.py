@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from framework.cli import evaluate as eval_command
-from framework.cli.train import main
-from framework.training.lock import LOCK
+from nerfloom.cli import evaluate as eval_command
+from nerfloom.cli.train import main
+from nerfloom.training.lock import LOCK
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import Refused
 from tests.faults.conftest import Disk

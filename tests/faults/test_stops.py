@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.machine_config import MachineConfig
-from framework.cli.session import resume, start
-from framework.training.checkpoint import FOLDER
-from framework.training.lock import LOCK
-from framework.training.progress import StepReport
-from framework.training.run import create_folder, read_run
-from framework.training.signals import Stopped, exit_status
-from framework.training.trainer import Trainer
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.cli.session import resume, start
+from nerfloom.training.checkpoint import FOLDER
+from nerfloom.training.lock import LOCK
+from nerfloom.training.progress import StepReport
+from nerfloom.training.run import create_folder, read_run
+from nerfloom.training.signals import Stopped, exit_status
+from nerfloom.training.trainer import Trainer
 from tests.faults import runs
 from tests.training.helpers import differences, tiny_run, tiny_trainer
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from framework.data.dataset import load_dataset
-from framework.data.mapped_pixels import MappedPixels
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_stream import FIRST_STEPS, PixelStream
-from framework.data.pixels import draw_pixels
-from framework.training.checkpoint import load_checkpoint
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.mapped_pixels import MappedPixels
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_stream import FIRST_STEPS, PixelStream
+from nerfloom.data.pixels import draw_pixels
+from nerfloom.training.checkpoint import load_checkpoint
 from tests.images import write_noise
 from tests.training.helpers import tiny_trainer
 
@@ -97,6 +97,6 @@ def test_a_decoder_that_dies_is_heard_of_and_leaves_nothing(
     def die(*_: Any) -> None:
         raise error
 
-    monkeypatch.setattr("framework.data.decoding.light_of", die)
+    monkeypatch.setattr("nerfloom.data.decoding.light_of", die)
     assert error_of(lambda: load_dataset(scene, "train", PixelMemory(limit, tmp_path / "cache"))) is error
     assert not (tmp_path / "cache").exists() or list((tmp_path / "cache").iterdir()) == []

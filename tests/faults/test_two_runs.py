@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.cli.session import start as start_session
-from framework.cli.train import main
-from framework.training.lock import LOCK, sole_user
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.session import start as start_session
+from nerfloom.cli.train import main
+from nerfloom.training.lock import LOCK, sole_user
 from tests.conftest import Refused
 from tests.faults.runs import ROOT, ended, new_run, start, wait_for_checkpoint
 from tests.training.helpers import tiny_run, tiny_trainer
@@ -22,7 +22,7 @@ HOLD = """
 import signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell ignores in the background
 from pathlib import Path
-from framework.training.lock import sole_user
+from nerfloom.training.lock import sole_user
 with sole_user(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

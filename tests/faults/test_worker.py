@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import DataError
-from framework.tools.processing.worker import Report, run_in_child
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.worker import Report, run_in_child
 
 ROOT = Path(__file__).parents[2]
 """Not from tests.faults.runs: children import this file, and torch takes them seconds."""
@@ -46,8 +46,8 @@ def test_a_process_that_runs_out_of_memory(tmp_path: Path) -> None:
 PARENT = """
 import sys
 from pathlib import Path
-from framework.cli.common import run_command
-from framework.tools.processing.worker import run_in_child
+from nerfloom.cli.common import run_command
+from nerfloom.tools.processing.worker import run_in_child
 from tests.faults.test_worker import endless
 
 if __name__ == "__main__":

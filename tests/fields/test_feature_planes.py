@@ -6,9 +6,9 @@ import pytest
 import torch
 from scipy.stats import chisquare
 
-from framework.encodings.planes import FeaturePlanes
-from framework.kernels.adam import sparse_adam_reference
-from framework.training.checkpoint import load_checkpoint
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.kernels.adam import sparse_adam_reference
+from nerfloom.training.checkpoint import load_checkpoint
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))

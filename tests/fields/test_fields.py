@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import Field
-from framework.fields.encoded import EncodedField
-from framework.fields.nerf import NeRFField
-from framework.geometry.points import Points
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import Field
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.geometry.points import Points
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 

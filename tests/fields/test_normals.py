@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import Field
-from framework.fields.encoded import EncodedField
-from framework.fields.normals import NormalHead, density_normals, normal_penalties
-from framework.geometry.points import Points
-from framework.geometry.rays import Samples
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import Field
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Samples
 
 
 class Ball(Field):

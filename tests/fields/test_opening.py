@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.opening import Opening, opened_levels
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.encoded import EncodedField
-from framework.fields.nerf import NeRFField, opened_frequencies
-from framework.geometry.points import Points
-from framework.kernels.frequency import frequency_encoding_reference
-from framework.training.optim import Adam
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.encodings.opening import Opening, opened_levels
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.nerf import NeRFField, opened_frequencies
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.frequency import frequency_encoding_reference
+from nerfloom.training.optim import Adam
 from tests.kernels.compiled import needs_kernels
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import LENSES, Cameras
-from framework.encodings.pixel_aligned import ImageEncoder, SourceViews
-from framework.evaluation.paths import look_at
-from framework.fields.pixel_aligned import PixelAlignedField
-from framework.geometry.points import Points
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import LENSES, Cameras
+from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
+from nerfloom.evaluation.paths import look_at
+from nerfloom.fields.pixel_aligned import PixelAlignedField
+from nerfloom.geometry.points import Points
 
 SIZES = torch.tensor([[24, 16], [24, 16], [24, 16]])
 

@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.integrated import IntegratedEncoding
-from framework.encodings.multisampled import MultisampledHashGrid
-from framework.fields.base import Field
-from framework.fields.encoded import EncodedField
-from framework.fields.integrated import IntegratedDensity, IntegratedField
-from framework.fields.sized import SizedDensity, SizedField
-from framework.geometry.points import Points, sample_points
-from framework.geometry.rays import Rays, Samples
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.encodings.integrated import IntegratedEncoding
+from nerfloom.encodings.multisampled import MultisampledHashGrid
+from nerfloom.fields.base import Field
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
+from nerfloom.fields.sized import SizedDensity, SizedField
+from nerfloom.geometry.points import Points, sample_points
+from nerfloom.geometry.rays import Rays, Samples
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

@@ -2,9 +2,9 @@
 
 import torch
 
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.tensor import VM, TensorField
-from framework.geometry.points import Points
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.tensor import VM, TensorField
+from nerfloom.geometry.points import Points
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from framework.base.errors import DataError
+from nerfloom.base.errors import DataError
 from tests.fuzz.payload import Payload
 from tests.fuzz.reader import Nonsense, Reader
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from framework.training.checkpoint import SEAL
+from nerfloom.training.checkpoint import SEAL
 from tests.fuzz.payload import Payload
 from tests.fuzz.raw import RAW
 from tests.fuzz.trees import damaged_tree

@@ -15,37 +15,37 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from dataparsers.blender import Blender
-from dataparsers.colmap import Colmap
-from dataparsers.dnerf import DNeRF
-from dataparsers.llff import Llff
-from dataparsers.nerfstudio import Nerfstudio
-from dataparsers.phototourism import Phototourism
-from dataparsers.polycam import Polycam
-from dataparsers.record3d import Record3D
-from framework import DataParser, Dataset
-from framework.base.config import from_plain, read_yaml
-from framework.cameras.camera_path import MOST_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
-from framework.cameras.poses import Placement
-from framework.cli.compare import CompareFlags, plan_of
-from framework.data.dataset import load_dataset
-from framework.data.depths import read_depth
-from framework.data.mapped_pixels import MappedPixels
-from framework.data.pixel_cache import PixelMemory, pack, unpack
-from framework.data.ply import read_points
-from framework.evaluation.lpips import SHAPES, read_weights
-from framework.splats.files import SUFFIXES, read_gaussians, write_gaussians
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import LEAST_BLUR, MOST_BLUR, Look
-from framework.tools.downloads import unpack as downloads
-from framework.tools.processing import polycam, record3d
-from framework.tools.processing.images import prepare_all
-from framework.tools.processing.listing import find_images
-from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.datasets import load_split
-from framework.training.run import Run, create_folder, read_run
-from framework.training.trained import load_trained
-from framework.training.trainer import Trainer
+from nerfloom import DataParser, Dataset
+from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.cameras.camera_path import MOST_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
+from nerfloom.cameras.poses import Placement
+from nerfloom.cli.compare import CompareFlags, plan_of
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.depths import read_depth
+from nerfloom.data.mapped_pixels import MappedPixels
+from nerfloom.data.pixel_cache import PixelMemory, pack, unpack
+from nerfloom.data.ply import read_points
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.dnerf import DNeRF
+from nerfloom.dataparsers.llff import Llff
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.dataparsers.phototourism import Phototourism
+from nerfloom.dataparsers.polycam import Polycam
+from nerfloom.dataparsers.record3d import Record3D
+from nerfloom.evaluation.lpips import SHAPES, read_weights
+from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, Look
+from nerfloom.tools.downloads import unpack as downloads
+from nerfloom.tools.processing import polycam, record3d
+from nerfloom.tools.processing.images import prepare_all
+from nerfloom.tools.processing.listing import find_images
+from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, create_folder, read_run
+from nerfloom.training.trained import load_trained
+from nerfloom.training.trainer import Trainer
 from tests.conftest import write_tiny
 from tests.dataparsers.captures import write_capture
 from tests.dataparsers.captures import write_images as write_pictures

@@ -47,7 +47,7 @@ def summary(outcomes: Sequence[Outcome]) -> list[str]:
 
 def as_plain(outcomes: Sequence[Outcome], seconds: float) -> dict[str, Any]:
     """For JSON: counts, the escapes in full, and what it was run with."""
-    from framework.training.machine import machine  # brings torch
+    from nerfloom.training.machine import machine  # brings torch
 
     readers = {reader: counts(own) for reader, own in by_reader(outcomes).items()}
     totals = {key: sum(found[key] for found in readers.values()) for key in ("inputs", "unique_outcomes", "escaped")}

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from framework import Cameras, Dataset, ParsedScene
+from nerfloom import Cameras, Dataset, ParsedScene
 from tests.fuzz.reader import require
 
 DIRECTION_TOLERANCE = 1e-2

@@ -15,7 +15,7 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO
 
-from framework.base.errors import NerfloomError
+from nerfloom.base.errors import NerfloomError
 from tests.fuzz.files import Files, read_files, write_files
 from tests.fuzz.mutations import damaged
 from tests.fuzz.outcome import Outcome

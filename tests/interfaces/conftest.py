@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.base import registry
+from nerfloom.base import registry
 
 METHODS = {
     "fog": "plugins.fog",

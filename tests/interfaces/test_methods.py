@@ -7,8 +7,8 @@ from pathlib import Path
 import imageio.v3 as imageio
 import pytest
 
-from framework.base.registry import load_method
-from framework.tools.testing import check_method
+from nerfloom.base.registry import load_method
+from nerfloom.tools.testing import check_method
 from tests.cli.helpers import called
 from tests.interfaces.conftest import HERE
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.base import registry
+from nerfloom.base import registry
 from tests.cli.helpers import called
 
-WHERE = "docs/plugins.md, 'From interface 1 to 2', says what to change"
+WHERE = "docs/plugins.md, 'Plugins for an older interface', says what to change"
 OLD = {
     "an old module": "from framework.renderers import render_field\n",
     "an old name": "from framework import Batch\n",
@@ -16,7 +16,7 @@ OLD = {
         "METHOD = Method(Model, TrainConfig(), paper='none', interface=1)\n"
     ),
     "an old number": (
-        "from framework import Method, TrainConfig\nMETHOD = Method(TrainConfig(), paper='none', interface=1)\n"
+        "from nerfloom import Method, TrainConfig\nMETHOD = Method(TrainConfig(), paper='none', interface=2)\n"
     ),
 }
 
@@ -36,4 +36,4 @@ def test_one_line_says_what_to_change(what: str, tmp_path: Path, monkeypatch: py
 
 
 def test_the_documents_say_it() -> None:
-    assert "### From interface 1 to 2" in (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()
+    assert "### Plugins for an older interface" in (Path(__file__).parents[2] / "docs" / "plugins.md").read_text()

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from framework.kernels import native
+from nerfloom.kernels import native
 
 needs_kernels = pytest.mark.skipif(not native.available(), reason="the compiled kernels are not installed")
 

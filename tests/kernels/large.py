@@ -15,27 +15,27 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.adam import dense_adam, dense_adam_reference, sparse_adam, sparse_adam_reference
-from framework.kernels.compositing import composite, composite_reference, distortion
-from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from framework.kernels.intervals import (
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.adam import dense_adam, dense_adam_reference, sparse_adam, sparse_adam_reference
+from nerfloom.kernels.compositing import composite, composite_reference, distortion
+from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.intervals import (
     interval_weights,
     interval_weights_reference,
     resample,
     resample_reference,
 )
-from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
-from framework.kernels.mlp import mlp, mlp_reference
-from framework.kernels.native import torch_on_one_thread
-from framework.kernels.planes import PlanesLayout, planes, planes_reference
-from framework.kernels.splat_blend import blend, blend_reference
-from framework.kernels.splat_project import RECORD, SplatCamera, project_gaussians, project_reference
-from framework.kernels.splat_tiles import tile_lists, tile_lists_reference
-from framework.kernels.ssim import ssim, ssim_reference
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.kernels.march import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
+from nerfloom.kernels.mlp import mlp, mlp_reference
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.splat_blend import blend, blend_reference
+from nerfloom.kernels.splat_project import RECORD, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splat_tiles import tile_lists, tile_lists_reference
+from nerfloom.kernels.ssim import ssim, ssim_reference
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels import test_trace
 from tests.kernels.compiled import relative_error
 

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from framework.geometry.lenses import Distortion
-from framework.kernels.native import torch_on_one_thread
-from framework.kernels.splat_blend import Blended, blend
-from framework.kernels.splat_project import SplatCamera, project_gaussians
-from framework.kernels.splat_tiles import tile_lists
-from framework.splats.density_control import image_gradients
+from nerfloom.geometry.lenses import Distortion
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.splat_blend import Blended, blend
+from nerfloom.kernels.splat_project import SplatCamera, project_gaussians
+from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.splats.density_control import image_gradients
 from tests.kernels.compiled import relative_error
 
 NAMES = ("means", "log scales", "rotations", "logits", "colors", "harmonics", "pose")

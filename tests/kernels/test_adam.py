@@ -5,8 +5,8 @@ import functools
 import pytest
 import torch
 
-from framework.kernels import native
-from framework.kernels.adam import (
+from nerfloom.kernels import native
+from nerfloom.kernels.adam import (
     ALL_FINITE,
     DENSE_ADAM,
     SPARSE_ADAM,
@@ -17,7 +17,7 @@ from framework.kernels.adam import (
     sparse_adam,
     sparse_adam_reference,
 )
-from framework.kernels.dispatch import FEW_OPERATIONS
+from nerfloom.kernels.dispatch import FEW_OPERATIONS
 from tests.kernels.compiled import needs_kernels, relative_error
 
 BETAS, EPS = (0.9, 0.99), 1e-15

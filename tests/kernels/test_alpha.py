@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels.alpha import alpha_depth, composite_alpha
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.alpha import alpha_depth, composite_alpha
 from tests.kernels.test_compositing import ragged
 
 F64 = torch.float64

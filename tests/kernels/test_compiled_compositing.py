@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import (
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import (
     MAX_OPTICAL_DEPTH,
     Composited,
     composite,

@@ -6,9 +6,9 @@ import pytest
 import torch
 from scipy.special import erf
 
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.compositing import exclusive_sum, optical_depth, ray_sum, weights_and_transmittance
-from framework.rendering.volume import volume_render
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.compositing import exclusive_sum, optical_depth, ray_sum, weights_and_transmittance
+from nerfloom.rendering.volume import volume_render
 
 F64 = torch.float64
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.planes import FeaturePlanes
-from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.planes import PlanesGradient
-from framework.training.optim import Adam
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.kernels.hash_grid_lookup import TableGradient
+from nerfloom.kernels.planes import PlanesGradient
+from nerfloom.training.optim import Adam
 from tests.kernels.compiled import needs_kernels, relative_error
 
 pytestmark = needs_kernels

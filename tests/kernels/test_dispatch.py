@@ -9,37 +9,37 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import CAMERA_RAYS, Cameras, subpixels
-from framework.data.pixels import GATHER_COLORS
-from framework.geometry.multisamples import Pattern
-from framework.geometry.points import Frustums
-from framework.geometry.rays import Rays, Samples
-from framework.kernels import dispatch, native
-from framework.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
-from framework.kernels.compositing import COMPOSITE, DISTORTION
-from framework.kernels.contraction import CONTRACT
-from framework.kernels.dispatch import TRITON, Backend, Operation, derivatives
-from framework.kernels.first_shared import CELLS, FIRST_SHARED, LEVELS
-from framework.kernels.fixed_march import FILL, REACH, fill
-from framework.kernels.frequency import FREQUENCY_ENCODING
-from framework.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
-from framework.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
-from framework.kernels.march import MARCH, SORT_BY_RAY, March, march
-from framework.kernels.mlp import DENSITY_NETWORK, NETWORK
-from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
-from framework.kernels.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
-from framework.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
-from framework.kernels.plane_bands import BAND_VARIATION, PLANE_BANDS
-from framework.kernels.planes import PLANES, PlanesGradient, PlanesLayout
-from framework.kernels.proposals import PROPOSAL_WEIGHTS
-from framework.kernels.rigid_motion import RIGID_MOTIONS
-from framework.kernels.rows import GATHER_ROWS
-from framework.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
-from framework.kernels.spacing import SPACED
-from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
-from framework.kernels.splat_blend import BLEND
-from framework.kernels.splat_packed import PROJECT_PACKED, pack_gaussians
-from framework.kernels.splat_project import (
+from nerfloom.cameras.cameras import CAMERA_RAYS, Cameras, subpixels
+from nerfloom.data.pixels import GATHER_COLORS
+from nerfloom.geometry.multisamples import Pattern
+from nerfloom.geometry.points import Frustums
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels import dispatch, native
+from nerfloom.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
+from nerfloom.kernels.compositing import COMPOSITE, DISTORTION
+from nerfloom.kernels.contraction import CONTRACT
+from nerfloom.kernels.dispatch import TRITON, Backend, Operation, derivatives
+from nerfloom.kernels.first_shared import CELLS, FIRST_SHARED, LEVELS
+from nerfloom.kernels.fixed_march import FILL, REACH, fill
+from nerfloom.kernels.frequency import FREQUENCY_ENCODING
+from nerfloom.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
+from nerfloom.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
+from nerfloom.kernels.march import MARCH, SORT_BY_RAY, March, march
+from nerfloom.kernels.mlp import DENSITY_NETWORK, NETWORK
+from nerfloom.kernels.multisampled_grid import MULTISAMPLED_GRID
+from nerfloom.kernels.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
+from nerfloom.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
+from nerfloom.kernels.plane_bands import BAND_VARIATION, PLANE_BANDS
+from nerfloom.kernels.planes import PLANES, PlanesGradient, PlanesLayout
+from nerfloom.kernels.proposals import PROPOSAL_WEIGHTS
+from nerfloom.kernels.rigid_motion import RIGID_MOTIONS
+from nerfloom.kernels.rows import GATHER_ROWS
+from nerfloom.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
+from nerfloom.kernels.spacing import SPACED
+from nerfloom.kernels.spherical_harmonics import SPHERICAL_HARMONICS
+from nerfloom.kernels.splat_blend import BLEND
+from nerfloom.kernels.splat_packed import PROJECT_PACKED, pack_gaussians
+from nerfloom.kernels.splat_project import (
     CUT,
     DISTANCE,
     PROJECT,
@@ -49,12 +49,12 @@ from framework.kernels.splat_project import (
     SplatCamera,
     project_gaussians,
 )
-from framework.kernels.splat_tiles import TILES, tile_lists
-from framework.kernels.ssim import PHOTOMETRIC, SIMILARITY
-from framework.kernels.step_functions import BLURRED_EXCESS
-from framework.kernels.trace import TRACE, GridDensity
-from framework.kernels.traced_colors import TRACED_COLORS, GridColor
-from framework.kernels.traced_error import TRACED_ERROR, PixelTargets
+from nerfloom.kernels.splat_tiles import TILES, tile_lists
+from nerfloom.kernels.ssim import PHOTOMETRIC, SIMILARITY
+from nerfloom.kernels.step_functions import BLURRED_EXCESS
+from nerfloom.kernels.trace import TRACE, GridDensity
+from nerfloom.kernels.traced_colors import TRACED_COLORS, GridColor
+from nerfloom.kernels.traced_error import TRACED_ERROR, PixelTargets
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)

@@ -2,9 +2,9 @@
 
 import torch
 
-from framework.encodings.planes import FeaturePlanes
-from framework.kernels.drawn_bands import drawn_bands
-from framework.kernels.planes_layout import PlanesLayout
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.kernels.drawn_bands import drawn_bands
+from nerfloom.kernels.planes_layout import PlanesLayout
 
 LAYOUT = PlanesLayout.build(((5, 7, 9), (4, 3, 2)))
 NUMBERED = torch.arange(LAYOUT.num_entries * 2.0).view(-1, 2)

@@ -7,19 +7,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.kernels import hash_grid, planes, splat_blend
-from framework.kernels.compositing import bounded_sum, segmented_sum
-from framework.kernels.dispatch import FEW_OPERATIONS, Operation
-from framework.kernels.hash_grid import HASH_GRID, HashGridLayout
-from framework.kernels.march import ReferenceMarch
-from framework.kernels.multisampled_grid import MULTISAMPLED_GRID
-from framework.kernels.plane_bands import PLANE_BANDS
-from framework.kernels.planes import PLANES, PlanesLayout
-from framework.kernels.rigid_motion import RIGID_MOTIONS
-from framework.kernels.rows import gather_rows
-from framework.kernels.spherical_harmonics import SPHERICAL_HARMONICS
-from framework.kernels.splat_blend import BLEND, CHANNELS, blend_reference
-from framework.kernels.splat_project import (
+from nerfloom.kernels import hash_grid, planes, splat_blend
+from nerfloom.kernels.compositing import bounded_sum, segmented_sum
+from nerfloom.kernels.dispatch import FEW_OPERATIONS, Operation
+from nerfloom.kernels.hash_grid import HASH_GRID, HashGridLayout
+from nerfloom.kernels.march import ReferenceMarch
+from nerfloom.kernels.multisampled_grid import MULTISAMPLED_GRID
+from nerfloom.kernels.plane_bands import PLANE_BANDS
+from nerfloom.kernels.planes import PLANES, PlanesLayout
+from nerfloom.kernels.rigid_motion import RIGID_MOTIONS
+from nerfloom.kernels.rows import gather_rows
+from nerfloom.kernels.spherical_harmonics import SPHERICAL_HARMONICS
+from nerfloom.kernels.splat_blend import BLEND, CHANNELS, blend_reference
+from nerfloom.kernels.splat_project import (
     CUT,
     DISTANCE,
     NORMAL,
@@ -29,7 +29,7 @@ from framework.kernels.splat_project import (
     SplatCamera,
     project_reference,
 )
-from framework.kernels.splat_tiles import TILES, TileLists, tile_lists_reference
+from nerfloom.kernels.splat_tiles import TILES, TileLists, tile_lists_reference
 from tests.kernels.test_march import occupancy, random_rays
 
 GRID = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=40, log2_table_size=9)
@@ -126,7 +126,7 @@ def test_harmonics(levels: int) -> None:
 
 @pytest.mark.parametrize("memory", [2**26, 1])
 def test_sums_on_rays_of_bounded_length(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.kernels.compositing.MAX_PADDED", memory)
+    monkeypatch.setattr("nerfloom.kernels.compositing.MAX_PADDED", memory)
     counts = torch.tensor([3, 0, 1, 7, 0, 5])
     owners = torch.arange(6).repeat_interleave(counts)
     places = torch.cat([torch.arange(count) for count in counts.tolist()])

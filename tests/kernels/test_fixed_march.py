@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.compositing import composite
-from framework.kernels.fixed_march import Placed, fill, fill_reference, longest_ray, most_steps, reach, share_out
-from framework.kernels.march import candidates
-from framework.kernels.occupancy import Occupancy
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.compositing import composite
+from nerfloom.kernels.fixed_march import Placed, fill, fill_reference, longest_ray, most_steps, reach, share_out
+from nerfloom.kernels.march import candidates
+from nerfloom.kernels.occupancy import Occupancy
 from tests.kernels.test_march import BOX, occupancy, random_rays
 
 STEPS = 40

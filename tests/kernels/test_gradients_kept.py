@@ -11,40 +11,40 @@ import pytest
 import torch
 from torch import Tensor
 
-import framework
-from framework.cameras.cameras import Cameras, subpixels
-from framework.data.pixels import gather_colors, gather_colors_reference
-from framework.fields.base import Field
-from framework.geometry.multisamples import Pattern
-from framework.geometry.points import Frustums, Points
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.compositing import composite, composite_reference, distortion, distortion_by_pairs
-from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from framework.kernels.intervals import (
+import nerfloom
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.data.pixels import gather_colors, gather_colors_reference
+from nerfloom.fields.base import Field
+from nerfloom.geometry.multisamples import Pattern
+from nerfloom.geometry.points import Frustums, Points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.compositing import composite, composite_reference, distortion, distortion_by_pairs
+from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.intervals import (
     interval_weights,
     interval_weights_reference,
     proposal_excess,
     proposal_excess_reference,
 )
-from framework.kernels.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
-from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
-from framework.kernels.multisamples import (
+from nerfloom.kernels.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
+from nerfloom.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
+from nerfloom.kernels.multisamples import (
     frustum_balls,
     frustum_balls_reference,
     unit_multisamples,
     unit_multisamples_reference,
 )
-from framework.kernels.plane_bands import Band, band_variation
-from framework.kernels.planes import PlanesGradient, PlanesLayout, planes, planes_reference
-from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from framework.kernels.splat_blend import blend, blend_reference
-from framework.kernels.splat_project import SplatCamera, project_gaussians, project_reference
-from framework.kernels.splat_tiles import tile_lists
-from framework.kernels.ssim import photometric_loss, photometric_reference
-from framework.kernels.step_functions import blurred_excess, blurred_excess_reference
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.kernels.plane_bands import Band, band_variation
+from nerfloom.kernels.planes import PlanesGradient, PlanesLayout, planes, planes_reference
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from nerfloom.kernels.splat_blend import blend, blend_reference
+from nerfloom.kernels.splat_project import SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.kernels.ssim import photometric_loss, photometric_reference
+from nerfloom.kernels.step_functions import blurred_excess, blurred_excess_reference
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 
 pytestmark = needs_kernels
@@ -355,7 +355,7 @@ WITHOUT_A_GRADIENT = {
 
 
 def test_every_kernel_is_asked() -> None:
-    sources = "".join(file.read_text() for file in Path(framework.__file__).parent.rglob("*.py"))
+    sources = "".join(file.read_text() for file in Path(nerfloom.__file__).parent.rglob("*.py"))
     declared = set(re.findall(r'native\.Function\("(\w+)"', sources))
     covered = {kernel for operation in OPERATIONS.values() for kernel in operation.kernels}
     assert declared == covered | WITHOUT_A_GRADIENT

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from framework.kernels.dispatch import CPP
-from framework.kernels.splat_blend import BLEND, CHANNELS, Blended, blend_reference
+from nerfloom.kernels.dispatch import CPP
+from nerfloom.kernels.splat_blend import BLEND, CHANNELS, Blended, blend_reference
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, growth_error, scene
 from tests.kernels.test_few_operations import few

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.encodings.hash_grid import HashGrid
-from framework.kernels.hash_grid import PRIMES, HashGridLayout, corners, hash_grid, hash_grid_reference
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.kernels.hash_grid import PRIMES, HashGridLayout, corners, hash_grid, hash_grid_reference
 
 MIXED = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=40, log2_table_size=9)
 

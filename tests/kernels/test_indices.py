@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.data.pixels import gather_colors
-from framework.fields.appearance import Appearance
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import composite, distortion
-from framework.kernels.march import sort_by_ray
-from framework.kernels.rows import gather_rows, take_rows
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.pixels import gather_colors
+from nerfloom.fields.appearance import Appearance
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import composite, distortion
+from nerfloom.kernels.march import sort_by_ray
+from nerfloom.kernels.rows import gather_rows, take_rows
 
 SIX = torch.full((2,), 6)
 CAMERAS = Cameras(torch.eye(4)[:3].expand(2, 3, 4), *(torch.full((2,), 5.0) for _ in range(4)), SIX, SIX)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from framework.kernels.intervals import (
+from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.intervals import (
     interval_weights,
     interval_weights_reference,
     proposal_excess,

@@ -9,20 +9,20 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from framework.encodings.hash_grid import HashGrid
-from framework.encodings.planes import FeaturePlanes
-from framework.fields.base import MLP, Field
-from framework.fields.deformed import DeformedField
-from framework.fields.encoded import DensityField, EncodedField
-from framework.fields.nerf import NeRFField
-from framework.fields.tensor import VM, TensorField
-from framework.geometry.points import Points
-from framework.kernels import kept, native
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.hash_grid import hash_grid
-from framework.kernels.kept import Waves
-from framework.kernels.mlp import mlp
-from methods.kplanes import ExplicitField
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.fields.base import MLP, Field
+from nerfloom.fields.deformed import DeformedField
+from nerfloom.fields.encoded import DensityField, EncodedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.fields.tensor import VM, TensorField
+from nerfloom.geometry.points import Points
+from nerfloom.kernels import kept, native
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.hash_grid import hash_grid
+from nerfloom.kernels.kept import Waves
+from nerfloom.kernels.mlp import mlp
+from nerfloom.methods.kplanes import ExplicitField
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

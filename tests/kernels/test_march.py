@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.march import (
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.march import (
     CompiledMarch,
     Occupancy,
     ReferenceMarch,
@@ -17,7 +17,7 @@ from framework.kernels.march import (
     sort_by_ray,
     step_start,
 )
-from framework.kernels.occupancy import refresh_occupancy_reference
+from nerfloom.kernels.occupancy import refresh_occupancy_reference
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

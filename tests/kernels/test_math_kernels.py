@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from framework.kernels.math import cross_matrix, safe_normalize, truncated_exp
+from nerfloom.kernels.math import cross_matrix, safe_normalize, truncated_exp
 
 
 @pytest.mark.parametrize("x", [-1e30, -100.0, 0.0, 3.0, 14.9])

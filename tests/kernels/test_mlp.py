@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import nn
 
-from framework.fields.base import MLP
-from framework.kernels import native
-from framework.kernels.math import MAX_LOG_DENSITY
-from framework.kernels.mlp import Activation, density_mlp, density_mlp_reference, mlp, mlp_reference
+from nerfloom.fields.base import MLP
+from nerfloom.kernels import native
+from nerfloom.kernels.math import MAX_LOG_DENSITY
+from nerfloom.kernels.mlp import Activation, density_mlp, density_mlp_reference, mlp, mlp_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
 SHAPES: list[tuple[tuple[int, ...], tuple[int, ...]]] = [

@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.multisampled import DECAYED, MultisampledHashGrid, _Decayed
-from framework.geometry.bounds import to_unit_box
-from framework.geometry.multisamples import fixed_pattern, hashed_pattern
-from framework.geometry.points import Frustums
-from framework.kernels.contraction import contract_to_unit_reference
-from framework.kernels.hash_grid import HashGridLayout, hash_grid_reference
-from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
-from framework.kernels.multisamples import (
+from nerfloom.encodings.multisampled import DECAYED, MultisampledHashGrid, _Decayed
+from nerfloom.geometry.bounds import to_unit_box
+from nerfloom.geometry.multisamples import fixed_pattern, hashed_pattern
+from nerfloom.geometry.points import Frustums
+from nerfloom.kernels.contraction import contract_to_unit_reference
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid_reference
+from nerfloom.kernels.hash_grid_lookup import TableGradient
+from nerfloom.kernels.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
+from nerfloom.kernels.multisamples import (
     frustum_balls,
     frustum_balls_reference,
     unit_multisamples,
@@ -135,7 +135,7 @@ def test_the_decay_is_the_gradient_of_the_mean_square_of_each_levels_features(mo
         total += grad / DECAYED
     assert grids[0].table.grad is not None
     assert relative_error(total, grids[0].table.grad) < 1e-6
-    monkeypatch.setattr("framework.base.device.runs_ahead", lambda device: True)  # elsewhere all decay at once
+    monkeypatch.setattr("nerfloom.base.device.runs_ahead", lambda device: True)  # elsewhere all decay at once
     (whole,) = torch.autograd.grad(grids[1](x).sum(), grids[1].table)
     assert relative_error(whole, grids[0].table.grad) < 1e-6
     grids[1].eval()

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.device import cpu_features
-from framework.kernels import native
-from framework.kernels.sources import fingerprint
+from nerfloom.base.device import cpu_features
+from nerfloom.kernels import native
+from nerfloom.kernels.sources import fingerprint
 from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
 from tests.sanitize.build import extensions
@@ -33,12 +33,12 @@ def test_pointer_names_what_is_wrong(tensor: torch.Tensor, message: str) -> None
 
 
 def test_the_reference_can_be_asked_for(forks: Forks) -> None:
-    code = "from framework.kernels import native; print(native.variant(), native.available())"
+    code = "from nerfloom.kernels import native; print(native.variant(), native.available())"
     assert forks.run(code, NERFLOOM_KERNELS="reference").stdout.split() == ["reference", "False"]
 
 
 def test_an_unknown_variant_is_an_error_that_lists_the_known(forks: Forks) -> None:
-    done = forks.run("from framework.kernels import native; native.variant()", NERFLOOM_KERNELS="sse9")
+    done = forks.run("from nerfloom.kernels import native; native.variant()", NERFLOOM_KERNELS="sse9")
     assert done.returncode == 1
     assert "NERFLOOM_KERNELS is 'sse9'; it must be one of auto, reference, amx_bf16, avx512_bf16" in done.stderr
 
@@ -46,9 +46,9 @@ def test_an_unknown_variant_is_an_error_that_lists_the_known(forks: Forks) -> No
 def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path: Path, forks: Forks) -> None:
     code = (
         "from pathlib import Path\n"
-        "from framework.kernels import native\n"
+        "from nerfloom.kernels import native\n"
         f"native.FOLDER = Path({str(tmp_path)!r})\n"
-        "from framework.kernels.mlp import mlp\n"
+        "from nerfloom.kernels.mlp import mlp\n"
         "import torch\n"
         "for _ in range(3): out = mlp([torch.ones(2, 3)], [torch.ones(1, 3)])\n"
         "print(out.tolist())"
@@ -79,9 +79,9 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
         pytest.skip(f"{variant} was not built: NERFLOOM_VARIANTS=native builds the best one alone")
     code = (
         "import torch\n"
-        "from framework.kernels import native\n"
-        "from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference\n"
-        "from framework.kernels.mlp import mlp, mlp_reference\n"
+        "from nerfloom.kernels import native\n"
+        "from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference\n"
+        "from nerfloom.kernels.mlp import mlp, mlp_reference\n"
         "torch.manual_seed(0)\n"
         "layout = HashGridLayout.build(4, 4, 64, 10)\n"
         "x, table = torch.rand(99, 3), torch.randn(layout.num_entries, 2)\n"
@@ -102,7 +102,7 @@ def test_libraries_of_other_sources_are_not_called(tmp_path: Path, forks: Forks)
     """As after an update of a checkout: what a function takes may have changed, and it would read foreign memory."""
     code = (
         "from pathlib import Path\n"
-        "from framework.kernels import native\n"
+        "from nerfloom.kernels import native\n"
         f"native.SOURCES = Path({str(tmp_path)!r})\n"
         "print(native.variant())"
     )
@@ -138,7 +138,7 @@ def test_where_the_system_gives_no_tiles_the_next_variant_is_taken(forks: Forks)
         pytest.skip("this processor has no tiles")
     code = (
         "import ctypes\n"
-        "from framework.kernels import native\n"
+        "from nerfloom.kernels import native\n"
         "opened = ctypes.CDLL\n"
         "class Refused:\n"
         "    def __init__(self, path):\n"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from framework.geometry.bounds import intersect_box, nested_boxes
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.march import CompiledMarch, March, ReferenceMarch
-from framework.kernels.occupancy import Occupancy, own_cells
+from nerfloom.geometry.bounds import intersect_box, nested_boxes
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.march import CompiledMarch, March, ReferenceMarch
+from nerfloom.kernels.occupancy import Occupancy, own_cells
 
 BOX = torch.tensor([[-1.0, -1.5, -0.5], [1.0, 0.5, 1.5]])
 LEVELS, RESOLUTION = 5, 16

@@ -4,14 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import MLP
-from framework.fields.encoded import DensityField
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.kernels.intervals import interval_weights_reference
-from framework.kernels.proposals import PROPOSAL_WEIGHTS, proposal_weights, proposal_weights_reference
-from framework.samplers.proposal import ProposalSampler, density_of
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import MLP
+from nerfloom.fields.encoded import DensityField
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.intervals import interval_weights_reference
+from nerfloom.kernels.proposals import PROPOSAL_WEIGHTS, proposal_weights, proposal_weights_reference
+from nerfloom.samplers.proposal import ProposalSampler, density_of
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.test_trace import BOX, rays
 

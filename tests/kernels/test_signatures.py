@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-import framework.cameras.cameras
-import framework.data.pixels
-import framework.kernels
-from framework.kernels import native
+import nerfloom.cameras.cameras
+import nerfloom.data.pixels
+import nerfloom.kernels
+from nerfloom.kernels import native
 
 SOURCES = Path(native.__file__).parent / "csrc"
 LETTERS = {"int64_t": "q", "int": "i", "float": "f", "double": "d"}
@@ -37,10 +37,10 @@ def kind(parameter: str) -> str:
 
 def declared() -> dict[str, list[native.Function]]:
     """The declarations of every module that can have any, by the name of their function."""
-    names = [module.name for module in pkgutil.iter_modules(framework.kernels.__path__, "framework.kernels.")]
+    names = [module.name for module in pkgutil.iter_modules(nerfloom.kernels.__path__, "nerfloom.kernels.")]
     modules = [importlib.import_module(name) for name in names]
     found: dict[str, list[native.Function]] = {}
-    for module in (*modules, framework.cameras.cameras, framework.data.pixels):
+    for module in (*modules, nerfloom.cameras.cameras, nerfloom.data.pixels):
         for value in vars(module).values():
             if isinstance(value, native.Function):
                 found.setdefault(value.name, []).append(value)
@@ -73,7 +73,7 @@ def test_every_exported_function_is_declared_once_and_every_declared_one_exporte
 
 def test_declarations_are_made_at_the_top_of_modules() -> None:
     """Where the comparison finds them."""
-    root = Path(framework.__file__).parent
+    root = Path(nerfloom.__file__).parent
     made = sum(len(re.findall(r"\bnative\.Function\(", file.read_text())) for file in root.rglob("*.py"))
     assert made == len(DECLARED)
 

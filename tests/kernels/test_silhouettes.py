@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.kernels.silhouettes import (
+from nerfloom.kernels.silhouettes import (
     Photograph,
     hold_balls,
     hold_balls_reference,

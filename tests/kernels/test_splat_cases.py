@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.lenses import Distortion
-from framework.kernels.splat_blend import MAX_ALPHA, OPAQUE, blend
-from framework.kernels.splat_project import MIN_ALPHA, SplatCamera, project_gaussians, project_reference
-from framework.kernels.splat_tiles import tile_lists
+from nerfloom.geometry.lenses import Distortion
+from nerfloom.kernels.splat_blend import MAX_ALPHA, OPAQUE, blend
+from nerfloom.kernels.splat_project import MIN_ALPHA, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splat_tiles import tile_lists
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.splat_truth import NAMES, camera, compared, drawn, leaves, scene, true_image
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.kernels.splat_packed import PACK, PackedGaussians, pack_gaussians, project_packed
-from framework.kernels.splat_project import CUT, SplatCamera, project_gaussians
+from nerfloom.kernels.splat_packed import PACK, PackedGaussians, pack_gaussians, project_packed
+from nerfloom.kernels.splat_project import CUT, SplatCamera, project_gaussians
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, scene
 

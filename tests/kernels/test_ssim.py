@@ -7,10 +7,10 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from framework.evaluation import metrics
-from framework.kernels import native
-from framework.kernels.dispatch import derivatives
-from framework.kernels.ssim import (
+from nerfloom.evaluation import metrics
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import derivatives
+from nerfloom.kernels.ssim import (
     WINDOW,
     photometric_loss,
     photometric_reference,

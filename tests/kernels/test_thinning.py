@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.kernels.hash_grid import HashGridLayout, hash_grid
-from framework.kernels.planes import PlanesLayout, planes
-from framework.kernels.thinning import thinned
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid
+from nerfloom.kernels.planes import PlanesLayout, planes
+from nerfloom.kernels.thinning import thinned
 
 COPIES = 4_000
 

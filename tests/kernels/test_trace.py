@@ -6,17 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import MLP
-from framework.fields.encoded import EncodedField
-from framework.fields.inverted import InvertedField
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays, Samples
-from framework.kernels import dispatch
-from framework.kernels.march import march
-from framework.kernels.occupancy import Occupancy
-from framework.kernels.trace import TRACE, trace_reference
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import MLP
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.inverted import InvertedField
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels import dispatch
+from nerfloom.kernels.march import march
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.trace import TRACE, trace_reference
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.data.dataset import Dataset
-from framework.kernels.traced_colors import TRACED_COLORS, traced_colors, traced_colors_reference
-from framework.rendering.traced import traced_rays
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.data.dataset import Dataset
+from nerfloom.kernels.traced_colors import TRACED_COLORS, traced_colors, traced_colors_reference
+from nerfloom.rendering.traced import traced_rays
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.test_traced_error import CASES, Case, field_of, marched, parts, rays
 from tests.training.test_graphs import small

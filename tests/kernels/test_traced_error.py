@@ -7,16 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.appearance import Appearance
-from framework.fields.encoded import EncodedField
-from framework.geometry.rays import Rays
-from framework.kernels import dispatch
-from framework.kernels.march import March, march
-from framework.kernels.occupancy import Occupancy
-from framework.kernels.trace import GridDensity, trace
-from framework.kernels.traced_colors import GridColor
-from framework.kernels.traced_error import (
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.appearance import Appearance
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import dispatch
+from nerfloom.kernels.march import March, march
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.trace import GridDensity, trace
+from nerfloom.kernels.traced_colors import GridColor
+from nerfloom.kernels.traced_error import (
     TRACED_ERROR,
     PixelTargets,
     TracedError,

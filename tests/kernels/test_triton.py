@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.kernels import native, triton_kernels
+from nerfloom.kernels import native, triton_kernels
 from tests.forked import Forks
 
 ROOT = Path(__file__).parents[2]
@@ -55,7 +55,7 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_there(target: tuple[str, st
 def test_triton_is_imported_by_no_user_of_the_cpu(forks: Forks) -> None:
     code = (
         "import sys, torch\n"
-        "from framework.kernels.hash_grid import HashGridLayout, hash_grid\n"
+        "from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid\n"
         "layout = HashGridLayout.build(2, 2, 4, 6)\n"
         "hash_grid(torch.rand(3, 3), torch.rand(layout.num_entries, 2), layout)\n"
         "print('triton' in sys.modules, any('triton_kernels.' in name for name in sys.modules))"
@@ -65,7 +65,7 @@ def test_triton_is_imported_by_no_user_of_the_cpu(forks: Forks) -> None:
 
 
 def test_asking_for_triton_without_a_gpu_is_an_error(forks: Forks) -> None:
-    code = "from framework.kernels import triton_kernels as t; print(t.available())"
+    code = "from nerfloom.kernels import triton_kernels as t; print(t.available())"
     assert forks.run(code, NERFLOOM_KERNELS="reference").stdout.split() == ["False"]
     done = forks.run(code, NERFLOOM_KERNELS="triton", TRITON_INTERPRET="0", CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 1
@@ -74,7 +74,7 @@ def test_asking_for_triton_without_a_gpu_is_an_error(forks: Forks) -> None:
 
 def test_the_processors_kernels_come_first() -> None:
     """Also while Triton interprets, unless they are left out."""
-    from framework.kernels.compositing import COMPOSITE
+    from nerfloom.kernels.compositing import COMPOSITE
 
     names = [implementation.backend.name for implementation in COMPOSITE.implementations]
     assert names == ["c++", "triton"]

@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from framework.training.machine import machine
+from nerfloom.training.machine import machine
 from tests.mutations import campaign
 from tests.mutations.bug import Bug, all_bugs, faults_of
 from tests.mutations.copy import ROOT, make_copy

@@ -20,7 +20,7 @@ from pathlib import Path
 from tests.mutations.plugin import CONTEXT
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
+PACKAGES = ("framework", "methods", "dataparsers")
 LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "__pycache__", ".*_cache", ".hypothesis", "outputs", "build", "dist", "shared"
 )
@@ -46,10 +46,11 @@ class Copy:
 
     def check(self) -> None:
         """Raises: NotTheCopy where an interpreter that is started elsewhere imports another tree."""
-        code = f"import {', '.join(PACKAGES)}; print(*(m.__path__[0] for m in ({', '.join(PACKAGES)})), sep='\\n')"
+        code = "from pathlib import Path as P; import nerfloom as n, nerfloom.methods as m, nerfloom.dataparsers as d; "
+        code += "print(*(P(module.__path__[0]).resolve() for module in (n, m, d)), sep='\\n')"
         words = [str(self.python), "-I", "-c", code]
         done = subprocess.run(words, cwd=self.python.parent, env=self.environment(), capture_output=True, text=True)
-        wanted = [str(self.root / package) for package in PACKAGES]
+        wanted = [str((self.root / package).resolve()) for package in PACKAGES]
         if done.stdout.splitlines() != wanted:
             raise NotTheCopy(f"{self.python} imports {done.stdout.split()} for {wanted}: {done.stderr}")
 
@@ -69,7 +70,11 @@ def make_copy(folder: Path) -> Copy:
     original = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     shutil.copy(Path(__file__).with_name("startup.py"), site / "mutations_startup.py")
     records = f"import os; os.environ.get({CONTEXT!r}) and __import__('mutations_startup')"
-    (site / "copy.pth").write_text("\n".join([str(root), *original, records]) + "\n")
+    package = environment / "links" / "nerfloom"
+    package.mkdir(parents=True)
+    for part in (*(root / "framework").iterdir(), root / "methods", root / "dataparsers"):
+        (package / part.name).symlink_to(part)
+    (site / "copy.pth").write_text("\n".join([str(package.parent), str(root), *original, records]) + "\n")
     scripts = Path(sys.executable).parent
     for script in scripts.glob("ns-*"):
         text = re.sub(r"^#!.*python[0-9.]*", f"#!{environment / 'bin' / 'python'}", script.read_text(), count=1)

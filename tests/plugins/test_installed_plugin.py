@@ -5,6 +5,7 @@ Dependencies are those of the environment the tests run in, so nothing is downlo
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,13 +16,13 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.registry import VARIABLES
+from nerfloom.base.registry import VARIABLES
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "plugin-method"
-PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
+PACKAGES = ("framework", "methods", "dataparsers")
 SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", *PACKAGES)
 BUILT = shutil.ignore_patterns("__pycache__", "lib", "build", "*.egg-info")
 SMALL = "--max-resolution 32 --grid-resolution 16 --num-steps 64 --samples-per-batch 4096"
@@ -110,7 +111,7 @@ def broken(installed: Installed) -> Iterator[Installed]:
 
 
 def test_the_wheel_is_what_runs(installed: Installed) -> None:
-    code = "import framework, methods, dataparsers, dense_grid as d; print(*(m.__file__ for m in (framework, d)))"
+    code = "import nerfloom, dense_grid as d; print(*(m.__file__ for m in (nerfloom, d)))"
     files = checked([installed.python, "-c", code], installed.folder).split()
     assert [Path(file).is_relative_to(installed.modules) for file in files] == [True, True]
 
@@ -120,13 +121,19 @@ def test_the_wheel_holds_all_that_the_sources_hold(installed: Installed) -> None
     sources = installed.folder.parent / "sources"
     files = [file for package in PACKAGES for file in (sources / package).rglob("*") if file.is_file()]
     assert {file.suffix for file in files} >= {".py", ".typed", ".jinja", ".template", ".cpp", ".h"}
-    left_out = [file for file in files if not (installed.modules / file.relative_to(sources)).is_file()]
-    assert left_out == []
+    places = {file: file.relative_to(sources).as_posix().removeprefix("framework/") for file in files}
+    assert [file for file, place in places.items() if not (installed.modules / "nerfloom" / place).is_file()] == []
+
+
+def test_the_wheel_installs_one_name(installed: Installed) -> None:
+    code = "from importlib.metadata import files; print(*{path.parts[0] for path in files('nerfloom')})"
+    names = checked([installed.python, "-c", code], installed.folder).split()
+    assert {name for name in names if name != ".." and not name.endswith(".dist-info")} == {"nerfloom"}
 
 
 def test_it_trains_and_is_evaluated(installed: Installed) -> None:
     listed = installed.run("ns-train", "--help").stdout
-    assert "dense-grid      DenseGrid: features on dense grids" in listed
+    assert re.search("dense-grid +DenseGrid: features on dense grids", listed)
     assert "--features-per-level" in installed.run("ns-train", "dense-grid", "--help").stdout
     done, folder = installed.train("dense-grid", SMALL, "t")
     assert done.returncode == 0, done.stderr
@@ -162,7 +169,7 @@ def test_ns_new_method_knows_its_templates(installed: Installed) -> None:
 def test_broken_it_stops_nobody_else(broken: Installed) -> None:
     done = broken.run("ns-train", "--help")
     assert done.returncode == 0, done.stderr
-    assert "dense-grid      Never loads." in done.stdout
+    assert re.search(r"dense-grid +Never loads\.", done.stdout)
     done, folder = broken.train("instant-ngp", TINY_NGP, "beside")
     assert done.returncode == 0, done.stderr
     assert (folder / "eval.json").is_file()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from framework.base.errors import DataError
-from framework.tools.processing.brightness import stretched, tones
-from framework.tools.processing.contrast import for_features
-from framework.tools.processing.images import prepare_all
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.brightness import stretched, tones
+from nerfloom.tools.processing.contrast import for_features
+from nerfloom.tools.processing.images import prepare_all
 
 
 def ramp(low: float, high: float) -> np.ndarray:

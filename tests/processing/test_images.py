@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
-from framework.base.errors import DataError
-from framework.tools.processing.images import output_names, prepare, prepare_all
-from framework.tools.processing.listing import find_images
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.images import output_names, prepare, prepare_all
+from nerfloom.tools.processing.listing import find_images
 
 
 def write(path: Path, size: tuple[int, int] = (6, 4), mode: str = "RGB", orientation: int | None = None) -> np.ndarray:

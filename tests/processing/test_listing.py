@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import DataError
-from framework.tools.processing.listing import find_images, kind_of
-from framework.tools.processing.sequence import is_sequence
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.listing import find_images, kind_of
+from nerfloom.tools.processing.sequence import is_sequence
 
 
 def touch(folder: Path, *names: str) -> Path:

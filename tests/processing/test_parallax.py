@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.camera_spread import camera_spread
-from framework.tools.processing.parallax import share_that_turned
+from nerfloom.dataparsers.camera_spread import camera_spread
+from nerfloom.tools.processing.parallax import share_that_turned
 
 
 def matches(shift: float, focal: float, count: int = 6) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -7,10 +7,10 @@ import pytest
 import torch
 from PIL import Image
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework.base.errors import DataError
-from framework.tools.processing import transforms
-from framework.tools.processing.output import check_apart, claim
+from nerfloom.base.errors import DataError
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.tools.processing import transforms
+from nerfloom.tools.processing.output import check_apart, claim
 
 
 def world_to_camera(index: int) -> np.ndarray:

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.base.errors import DataError, FlagError
-from framework.tools.processing.estimate import about
-from framework.tools.processing.matching import choose_matching
-from framework.tools.processing.output import begin, claim
-from framework.tools.processing.retrieval import similar_pairs
-from framework.tools.processing.settings import ColmapFlags
-from framework.tools.processing.unfinished import unfinished
+from nerfloom.base.errors import DataError, FlagError
+from nerfloom.tools.processing.estimate import about
+from nerfloom.tools.processing.matching import choose_matching
+from nerfloom.tools.processing.output import begin, claim
+from nerfloom.tools.processing.retrieval import similar_pairs
+from nerfloom.tools.processing.settings import ColmapFlags
+from nerfloom.tools.processing.unfinished import unfinished
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.data.folds import folds, thumbnail
-from framework.data.image_files import read_image
-from framework.tools.processing.colmap import Model
-from framework.tools.processing.database import PAIR_BASE
-from framework.tools.processing.unfolding import folded_pairs, unfold
+from nerfloom.data.folds import folds, thumbnail
+from nerfloom.data.image_files import read_image
+from nerfloom.tools.processing.colmap import Model
+from nerfloom.tools.processing.database import PAIR_BASE
+from nerfloom.tools.processing.unfolding import folded_pairs, unfold
 from tests.test_folds import walk
 
 COUNT = 60
@@ -94,7 +94,7 @@ def test_a_can_whose_label_repeats_is_unfolded(
 ) -> None:
     """The photographer walked around the can one and a half times; the given reconstruction shows one half of it."""
     pytest.importorskip("pycolmap")
-    from framework.cli.process_data import main
+    from nerfloom.cli.process_data import main
 
     photographs, output = real_data / "colmap_can" / "images_2", tmp_path / "can"
     arguments = ["images", "--data", photographs, "--output-dir", output, "--num-downscales", 0]

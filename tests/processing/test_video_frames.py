@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from framework.base.errors import DataError
-from framework.tools.processing.ffmpeg import chosen_frames, frame_count, survey
-from framework.tools.processing.frame_choice import blocks, different, intervals, sharpest, sharpness
-from framework.tools.processing.video import line, write_frames
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.ffmpeg import chosen_frames, frame_count, survey
+from nerfloom.tools.processing.frame_choice import blocks, different, intervals, sharpest, sharpness
+from nerfloom.tools.processing.video import line, write_frames
 
 BITS = 6
 """Squares of a frame whose brightness is its number in binary."""

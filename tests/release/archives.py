@@ -9,11 +9,11 @@ from email import message_from_bytes
 from email.message import Message
 from pathlib import Path
 
-from framework.kernels.native import NEEDS
+from nerfloom.kernels.native import NEEDS
 from tests.release.problem import Problem
 from tests.release.sources import ROOT, version
 
-PACKAGES = ("nerfloom", "framework", "methods", "dataparsers")
+PACKAGES = ("framework", "methods", "dataparsers")
 LARGEST_WHEEL = 6_000_000
 """Bytes. The kernels of five instruction sets are most of it."""
 LARGEST_SDIST = 3_000_000
@@ -29,22 +29,27 @@ def tracked() -> list[str]:
     return listed.stdout.splitlines()
 
 
+def installed(path: str) -> str:
+    """The place in site-packages of a file of the repository."""
+    return "nerfloom/" + path.removeprefix("framework/")
+
+
 def check_wheel(wheel: Path) -> str:
     """Check names, metadata, licence, kernels and size of a wheel."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         folder = f"nerfloom-{version()}.dist-info"
         metadata = message_from_bytes(archive.read(f"{folder}/METADATA"))
-    if missing := sorted(set(tracked()) - set(names)):
+    if missing := sorted({installed(path) for path in tracked()} - set(names)):
         raise Problem(f"the wheel lacks {', '.join(missing[:5])} ({len(missing)} files)")
-    strange = [name for name in names if name.split("/")[0] not in (*PACKAGES, folder)]
+    strange = [name for name in names if name.split("/")[0] not in ("nerfloom", folder)]
     data = [name for name in names if name.lower().endswith(DATA)]
     if strange or data:
         raise Problem(f"the wheel holds {', '.join([*strange, *data][:5])}, which do not belong into it")
     if f"{folder}/licenses/LICENSE" not in names:
         raise Problem("the wheel lacks the licence")
     libraries = [Path(name) for name in names if name.endswith(LIBRARIES)]
-    if not libraries or any(path.parent.as_posix() != "framework/kernels/lib" for path in libraries):
+    if not libraries or any(path.parent.as_posix() != "nerfloom/kernels/lib" for path in libraries):
         raise Problem(f"the wheel's libraries are {libraries}; those of the kernels are expected, and no others")
     kinds = {path.stem for path in libraries}
     if re.search(r"linux.*x86_64", wheel.name) and kinds != set(NEEDS):

@@ -30,7 +30,7 @@ def check_sources() -> list[str]:
             raise Problem(f"{name} is missing")
     pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     if re.search(r"^version\s*=\s*[\"']", pyproject, re.MULTILINE):
-        raise Problem("pyproject.toml has a version of its own; it is framework.__version__ alone")
+        raise Problem("pyproject.toml has a version of its own; it is nerfloom.__version__ alone")
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     if cited is None or cited[1] != current:
         raise Problem(f"CITATION.cff cites version {cited and cited[1]}, not {current}")

@@ -1,5 +1,6 @@
 """`make release-check` notices what it is for; the whole of it takes minutes, and is no test."""
 
+import ast
 import re
 import tarfile
 import zipfile
@@ -7,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-import framework
-from framework.kernels.native import NEEDS
+import nerfloom
+from nerfloom.kernels.native import NEEDS
 from tests.release import archives, sources
-from tests.release.archives import PACKAGES, check_sdist, check_wheel, tracked
+from tests.release.archives import PACKAGES, check_sdist, check_wheel, installed, tracked
 from tests.release.install import BIN, Environment
 from tests.release.problem import Problem
 from tests.release.sources import ROOT, check_sources, relative_links, version
 
-INFO = f"nerfloom-{framework.__version__}.dist-info"
+INFO = f"nerfloom-{nerfloom.__version__}.dist-info"
 
 
 def metadata(**changed: str) -> str:
@@ -23,16 +24,16 @@ def metadata(**changed: str) -> str:
     needs = re.findall(
         r'^    "([\w-]+>=[\d.]+)",$', text[text.index("\ndependencies") : text.index("optional-dep")], re.M
     )
-    fields = {"Name": "nerfloom", "Version": framework.__version__, "Requires-Python": ">=3.10"} | changed
+    fields = {"Name": "nerfloom", "Version": nerfloom.__version__, "Requires-Python": ">=3.10"} | changed
     lines = [*(f"{name}: {value}" for name, value in fields.items()), *(f"Requires-Dist: {need}" for need in needs)]
     return "\n".join([*lines, "Requires-Dist: lpips>=0.1.4; extra == 'lpips'"]) + "\n"
 
 
 def write_wheel(folder: Path, left_out: str = "", more: str = "", **changed: str) -> Path:
     """A wheel as it should be, with empty files, but for what is changed."""
-    path = folder / f"nerfloom-{framework.__version__}-py3-none-linux_x86_64.whl"
-    libraries = [f"framework/kernels/lib/{kind}.so" for kind in NEEDS]
-    names = [*tracked(), f"{INFO}/licenses/LICENSE", f"{INFO}/RECORD", *libraries, more]
+    path = folder / f"nerfloom-{nerfloom.__version__}-py3-none-linux_x86_64.whl"
+    libraries = [f"nerfloom/kernels/lib/{kind}.so" for kind in NEEDS]
+    names = [*map(installed, tracked()), f"{INFO}/licenses/LICENSE", f"{INFO}/RECORD", *libraries, more]
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(f"{INFO}/METADATA", metadata(**changed))
         for name in filter(None, names):
@@ -52,23 +53,23 @@ def write_sdist(folder: Path, left_out: str = "", more: str = "") -> Path:
 
 
 def test_the_version_stands_in_one_place() -> None:
-    assert version() == framework.__version__
-    assert 'version = { attr = "framework.__version__" }' in (ROOT / "pyproject.toml").read_text()
+    assert version() == nerfloom.__version__
+    assert 'version = { attr = "nerfloom.__version__" }' in (ROOT / "pyproject.toml").read_text()
 
 
 def test_the_sources_are_ready() -> None:
     said = check_sources()
-    assert said[0].startswith(f"version {framework.__version__}: ")
+    assert said[0].startswith(f"version {nerfloom.__version__}: ")
     assert "Apache-2.0" in said[1]
 
 
 @pytest.mark.parametrize(
     ("file", "old", "new", "said"),
     [
-        ("CITATION.cff", f"version: {framework.__version__}", "version: 9.9.9", "cites version 9.9.9"),
+        ("CITATION.cff", f"version: {nerfloom.__version__}", "version: 9.9.9", "cites version 9.9.9"),
         ("pyproject.toml", 'dynamic = ["version"]', 'version = "1.0"', "has a version of its own"),
         ("LICENSE", "Apache License", "My License", "LICENSE is not the Apache License"),
-        ("framework/__init__.py", f'"{framework.__version__}"', '"1.0"', "is not of the form"),
+        ("framework/__init__.py", f'"{nerfloom.__version__}"', '"1.0"', "is not of the form"),
     ],
 )
 def test_sources_that_disagree(
@@ -95,12 +96,13 @@ def test_a_wheel_as_it_should_be(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"left_out": "framework/templates/method/README.md.template"}, "the wheel lacks framework/templates"),
-        ({"left_out": "framework/kernels/lib/amx_bf16.so"}, "lacks the kernels for amx_bf16"),
+        ({"left_out": "nerfloom/templates/method/README.md.template"}, "the wheel lacks nerfloom/templates"),
+        ({"left_out": "nerfloom/kernels/lib/amx_bf16.so"}, "lacks the kernels for amx_bf16"),
         ({"left_out": f"{INFO}/licenses/LICENSE"}, "lacks the licence"),
         ({"more": "tests/test_light.py"}, "holds tests/test_light.py"),
-        ({"more": "framework/lego.PNG"}, "holds framework/lego.PNG"),
-        ({"more": "framework/other.so"}, "those of the kernels are expected"),
+        ({"more": "nerfloom/lego.PNG"}, "holds nerfloom/lego.PNG"),
+        ({"more": "framework/__init__.py"}, "holds framework/__init__.py"),
+        ({"more": "nerfloom/other.so"}, "those of the kernels are expected"),
         ({"Version": "9.9"}, "Version is 9.9"),
         ({"Requires-Python": ">=3.8"}, "Requires-Python is >=3.8"),
         ({"Name": "nerfloom\nRequires-Dist: left-pad"}, "requires .*left-pad"),
@@ -152,7 +154,7 @@ def test_relative_links_are_found() -> None:
     assert relative_links(text) == ["docs/a.md", "b.png", "f.gif"]
 
 
-def test_packages_are_those_of_pyproject() -> None:
-    included = re.search(r"^include = \[(.*)\]$", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
-    assert included is not None
-    assert tuple(re.findall(r'"(\w+)\*"', included[1])) == PACKAGES
+def test_packages_are_those_of_the_build() -> None:
+    parts = re.search(r"^PARTS = (\{.*\})$", (ROOT / "setup.py").read_text(), re.MULTILINE)
+    assert parts is not None
+    assert tuple(ast.literal_eval(parts[1]).values()) == PACKAGES

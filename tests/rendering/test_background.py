@@ -8,32 +8,32 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from framework.base.errors import ConfigError
-from framework.data.scene import Scene
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import Field
-from framework.fields.encoded import EncodedField
-from framework.fields.inverted import InvertedField
-from framework.fields.nerf import NeRFField
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays, Samples
-from framework.geometry.spheres import InvertedRays, distances_behind
-from framework.kernels.contraction import contract_to_unit_reference
-from framework.method import Method
-from framework.ray_model import RayModel
-from framework.rendering.background import SphereRenderer, over_background
-from framework.rendering.rendered import Rendered
-from framework.rendering.volume import VolumeRenderer, volume_render
-from framework.samplers.background import foreground, foreground_sphere
-from framework.samplers.hierarchical import HierarchicalSampler
-from framework.samplers.inside import InsideSphere
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.proposal import ProposalSampler
-from framework.samplers.uniform import UniformSampler
-from framework.tools.testing import check_method
-from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
-from framework.tools.testing.subject import Learner
-from methods import instant_ngp, nerf_plus_plus, vanilla_nerf
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.scene import Scene
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import Field
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.inverted import InvertedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.geometry.spheres import InvertedRays, distances_behind
+from nerfloom.kernels.contraction import contract_to_unit_reference
+from nerfloom.method import Method
+from nerfloom.methods import instant_ngp, nerf_plus_plus, vanilla_nerf
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.background import SphereRenderer, over_background
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import VolumeRenderer, volume_render
+from nerfloom.samplers.background import foreground, foreground_sphere
+from nerfloom.samplers.hierarchical import HierarchicalSampler
+from nerfloom.samplers.inside import InsideSphere
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.samplers.uniform import UniformSampler
+from nerfloom.tools.testing import check_method
+from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
+from nerfloom.tools.testing.subject import Learner
 from tests.training.helpers import TINY
 
 SPHERE = torch.tensor([0.2, -0.1, 0.0, 1.5]).double()
@@ -297,7 +297,7 @@ def test_without_a_sphere_methods_are_what_they_were() -> None:
         (instant_ngp, BOUNDED, OccupancySampler),
         (instant_ngp, UNBOUNDED, ProposalSampler),
     ):
-        small = dataclasses.replace(module.METHOD.config, **TINY[module.__name__.split(".")[1].replace("_", "-")])
+        small = dataclasses.replace(module.METHOD.config, **TINY[module.__name__.split(".")[-1].replace("_", "-")])
         model = module.METHOD.build(small, scene)
         assert isinstance(model, RayModel)
         assert (type(model.sampler), type(model.renderer)) == (kind, VolumeRenderer)

@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.rendering.losses import density_before, depth_roughness
+from nerfloom.geometry.rays import Samples
+from nerfloom.rendering.losses import density_before, depth_roughness
 
 SIDE = 4
 

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from framework.data.pixels import PixelBatch, thinned
-from framework.geometry.rays import Rays, Samples
-from framework.rendering.losses import mean_squared_error, opacity_of_transparent
-from framework.rendering.volume import volume_render
+from nerfloom.data.pixels import PixelBatch, thinned
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.rendering.losses import mean_squared_error, opacity_of_transparent
+from nerfloom.rendering.volume import volume_render
 
 
 def test_only_pixels_that_are_fully_transparent_count() -> None:

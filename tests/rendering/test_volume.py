@@ -7,24 +7,24 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.registry import load_method, registered
-from framework.data.scene import Scene
-from framework.fields.base import Field
-from framework.geometry.points import Footprint, Points
-from framework.geometry.rays import Rays
-from framework.ray_model import RayModel
-from framework.rendering.background import SphereRenderer
-from framework.rendering.rendered import Rendered
-from framework.rendering.volume import VolumeRenderer, shade
-from framework.samplers.base import Sampler
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.proposal import ProposalSampler
-from framework.samplers.uniform import UniformSampler
+from nerfloom.base.registry import load_method, registered
+from nerfloom.data.scene import Scene
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Footprint, Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.background import SphereRenderer
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import VolumeRenderer, shade
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.samplers.uniform import UniformSampler
 from tests.training.helpers import TINY
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 CAPTURE = Scene(0.5 * BOX, 0.05, 100.0, num_cameras=3, has_alpha=False, moving=False, image_size=32)
-BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
+BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
 RAY_METHODS = [name for name in BUILT_IN if name != "gaussian-splatting"]
 
 

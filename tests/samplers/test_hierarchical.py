@@ -4,14 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import CoarseLevel, Rays, Samples
-from framework.rendering.volume import VolumeRenderer
-from framework.samplers.hierarchical import HierarchicalSampler, blurred
-from framework.samplers.uniform import LAST_INTERVAL, stratified_points
-from methods.vanilla_nerf import VanillaNeRFConfig
+from nerfloom.base.errors import ConfigError
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import CoarseLevel, Rays, Samples
+from nerfloom.methods.vanilla_nerf import VanillaNeRFConfig
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.hierarchical import HierarchicalSampler, blurred
+from nerfloom.samplers.uniform import LAST_INTERVAL, stratified_points
 
 COARSE, FINE = 16, 48
 

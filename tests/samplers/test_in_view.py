@@ -6,18 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.registry import load_method
-from framework.cameras.cameras import Cameras, subpixels
-from framework.cameras.view import View
-from framework.data.scene import Scene
-from framework.evaluation.paths import look_at
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.ray_model import RayModel
-from framework.rendering.volume import VolumeRenderer
-from framework.samplers.in_view import pixels_in_view
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.uniform import UniformSampler
+from nerfloom.base.registry import load_method
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.cameras.view import View
+from nerfloom.data.scene import Scene
+from nerfloom.evaluation.paths import look_at
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.in_view import pixels_in_view
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.uniform import UniformSampler
 
 BOX = torch.tensor([[-1.0, -0.8, -1.2], [1.0, 0.8, 1.0]])
 SIZE = 144, 120
@@ -105,7 +105,7 @@ def test_a_picture_is_the_same_with_rays_through_every_pixel(
     config, _ = method.decided(dataclasses.replace(method.config, eval_num_rays_per_chunk=5000), scene)
     model = RayModel(config, scene, Cloud(), sampler(), VolumeRenderer())
     model.register_parameter("any", torch.nn.Parameter(torch.zeros(1)))  # by which a model knows its device
-    monkeypatch.setattr("framework.samplers.in_view.LEAST", 1)
+    monkeypatch.setattr("nerfloom.samplers.in_view.LEAST", 1)
     view, cast = View(camera((4.0, 1.0, 0.5)), rays_per_pixel=per_pixel, stride=stride), []  # type: ignore[arg-type]
     render = RayModel.render
     background = torch.tensor([1.0, 0.0, 1.0])

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from framework.data.scene import Scene
-from framework.geometry.points import Points
-from framework.kernels.spacing import spacing
-from framework.samplers.choice import SamplingConfig, make_sampler
-from framework.samplers.occupancy import DECAY, MOVING_DECAY, WARM_UP_STEPS, OccupancySampler
+from nerfloom.data.scene import Scene
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.spacing import spacing
+from nerfloom.samplers.choice import SamplingConfig, make_sampler
+from nerfloom.samplers.occupancy import DECAY, MOVING_DECAY, WARM_UP_STEPS, OccupancySampler
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 

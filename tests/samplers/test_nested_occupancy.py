@@ -7,20 +7,20 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.data.scene import Scene
-from framework.fields.base import Field
-from framework.geometry.bounds import nested_boxes
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.kernels.compositing import composite
-from framework.kernels.occupancy import own_cells
-from framework.samplers.choice import SamplingConfig, contracted_box, make_sampler
-from framework.samplers.occupancy import FARTHEST, WARM_UP_STEPS, OccupancySampler
-from framework.scene.seen_cells import seen_cells
-from framework.training.checkpoint import load_newest
-from framework.training.trainer import Trainer
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.scene import Scene
+from nerfloom.fields.base import Field
+from nerfloom.geometry.bounds import nested_boxes
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.compositing import composite
+from nerfloom.kernels.occupancy import own_cells
+from nerfloom.samplers.choice import SamplingConfig, contracted_box, make_sampler
+from nerfloom.samplers.occupancy import FARTHEST, WARM_UP_STEPS, OccupancySampler
+from nerfloom.scene.seen_cells import seen_cells
+from nerfloom.training.checkpoint import load_newest
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])

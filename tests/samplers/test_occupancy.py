@@ -3,15 +3,15 @@
 import pytest
 import torch
 
-from framework.base.errors import ConfigError
-from framework.fields.base import Field
-from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays, Samples
-from framework.kernels import native
-from framework.kernels.mlp import mlp
-from framework.rendering.volume import volume_render
-from framework.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
+from nerfloom.base.errors import ConfigError
+from nerfloom.fields.base import Field
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels import native
+from nerfloom.kernels.mlp import mlp
+from nerfloom.rendering.volume import volume_render
+from nerfloom.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
 
 BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

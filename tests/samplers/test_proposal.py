@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.kernels.spacing import from_disparity, to_disparity
-from framework.rendering.volume import Rendered, VolumeRenderer
-from framework.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.spacing import from_disparity, to_disparity
+from nerfloom.rendering.volume import Rendered, VolumeRenderer
+from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.samplers.uniform import LAST_INTERVAL, UniformSampler, samples_from_points, stratified_points
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.samplers.uniform import LAST_INTERVAL, UniformSampler, samples_from_points, stratified_points
 
 
 class Unseen(Field):

@@ -4,12 +4,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Histogram, Rays, Samples
-from framework.kernels.spacing import inverse_power_ladder, power_ladder, spacing
-from framework.kernels.step_functions import blurred_excess_reference
-from framework.samplers.proposal import ProposalSampler, interlevel_loss, propose
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Histogram, Rays, Samples
+from nerfloom.kernels.spacing import inverse_power_ladder, power_ladder, spacing
+from nerfloom.kernels.step_functions import blurred_excess_reference
+from nerfloom.samplers.proposal import ProposalSampler, interlevel_loss, propose
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 DISTANCES = torch.logspace(-6, 3, 100, dtype=torch.float64)

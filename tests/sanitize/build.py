@@ -12,8 +12,8 @@ from unittest import mock
 
 from setuptools import Extension
 
-from framework.base.device import cpu_features
-from framework.kernels.native import NEEDS, SUFFIX
+from nerfloom.base.device import cpu_features
+from nerfloom.kernels.native import NEEDS, SUFFIX
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "build" / "sanitized"

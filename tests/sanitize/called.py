@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from framework.kernels import native
+from nerfloom.kernels import native
 from tests.kernels.test_signatures import declared
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from framework.base.registry import load_dataparser, registered
-from framework.training.run import Run
+from nerfloom.base.registry import load_dataparser, registered
+from nerfloom.training.run import Run
 from tests.site.pages import ROOT
 
 EXAMPLES = ("my-method", "voxels")
@@ -50,29 +50,29 @@ class Checker:
         shutil.copytree(ROOT / "configs", folder / "configs")
         (folder / "path" / "to" / "masks").mkdir(parents=True)
         exchanged: dict[str, Callable[..., Any]] = {
-            "framework.data.data_folder.find_data": found,
-            "framework.cli.train_paths.check_paths": lambda *_: None,
-            "framework.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
-            **{f"framework.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
-            **{f"framework.cli.{name}.check_data": lambda path: None for name in ("bench", "compare", "stress")},
-            "framework.cli.session.start": begin,
-            "framework.cli.session.resume": begin,
-            "framework.training.splat_files.load_run_or_splats": begin,
-            "framework.training.trained.load_trained": begin,
-            "framework.cli.process_data._process": begin,
-            "framework.cli.compare.compare": begin,
-            "framework.cli.stress.stress": stress,
-            "framework.tools.downloads.install.announce": begin,
+            "nerfloom.data.data_folder.find_data": found,
+            "nerfloom.cli.train_paths.check_paths": lambda *_: None,
+            "nerfloom.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
+            **{f"nerfloom.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
+            **{f"nerfloom.cli.{name}.check_data": lambda path: None for name in ("bench", "compare", "stress")},
+            "nerfloom.cli.session.start": begin,
+            "nerfloom.cli.session.resume": begin,
+            "nerfloom.training.splat_files.load_run_or_splats": begin,
+            "nerfloom.training.trained.load_trained": begin,
+            "nerfloom.cli.process_data._process": begin,
+            "nerfloom.cli.compare.compare": begin,
+            "nerfloom.cli.stress.stress": stress,
+            "nerfloom.tools.downloads.install.announce": begin,
         }
         for name, replacement in exchanged.items():
             module, _, attribute = name.rpartition(".")
             if find_spec(module.rpartition(".")[0]) is None:
                 continue
             monkeypatch.setattr(import_module(module), attribute, replacement)
-        train = import_module("framework.cli.train")
+        train = import_module("nerfloom.cli.train")
         read = train._read_run
         monkeypatch.setattr(train, "_read_run", lambda path: read(path) if path.is_file() else run_at(path))
-        bench = import_module("framework.cli.bench")
+        bench = import_module("nerfloom.cli.bench")
         for name, (flags, _) in bench.KINDS.items():
             monkeypatch.setitem(bench.KINDS, name, (flags, begin))
 
@@ -119,11 +119,11 @@ def status_of(command: Callable[[list[str]], None], words: list[str]) -> Any:
 def run_at(path: Path) -> Run:
     """The run that a path of the documents stands for: its method with its defaults."""
     (method,) = [part for part in path.parts if part in registered("methods")]
-    return import_module("framework.cli.train")._default_run(method)
+    return import_module("nerfloom.cli.train")._default_run(method)
 
 
 def stress(methods: list[str], flags: Any) -> list[Any]:
-    module = import_module("framework.cli.stress")
+    module = import_module("nerfloom.cli.stress")
     for method in methods:
         module._run(method, flags)
     module._conditions(flags)

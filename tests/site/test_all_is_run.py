@@ -29,7 +29,7 @@ ELSEWHERE = {
     r"ns-process-data images .*--resume": "tests/processing/test_process_command.py",
     r"ns-compare --load-config": "tests/cli/test_compare_command.py",
     r"ns-bench (gpu|quadrature|processes|contention|cache|poses|tables) ?": "tests/benchmarks/test_bench_command.py",
-    r"python -m framework.cli.bench gpu": "tests/benchmarks/test_gpu.py",
+    r"python -m nerfloom.cli.bench gpu": "tests/benchmarks/test_gpu.py",
     r"ns-download-data": "tests/downloads/test_install.py",
     r"ns-stress": "tests/stress_command/test_runs.py",
     r"torchrun": "tests/training/test_processes.py",

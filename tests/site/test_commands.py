@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError
 from tests.site.commands import Checker, formats
 from tests.site.pages import PAGES, ROOT, commands, words_of
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework import Cameras
-from framework.geometry.lenses import LENSES
+from nerfloom import Cameras
+from nerfloom.geometry.lenses import LENSES
 from tests.site.pages import ROOT
 
 pytestmark = pytest.mark.medium

@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 from statistics import fmean, stdev
 
-from framework.base import from_nerfstudio
-from framework.base.elsewhere import ELSEWHERE
-from framework.base.registry import registered
+from nerfloom.base import from_nerfstudio
+from nerfloom.base.elsewhere import ELSEWHERE
+from nerfloom.base.registry import registered
 from tests.site.pages import ROOT
 
 DOCS = ROOT / "docs"
@@ -164,5 +164,5 @@ def test_methods_of_nerfstudio_are_those_that_are_answered() -> None:
 
 def test_every_data_format_is_named() -> None:
     text = (DOCS / "guides" / "poses.md").read_text()
-    built_in = [name for name, entry in registered("dataparsers").items() if entry.module.startswith("dataparsers.")]
+    built_in = [name for name, entry in registered("dataparsers").items() if entry.module.startswith("nerfloom.dataparsers.")]
     assert [name for name in built_in if f"`{name}`" not in text] == []

@@ -11,13 +11,13 @@ from types import ModuleType
 import pytest
 from PIL import Image
 
-from framework.base.config import ConfigError
-from framework.base.registry import load_method, registered
-from framework.cli.train import _flag_names
+from nerfloom.base.config import ConfigError
+from nerfloom.base.registry import load_method, registered
+from nerfloom.cli.train import _flag_names
 from tests.site.commands import Checker
 from tests.site.pages import ROOT, words_of
 
-BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
+BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
 ROW = re.compile(r"^\| `--([\w.-]+)` \| (.*?) \| (.*?) \| (.*) \|$", re.MULTILINE)
 
 

@@ -129,7 +129,7 @@ def test_the_viewer_answers(command: str, folder: Path) -> None:
         port = str(free.getsockname()[1])
     words = [word for word in words_of(RUN.sub(r"outputs/all/\1/TIME", command)) if not word.startswith("--websocket")]
     words = [word for word in words if word not in ("0.0.0.0", "8080")]
-    program = [sys.executable, "-m", "framework.cli.viewer", *words[1:], "--websocket-port", port]
+    program = [sys.executable, "-m", "nerfloom.cli.viewer", *words[1:], "--websocket-port", port]
     where = {**os.environ, "PYTHONPATH": str(ROOT)}
     viewer = subprocess.Popen(program, cwd=folder, env=where, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     try:
@@ -164,6 +164,6 @@ def test_a_benchmark_writes_what_it_measured(what: str, folder: Path, monkeypatc
 
 def test_enough_is_run() -> None:
     assert len(RUNNING) > 35
-    benchmarks = re.findall(r"^  ([a-z-]+)  ", import_module("framework.cli.bench").USAGE, re.MULTILINE)
+    benchmarks = re.findall(r"^  ([a-z-]+)  ", import_module("nerfloom.cli.bench").USAGE, re.MULTILINE)
     elsewhere = {"gpu", "quadrature", "processes", "contention", "cache", "poses"}
     assert set(benchmarks) - elsewhere <= set(MEASURED) | {"tables"}

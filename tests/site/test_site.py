@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from framework.base.registry import registered
+from nerfloom.base.registry import registered
 from tests.site.pages import PAGES, ROOT
 
 BUILD = """
@@ -63,7 +63,7 @@ def test_the_site_is_whole(check_links: ModuleType, tmp_path: Path) -> None:
     pages = {file.relative_to(site).as_posix() for file in site.rglob("*.html")}
     documents = [page.relative_to(ROOT / "docs") for page in PAGES if (ROOT / "docs") in page.parents]
     assert {page.with_suffix(".html").as_posix() for page in documents} <= pages
-    methods = [name for name, entry in registered("methods").items() if entry.module.startswith("methods.")]
+    methods = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
     assert {f"methods/{name}.html" for name in methods} <= pages
     text = (site / "methods" / "nerfacto.html").read_text()
     assert "<math" in text

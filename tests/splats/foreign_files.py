@@ -4,7 +4,7 @@ import math
 import struct
 from pathlib import Path
 
-from framework.splats.gaussians import Gaussians
+from nerfloom.splats.gaussians import Gaussians
 
 DC = 0.28209479177387814
 

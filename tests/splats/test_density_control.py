@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 
-from framework import View
-from framework.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
-from framework.kernels.splat_project import RECORD, X
-from framework.splats.density_control import (
+from nerfloom import View
+from nerfloom.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
+from nerfloom.kernels.splat_project import RECORD, X
+from nerfloom.splats.density_control import (
     CHILDREN,
     GRADIENT,
     LARGE,
@@ -18,8 +18,8 @@ from framework.splats.density_control import (
     grown,
     image_gradients,
 )
-from framework.splats.drawing import draw, on_image, splat_camera
-from framework.splats.gaussians import Gaussians
+from nerfloom.splats.drawing import draw, on_image, splat_camera
+from nerfloom.splats.gaussians import Gaussians
 from tests.splats.test_method import ball, camera
 
 EXTENT = 2.0

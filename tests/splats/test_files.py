@@ -11,19 +11,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError, DataError
-from framework.cameras.poses import Placement
-from framework.cli.export import main
-from framework.data.offsets import offset_file, read_offset
-from framework.data.ply import read_columns, read_header, write_columns
-from framework.kernels.spherical_harmonics import spherical_harmonics_reference
-from framework.splats.budget import colour_error, fitted_ply, fitted_spz, visibility
-from framework.splats.files import read_gaussians, write_gaussians
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import OURS, Look
-from framework.splats.ply import SURE, ply_size, property_names, write_ply
-from framework.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits, write_spz
-from framework.splats.transform import quaternion, quaternion_product, rotated_harmonics, transformed
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.cameras.poses import Placement
+from nerfloom.cli.export import main
+from nerfloom.data.offsets import offset_file, read_offset
+from nerfloom.data.ply import read_columns, read_header, write_columns
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics_reference
+from nerfloom.splats.budget import colour_error, fitted_ply, fitted_spz, visibility
+from nerfloom.splats.files import read_gaussians, write_gaussians
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import OURS, Look
+from nerfloom.splats.ply import SURE, ply_size, property_names, write_ply
+from nerfloom.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits, write_spz
+from nerfloom.splats.transform import quaternion, quaternion_product, rotated_harmonics, transformed
 from tests.conftest import Refused
 
 TERMS = (0, 3, 8, 15)
@@ -566,8 +566,8 @@ UTM = torch.tensor([512345.678, 5403210.987, 432.1], dtype=torch.float64)
 
 def pretend(monkeypatch: pytest.MonkeyPatch, model: object, placement: Placement, method: str) -> None:
     trained = SimpleNamespace(model=model, placement=placement, run=SimpleNamespace(method=method))
-    monkeypatch.setattr("framework.cli.export.trained_run", lambda path, *_: path)
-    monkeypatch.setattr("framework.training.trained.load_trained", lambda *_: trained)
+    monkeypatch.setattr("nerfloom.cli.export.trained_run", lambda path, *_: path)
+    monkeypatch.setattr("nerfloom.training.trained.load_trained", lambda *_: trained)
 
 
 def exported(monkeypatch: pytest.MonkeyPatch, folder: Path, suffix: str, *flags: str) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.splats.files import OTHERS, is_splat_file, read_gaussians
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import ELSEWHERE, OURS, Look
-from framework.splats.ply import property_names
+from nerfloom.base.errors import DataError
+from nerfloom.splats.files import OTHERS, is_splat_file, read_gaussians
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import ELSEWHERE, OURS, Look
+from nerfloom.splats.ply import property_names
 from tests.splats.foreign_files import write_compressed, write_splat
 from tests.splats.test_files import covariances, matrices, some
 

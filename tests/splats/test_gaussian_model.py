@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 import torch
 
-from framework import Dataset, GaussianModel, Loss, Method, Scene, ViewBatch
-from framework.base.pace import Pace
-from framework.splats.drawing import draw, splat_camera
-from framework.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, MOVES_PER_DOUBLING, steps_per_move
-from framework.splats.settings import SplattingConfig, decide_splatting
-from framework.splats.start import first_points, from_points, seen_colors
-from framework.tools.testing import check_method
+from nerfloom import Dataset, GaussianModel, Loss, Method, Scene, ViewBatch
+from nerfloom.base.pace import Pace
+from nerfloom.splats.drawing import draw, splat_camera
+from nerfloom.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, MOVES_PER_DOUBLING, steps_per_move
+from nerfloom.splats.settings import SplattingConfig, decide_splatting
+from nerfloom.splats.start import first_points, from_points, seen_colors
+from nerfloom.tools.testing import check_method
 
 
 class Plain(GaussianModel[SplattingConfig]):

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.cameras.view import View
-from framework.data.pixels import ViewBatch
-from framework.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
-from framework.tools.surfaces import found_surfaces
-from framework.training.datasets import load_split
-from methods.gaussian_splatting import GaussianSplattingConfig, decide
+from nerfloom.cameras.view import View
+from nerfloom.data.pixels import ViewBatch
+from nerfloom.methods.gaussian_splatting import GaussianSplattingConfig, decide
+from nerfloom.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
+from nerfloom.tools.surfaces import found_surfaces
+from nerfloom.training.datasets import load_split
 from tests.splats.test_method import SCENE, ball, camera
 from tests.splats.test_what_images_differ_in import model_of
 from tests.training.helpers import tiny_trainer

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.kernels.splat_project import rotation_matrices
-from framework.splats.gaussians import Gaussians
-from framework.splats.mcmc import DEAD, MOST_COPIES, moved, shaken, shared
+from nerfloom.kernels.splat_project import rotation_matrices
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.mcmc import DEAD, MOST_COPIES, moved, shaken, shared
 
 
 def some(count: int, logits: Tensor | None = None) -> Gaussians:

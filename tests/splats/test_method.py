@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from framework import ConfigError, View
-from framework.cameras.cameras import Cameras
-from framework.data.pixels import ViewBatch
-from framework.data.scene import Scene
-from framework.splats.drawing import draw_colors, draw_view, splat_camera
-from framework.splats.gaussians import Gaussians, HasGaussians
-from framework.training.checkpoint import load_checkpoint
-from methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom import ConfigError, View
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.pixels import ViewBatch
+from nerfloom.data.scene import Scene
+from nerfloom.methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom.splats.drawing import draw_colors, draw_view, splat_camera
+from nerfloom.splats.gaussians import Gaussians, HasGaussians
+from nerfloom.training.checkpoint import load_checkpoint
 from tests.cli.helpers import called
 from tests.dataparsers.captures import write_capture
 from tests.training.helpers import tiny_trainer
@@ -155,7 +155,7 @@ def test_growth_asks_for_as_much_of_images_of_half_the_size() -> None:
 @pytest.mark.slow
 def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None:
     """After no step of its own, better than anywhere in the box; the same bits each time."""
-    from framework.evaluation.evaluator import evaluate
+    from nerfloom.evaluation.evaluator import evaluate
 
     psnr, bits = {}, []
     for start in ("field", "field", "random"):

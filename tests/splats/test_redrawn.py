@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework import View
-from framework.splats.drawing import draw, draw_colors, draw_view, on_image, splat_camera
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import ELSEWHERE, OURS
-from framework.splats.redrawn import Redrawn, packed
-from framework.tools.benchmarks.frames import measure
+from nerfloom import View
+from nerfloom.splats.drawing import draw, draw_colors, draw_view, on_image, splat_camera
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import ELSEWHERE, OURS
+from nerfloom.splats.redrawn import Redrawn, packed
+from nerfloom.tools.benchmarks.frames import measure
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import scene
 from tests.splats.test_method import ball, camera

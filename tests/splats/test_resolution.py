@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from framework.base.pace import Pace
-from framework.splats.resolution import (
+from nerfloom.base.pace import Pace
+from nerfloom.splats.resolution import (
     LEAST_SIDE,
     REDUCED_SHARE,
     ImageSizes,

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.kernels.splat_tiles import TileLists
-from framework.splats.room import FADED, HEADROOM, PIECE, Room
-from framework.tools.benchmarks.operations import trainer_of
-from framework.training.skipping import skip_report
+from nerfloom.kernels.splat_tiles import TileLists
+from nerfloom.splats.room import FADED, HEADROOM, PIECE, Room
+from nerfloom.tools.benchmarks.operations import trainer_of
+from nerfloom.training.skipping import skip_report
 from tests.training.recorded import ahead
 
 NONE = torch.zeros(0, dtype=torch.int32)

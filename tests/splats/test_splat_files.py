@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.cli import evaluate as eval_command
-from framework.data.offsets import offset_file
-from framework.splats.files import read_gaussians, write_gaussians
-from framework.splats.gaussians import HasGaussians
-from framework.splats.look import Look
-from framework.splats.transform import transformed
-from framework.training.splat_files import load_run_or_splats
+from nerfloom.base.errors import DataError
+from nerfloom.cli import evaluate as eval_command
+from nerfloom.data.offsets import offset_file
+from nerfloom.splats.files import read_gaussians, write_gaussians
+from nerfloom.splats.gaussians import HasGaussians
+from nerfloom.splats.look import Look
+from nerfloom.splats.transform import transformed
+from nerfloom.training.splat_files import load_run_or_splats
 from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.dataparsers.captures import moved, poses, write_capture

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from dataparsers.blender import Blender
-from framework.data.dataset import load_dataset
-from framework.kernels.splat_project import DC
-from framework.splats.start import (
+from nerfloom.data.dataset import load_dataset
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.kernels.splat_project import DC
+from nerfloom.splats.start import (
     first_points,
     from_points,
     hull_points,

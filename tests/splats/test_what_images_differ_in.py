@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework import View
-from framework.cameras.cameras import Cameras
-from framework.data.pixels import ViewBatch
-from framework.evaluation.appearance import appearance_of, fit_appearance
-from framework.kernels.math import cross_matrix
-from framework.splats.gaussians import Gaussians
-from framework.training.datasets import load_split
-from methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom import View
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.pixels import ViewBatch
+from nerfloom.evaluation.appearance import appearance_of, fit_appearance
+from nerfloom.kernels.math import cross_matrix
+from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.training.datasets import load_split
 from tests.splats.test_method import SCENE, ball, camera
 from tests.training.helpers import tiny_trainer
 

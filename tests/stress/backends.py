@@ -10,7 +10,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import HealthCheck, settings
 
-from framework.kernels import native
+from nerfloom.kernels import native
 from tests.kernels.compiled import needs_kernels
 
 REFERENCE, COMPILED = "reference", "compiled"

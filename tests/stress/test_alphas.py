@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
-from framework.rendering.rendered import Rendered
-from framework.rendering.volume import volume_render
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import volume_render
 from tests.stress.backends import FEW, backends
 
 LEAK = 1.01 * torch.finfo(torch.float32).eps ** 0.5

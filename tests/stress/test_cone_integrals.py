@@ -6,18 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.encodings.integrated import IntegratedEncoding, icosahedron_directions
-from framework.geometry.bounds import contract, contract_gaussians, contraction_scale
-from framework.geometry.multisamples import Pattern
-from framework.geometry.points import Frustums, Points, frames, sample_points
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.downweighting import level_weights
-from framework.kernels.frequency import frequency_encoding_reference
-from framework.kernels.hash_grid_layout import HashGridLayout
-from framework.kernels.integrated import integrated_encoding
-from framework.kernels.multisampled_grid import multisampled_grid
-from framework.kernels.multisamples import unit_multisamples
-from framework.samplers.proposal import FARTHEST
+from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_directions
+from nerfloom.geometry.bounds import contract, contract_gaussians, contraction_scale
+from nerfloom.geometry.multisamples import Pattern
+from nerfloom.geometry.points import Frustums, Points, frames, sample_points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.downweighting import level_weights
+from nerfloom.kernels.frequency import frequency_encoding_reference
+from nerfloom.kernels.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.integrated import integrated_encoding
+from nerfloom.kernels.multisampled_grid import multisampled_grid
+from nerfloom.kernels.multisamples import unit_multisamples
+from nerfloom.samplers.proposal import FARTHEST
 from tests.stress.backends import backends
 from tests.stress.test_cones import assert_like, drawn_in_frustum, two_rays
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.geometry.points import conical_frustums, sample_points
-from framework.geometry.rays import Rays, Samples
-from framework.samplers.uniform import LAST_INTERVAL
+from nerfloom.geometry.points import conical_frustums, sample_points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.samplers.uniform import LAST_INTERVAL
 from tests.stress.backends import FEW
 
 F64 = torch.float64

@@ -7,13 +7,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.encoded import EncodedField
-from framework.fields.tensor import DENSITY_SCALE, DENSITY_SHIFT, TensorField
-from framework.geometry.points import Points
-from framework.kernels.march import refresh_occupancy
-from framework.kernels.math import MAX_LOG_DENSITY, split_density, truncated_exp
-from framework.samplers.occupancy import OccupancySampler
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.tensor import DENSITY_SCALE, DENSITY_SHIFT, TensorField
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.march import refresh_occupancy
+from nerfloom.kernels.math import MAX_LOG_DENSITY, split_density, truncated_exp
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.stress.backends import FEW, backends
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

@@ -9,21 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.encoded import EncodedField
-from framework.geometry.bounds import contract
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import composite
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from framework.kernels.intervals import interval_weights, resample
-from framework.kernels.math import cross_matrix, safe_normalize, truncated_exp
-from framework.kernels.mlp import mlp
-from framework.kernels.planes import PlanesLayout, planes, planes_reference
-from framework.kernels.spacing import from_disparity, to_disparity
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.samplers.inverse_cdf import inverse_cdf
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.geometry.bounds import contract
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import composite
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.intervals import interval_weights, resample
+from nerfloom.kernels.math import cross_matrix, safe_normalize, truncated_exp
+from nerfloom.kernels.mlp import mlp
+from nerfloom.kernels.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.spacing import from_disparity, to_disparity
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.samplers.inverse_cdf import inverse_cdf
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import COMPILED, FEW, backends
 

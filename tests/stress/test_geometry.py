@@ -12,18 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.data.light import QUANTILES, light_of
-from framework.encodings.hash_grid import HashGrid
-from framework.evaluation.images import to_uint8
-from framework.fields.encoded import EncodedField
-from framework.fields.normals import NormalHead, density_normals
-from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.march import CompiledMarch, Occupancy
-from framework.kernels.math import safe_normalize
-from framework.kernels.spacing import from_disparity, to_disparity
+from nerfloom.data.light import QUANTILES, light_of
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.evaluation.images import to_uint8
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.normals import NormalHead, density_normals
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.march import CompiledMarch, Occupancy
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.spacing import from_disparity, to_disparity
 from tests.stress.backends import COMPILED, FEW, backends
 
 CUBE = torch.tensor([[-1.0] * 3, [1.0] * 3])

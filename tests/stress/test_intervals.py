@@ -8,16 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.compositing import (
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.compositing import (
     MAX_OPTICAL_DEPTH,
     Composited,
     composite,
     optical_depth,
     weights_and_transmittance,
 )
-from framework.kernels.intervals import interval_weights
-from framework.rendering.volume import Rendered, volume_render
+from nerfloom.kernels.intervals import interval_weights
+from nerfloom.rendering.volume import Rendered, volume_render
 from tests.kernels.test_compositing import EXTREMES, ragged
 from tests.stress.backends import FEW, backends
 

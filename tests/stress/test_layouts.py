@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import distortion, distortion_by_pairs
-from framework.kernels.frequency import frequency_encoding
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import distortion, distortion_by_pairs
+from nerfloom.kernels.frequency import frequency_encoding
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import FEW, backends
 from tests.stress.test_encodings import ANY_SHAPE, ROWS

@@ -13,18 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.data.depths import read_depths
-from framework.data.scene import Scene
-from framework.encodings.planes import FeaturePlanes
-from framework.evaluation.lpips import load_lpips
-from framework.evaluation.metrics import MAX_PSNR, psnr, ssim
-from framework.geometry.rays import Histogram, Samples
-from framework.kernels.compositing import distortion, distortion_by_pairs
-from framework.kernels.plane_bands import squared_steps, variation
-from framework.kernels.planes import PlanesLayout
-from framework.rendering.losses import depth_error, mean_squared_error
-from framework.samplers.proposal import interlevel_loss
-from methods.kplanes import METHOD, KPlanes, KPlanesConfig
+from nerfloom.data.depths import read_depths
+from nerfloom.data.scene import Scene
+from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.evaluation.lpips import load_lpips
+from nerfloom.evaluation.metrics import MAX_PSNR, psnr, ssim
+from nerfloom.geometry.rays import Histogram, Samples
+from nerfloom.kernels.compositing import distortion, distortion_by_pairs
+from nerfloom.kernels.plane_bands import squared_steps, variation
+from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.methods.kplanes import METHOD, KPlanes, KPlanesConfig
+from nerfloom.rendering.losses import depth_error, mean_squared_error
+from nerfloom.samplers.proposal import interlevel_loss
 from tests.images import parsed
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import FEW, backends

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras.poses import rotation_between
-from framework.cameras.refinement import PoseRefinement
-from framework.geometry.lenses import LENSES
-from framework.geometry.rays import Rays
-from framework.kernels.math import cross_matrix
+from nerfloom.cameras.poses import rotation_between
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.geometry.lenses import LENSES
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.math import cross_matrix
 from tests.stress.backends import backends
 from tests.test_lenses import HEIGHT, WIDTH, cameras
 

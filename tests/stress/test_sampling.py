@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.kernels.intervals import resample
-from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
-from framework.kernels.spacing import spacing
-from framework.rendering.volume import VolumeRenderer
-from framework.samplers.inverse_cdf import inverse_cdf
-from framework.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.intervals import resample
+from nerfloom.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
+from nerfloom.kernels.spacing import spacing
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.inverse_cdf import inverse_cdf
+from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss
 from tests.kernels.test_march import walk
 from tests.stress.backends import COMPILED, FEW, backends
 

@@ -12,20 +12,20 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from framework.base.config import TrainConfig
-from framework.base.errors import ConfigError
-from framework.encodings.hash_grid import HashGrid
-from framework.evaluation.evaluator import evaluation_background
-from framework.fields.base import Field
-from framework.fields.encoded import EncodedField
-from framework.fields.nerf import NeRFField
-from framework.geometry.rays import Rays
-from framework.kernels.adam import sparse_adam
-from framework.rendering.rendered import Rendered
-from framework.rendering.volume import VolumeRenderer
-from framework.samplers.uniform import UniformSampler
-from framework.training.optim import Adam
-from framework.training.trainer import State, Trainer
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import ConfigError
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.fields.base import Field
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.adam import sparse_adam
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.uniform import UniformSampler
+from nerfloom.training.optim import Adam
+from nerfloom.training.trainer import State, Trainer
 from tests.stress.backends import backends
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 

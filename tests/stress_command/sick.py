@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from framework import RayModel, Rays, Rendered
-from methods import instant_ngp
-from methods.instant_ngp import InstantNGPConfig
+from nerfloom import RayModel, Rays, Rendered
+from nerfloom.methods import instant_ngp
+from nerfloom.methods.instant_ngp import InstantNGPConfig
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.config import from_plain
-from framework.base.errors import ConfigError
-from framework.base.registry import load_method
-from framework.cli.stress import USAGE
-from framework.data.sources import make_source
-from framework.tools.stress.conditions import CONDITIONS, PLAIN, Condition, select
-from framework.tools.stress.scenes import ball_views
-from framework.tools.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedSource, shortened
-from framework.training.run import Run, create_folder
-from framework.training.trainer import Trainer
+from nerfloom.base.config import from_plain
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import load_method
+from nerfloom.cli.stress import USAGE
+from nerfloom.data.sources import make_source
+from nerfloom.tools.stress.conditions import CONDITIONS, PLAIN, Condition, select
+from nerfloom.tools.stress.scenes import ball_views
+from nerfloom.tools.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedSource, shortened
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run
 
 BALL = ball_views()

@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-from framework.tools.stress.report import Result, markdown, notes, settings_of, table
-from framework.tools.stress.scenes import ball_views
-from framework.tools.stress.trial import Budget
-from framework.tools.stress.verdict import Outcome, Verdict
+from nerfloom.tools.stress.report import Result, markdown, notes, settings_of, table
+from nerfloom.tools.stress.scenes import ball_views
+from nerfloom.tools.stress.trial import Budget
+from nerfloom.tools.stress.verdict import Outcome, Verdict
 from tests.training.helpers import tiny_run
 
 MACHINE = {

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base import registry
-from framework.cli.stress import main
-from framework.tools.stress.conditions import CONDITIONS, PLAIN, select
-from framework.tools.stress.scenes import ball_views
-from framework.tools.stress.trial import Budget, attempt, unsound
-from framework.tools.stress.verdict import verdicts
+from nerfloom.base import registry
+from nerfloom.cli.stress import main
+from nerfloom.tools.stress.conditions import CONDITIONS, PLAIN, select
+from nerfloom.tools.stress.scenes import ball_views
+from nerfloom.tools.stress.trial import Budget, attempt, unsound
+from nerfloom.tools.stress.verdict import verdicts
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import Refused
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
@@ -149,7 +149,7 @@ def test_several_methods_make_one_table(tmp_path: Path, refused: Refused) -> Non
 
 def test_all_stands_for_every_registered_method(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
-    monkeypatch.setattr("framework.cli.stress.stress", lambda methods, flags: asked.extend(methods) or [])
+    monkeypatch.setattr("nerfloom.cli.stress.stress", lambda methods, flags: asked.extend(methods) or [])
     stress(monkeypatch, "all", "--only", "plain")
     assert asked == list(registry.registered("methods"))
     assert "instant-ngp" in asked
@@ -201,7 +201,7 @@ def test_what_cannot_be_begun_is_one_line(
 def test_a_place_that_cannot_be_written_is_named_before_anything_is_trained(
     tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("framework.tools.stress.verdict.verdicts", None)
+    monkeypatch.setattr("nerfloom.tools.stress.verdict.verdicts", None)
     (tmp_path / "file").touch()
     said = refused(main, "instant-ngp", "--output-path", tmp_path / "file" / "table.json")
     assert f"cannot write {tmp_path / 'file' / 'table.json'}: Not a directory; name another place" in said

@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from dataparsers.blender import Blender
-from framework.cameras.cameras import check_pose, subpixels
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixel_set import PixelSet
-from framework.geometry.bounds import intersect_box
-from framework.tools.stress.scenes import (
+from nerfloom.cameras.cameras import check_pose, subpixels
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.tools.stress.scenes import (
     FIELD_OF_VIEW,
     NUM_TEST,
     NUM_TRAIN,
@@ -26,7 +26,7 @@ from framework.tools.stress.scenes import (
     data_views,
     reduced,
 )
-from framework.tools.testing.ball import RADIUS, trace
+from nerfloom.tools.testing.ball import RADIUS, trace
 
 INSIDE = RADIUS / 2
 views_of = cache(ball_views)

@@ -6,14 +6,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import check_pose
-from framework.data.dataset import Dataset
-from framework.data.pixel_set import PixelSet
-from framework.data.pixels import draw_batch
-from framework.tools.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
-from framework.tools.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
-from framework.tools.stress.variants import (
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import check_pose
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels import draw_batch
+from nerfloom.tools.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
+from nerfloom.tools.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
+from nerfloom.tools.stress.variants import (
     chosen,
     first_image,
     mean_color,

@@ -4,11 +4,11 @@ import math
 
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.tools.stress.conditions import ALLOWED, PLAIN, Condition
-from framework.tools.stress.faults import spoiled_pixel
-from framework.tools.stress.trial import Trial, in_a_line
-from framework.tools.stress.verdict import LEAST_LEARNT, Outcome, verdict_of
+from nerfloom.base.errors import ConfigError
+from nerfloom.tools.stress.conditions import ALLOWED, PLAIN, Condition
+from nerfloom.tools.stress.faults import spoiled_pixel
+from nerfloom.tools.stress.trial import Trial, in_a_line
+from nerfloom.tools.stress.verdict import LEAST_LEARNT, Outcome, verdict_of
 
 HARD = Condition("hard", "anything")
 EXPLAINED = Condition("explained", "anything", reason="who could do better")

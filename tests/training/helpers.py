@@ -7,12 +7,12 @@ from typing import Any
 
 import torch
 
-from dataparsers.blender import Blender
-from framework.base.registry import load_method
-from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.datasets import load_split
-from framework.training.run import Run, create_folder
-from framework.training.trainer import Trainer
+from nerfloom.base.registry import load_method
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 
 TINY: dict[str, dict[str, Any]] = {
     "instant-ngp": {

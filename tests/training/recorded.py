@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map_only
 
-from framework.kernels import given
-from framework.tools.benchmarks.operations import _place, _tensors, _waits
+from nerfloom.kernels import given
+from nerfloom.tools.benchmarks.operations import _place, _tensors, _waits
 
 T = TypeVar("T")
 
@@ -107,10 +107,10 @@ class FakeRecorder:
 
 def ahead(monkeypatch: Any) -> None:
     """Let the CPU be a device that runs ahead of Python, and for which there are no kernels of ours."""
-    from framework.kernels import native
+    from nerfloom.kernels import native
 
     monkeypatch.setattr(native, "available", lambda: False)
     monkeypatch.setattr(native, "has", lambda name: False)
-    monkeypatch.setattr("framework.base.device.runs_ahead", lambda device: True)
-    monkeypatch.setattr("framework.training.step.is_bad_here", lambda loss: False)
+    monkeypatch.setattr("nerfloom.base.device.runs_ahead", lambda device: True)
+    monkeypatch.setattr("nerfloom.training.step.is_bad_here", lambda loss: False)
     assert given.is_bad_here is not None

@@ -13,17 +13,17 @@ from typing import Any
 
 import torch
 
-from framework import Loss
-from framework.base.device import seed_step
-from framework.base.processes import joined_processes, processes
-from framework.cli import train
-from framework.data.pixels import PixelBatch, draw_pixels, gather_batch
-from framework.data.sources import PixelSource, Request
-from framework.training import mean_gradients as averaging
-from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.progress import StepReport
-from framework.training.step import backward, forward
-from framework.training.trainer import Trainer
+from nerfloom import Loss
+from nerfloom.base.device import seed_step
+from nerfloom.base.processes import joined_processes, processes
+from nerfloom.cli import train
+from nerfloom.data.pixels import PixelBatch, draw_pixels, gather_batch
+from nerfloom.data.sources import PixelSource, Request
+from nerfloom.training import mean_gradients as averaging
+from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.progress import StepReport
+from nerfloom.training.step import backward, forward
+from nerfloom.training.trainer import Trainer
 from tests.cli.helpers import TINY_NGP
 from tests.training.helpers import tensors, tiny_trainer
 

@@ -5,9 +5,9 @@ import math
 
 import pytest
 
-from framework.base.config import RayConfig
-from framework.base.pace import Pace
-from framework.training.batch_size import BATCH_CHANGES, LARGEST_BATCH, SMALLEST_BATCH, BatchSize
+from nerfloom.base.config import RayConfig
+from nerfloom.base.pace import Pace
+from nerfloom.training.batch_size import BATCH_CHANGES, LARGEST_BATCH, SMALLEST_BATCH, BatchSize
 
 CONFIG = RayConfig(num_rays_per_batch=2_048)
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.config import TrainConfig
-from framework.base.errors import FlagError
-from framework.base.step_limit import limited_as_given
-from framework.cli.train import run_of
-from framework.training.budget import evaluation_seconds, reason_to_stop, spent
-from framework.training.run import Run, create_folder, read_run
-from framework.training.state import State
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import FlagError
+from nerfloom.base.step_limit import limited_as_given
+from nerfloom.cli.train import run_of
+from nerfloom.training.budget import evaluation_seconds, reason_to_stop, spent
+from nerfloom.training.run import Run, create_folder, read_run
+from nerfloom.training.state import State
 
 CURVE = ((1.0, 10, 31.0), (2.0, 20, 29.5))
 

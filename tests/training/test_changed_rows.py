@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.optimised import RowChange
-from framework.training.optim import Adam
+from nerfloom.base.optimised import RowChange
+from nerfloom.training.optim import Adam
 
 RATE, BETAS, EPS = 1e-2, (0.8, 0.95), 1e-12
 ROWS, FEATURES = 7, 3

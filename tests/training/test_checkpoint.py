@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.errors import CheckpointError
-from framework.training import checkpoint
-from framework.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
+from nerfloom.base.errors import CheckpointError
+from nerfloom.training import checkpoint
+from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
 
 
 def save(folder: Path, step: int, keep_all: bool = False, before: int | None = None) -> Path:

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.checked import checked
-from framework.base.registry import load_method, registered
-from framework.cameras.view import every
-from framework.evaluation.evaluator import Measured, evaluate, evaluation_background
-from framework.evaluation.metrics import psnr
-from framework.training.checkpoint import load_checkpoint
-from framework.training.curve import (
+from nerfloom.base.checked import checked
+from nerfloom.base.registry import load_method, registered
+from nerfloom.cameras.view import every
+from nerfloom.evaluation.evaluator import Measured, evaluate, evaluation_background
+from nerfloom.evaluation.metrics import psnr
+from nerfloom.training.checkpoint import load_checkpoint
+from nerfloom.training.curve import (
     FEW,
     MARGIN,
     SHARE,
@@ -28,8 +28,8 @@ from framework.training.curve import (
     pixel_stride,
     rows,
 )
-from framework.training.progress import StepReport
-from framework.training.trainer import State, Trainer
+from nerfloom.training.progress import StepReport
+from nerfloom.training.trainer import State, Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 
@@ -49,7 +49,7 @@ def test_every_run_has_a_curve_at_its_price(
 ) -> None:
     """By a clock of its own: short steps after a first one of a second, and pictures at a given speed."""
     clock = [0.0]
-    monkeypatch.setattr("framework.training.curve.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("nerfloom.training.curve.time.perf_counter", lambda: clock[0])
     few = FewImages.__new__(FewImages)
     few._views, few._sizes, few._rays_per_pixel = [0, 1, 2], [(size, size)] * 3, rays_per_pixel
 
@@ -75,8 +75,8 @@ def test_every_run_has_a_curve_at_its_price(
 
 @pytest.mark.medium
 def test_looks_change_no_bit(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.training.curve.SHARE", math.inf)
-    monkeypatch.setattr("framework.training.curve.SPACING", 0.0)
+    monkeypatch.setattr("nerfloom.training.curve.SHARE", math.inf)
+    monkeypatch.setattr("nerfloom.training.curve.SPACING", 0.0)
     blind = tiny_trainer("nerfacto", shared_tiny, tmp_path / "blind", max_num_iterations=8)
     seeing = tiny_trainer("nerfacto", shared_tiny, tmp_path / "seeing", True, max_num_iterations=8)
     blind.train()
@@ -118,10 +118,10 @@ def test_what_the_first_look_compiles_on_a_gpu_is_not_the_cost_of_the_next(
         clock[0] += costs.pop()
         return Measured(20.0, None)
 
-    monkeypatch.setattr("framework.training.curve.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr("nerfloom.training.curve.time", SimpleNamespace(perf_counter=lambda: clock[0]))
 
     monkeypatch.setattr(FewImages, "_measure", measure)
-    monkeypatch.setattr("framework.training.curve.runs_ahead", lambda device: True)
+    monkeypatch.setattr("nerfloom.training.curve.runs_ahead", lambda device: True)
     found = FewImages(dataset, None, 1).look_if_due(
         trainer.model, (), StepReport(10, 1e9, 1.0, {}, 20.0, 1e9, None), last=False
     )

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.run import read_run
-from framework.training.trained import load_trained
+from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.run import read_run
+from nerfloom.training.trained import load_trained
 from tests.cli.helpers import called
 from tests.training.helpers import tiny_run, tiny_trainer
 

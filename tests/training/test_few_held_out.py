@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from framework.training.datasets import first_split, load_split
-from framework.training.trainer import Trainer
+from nerfloom.training.datasets import first_split, load_split
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run
 
 

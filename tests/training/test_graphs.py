@@ -14,17 +14,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.errors import ConfigError, DivergenceError
-from framework.base.step_kind import StepKind
-from framework.model import Loss
-from framework.samplers import proposal
-from framework.tools.benchmarks.operations import trainer_of
-from framework.tools.testing.scenes import moving_ball
-from framework.training import graphs
-from framework.training.batch_size import BatchSize
-from framework.training.graphs import WARM_UP, CudaRecorder, StepGraphs, kind_of_step, make_graphs
-from framework.training.state import State
-from framework.training.trainer import MAX_BAD_STEPS, Trainer
+from nerfloom.base.errors import ConfigError, DivergenceError
+from nerfloom.base.step_kind import StepKind
+from nerfloom.model import Loss
+from nerfloom.samplers import proposal
+from nerfloom.tools.benchmarks.operations import trainer_of
+from nerfloom.tools.testing.scenes import moving_ball
+from nerfloom.training import graphs
+from nerfloom.training.batch_size import BatchSize
+from nerfloom.training.graphs import WARM_UP, CudaRecorder, StepGraphs, kind_of_step, make_graphs
+from nerfloom.training.state import State
+from nerfloom.training.trainer import MAX_BAD_STEPS, Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 from tests.training.recorded import FakeRecorder, ahead
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.kernels import native
-from framework.tools.benchmarks.operations import METHODS, Counting, counted, trainer_of
-from framework.training.optim import Adam
-from framework.training.step import backward
+from nerfloom.kernels import native
+from nerfloom.tools.benchmarks.operations import METHODS, Counting, counted, trainer_of
+from nerfloom.training.optim import Adam
+from nerfloom.training.step import backward
 from tests.training.helpers import tiny_trainer
 
 BOUNDS = {
@@ -129,7 +129,7 @@ def test_errors_that_are_read_late_make_the_same_mean(shared_tiny: Path, tmp_pat
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 def test_a_loss_is_found_bad_together_with_its_gradients(bad: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Off the CPU it is not looked at before: the device is asked once. No gradient of it remains."""
-    monkeypatch.setattr("framework.training.step.is_bad_here", lambda loss: False)
+    monkeypatch.setattr("nerfloom.training.step.is_bad_here", lambda loss: False)
     weight = torch.nn.Parameter(torch.ones(3))
     optimizer = Adam([{"params": [weight]}], {}, 1e-2, (0.9, 0.99), 1e-8)
     assert backward((weight * 2).sum(), optimizer)

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base.config import TrainConfig
-from framework.encodings.hash_grid import HashGrid
-from framework.training.optim import Adam, learning_rate_factor
+from nerfloom.base.config import TrainConfig
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.training.optim import Adam, learning_rate_factor
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import torch
 
-from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluation_background, measure_view
-from framework.training.trainer import Trainer
+from nerfloom.data.dataset import Dataset
+from nerfloom.evaluation.evaluator import evaluation_background, measure_view
+from nerfloom.training.trainer import Trainer
 from tests.other_device import OTHER, There, other_device
 from tests.training.test_graphs import VARIANTS, small
 

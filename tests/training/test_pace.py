@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
-from framework.base.config import TrainConfig
-from framework.base.device import relative_speed
-from framework.base.errors import ConfigError
-from framework.base.machine_config import MachineConfig
-from framework.base.pace import Pace, StepTimes
-from framework.training import speed
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.device import relative_speed
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.pace import Pace, StepTimes
+from nerfloom.training import speed
 
 
 def learnt(times: StepTimes, steps: list[tuple[int, float]], steps_per_read: int = 1) -> None:

@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework import DataParser, ParsedScene
-from framework.base.errors import DataError
-from framework.base.registry import load_method
-from framework.data.dataset import Split, load_dataset
-from framework.training.run import TRANSFORMS, Run, write_transforms
+from nerfloom import DataParser, ParsedScene
+from nerfloom.base.errors import DataError
+from nerfloom.base.registry import load_method
+from nerfloom.data.dataset import Split, load_dataset
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.training.run import TRANSFORMS, Run, write_transforms
 from tests.dataparsers.captures import write_capture
 
 TURNED = [[0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 1.0, -2.0], [1.0, 0.0, 0.0, 5.0]]

@@ -14,20 +14,20 @@ from typing import Any
 import pytest
 import torch
 
-from framework.base import device, processes
-from framework.base.device import choose_device, seed_step, shared_stream, stream_seed
-from framework.base.machine_config import MachineConfig
-from framework.base.processes import Processes, gathered
-from framework.cli.session import resume
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixel_cache import PixelMemory
-from framework.data.pixel_stream import PixelStream
-from framework.data.pixels import draw_batch
-from framework.data.sources import Request, ViewSource
-from framework.training import mean_gradients as averaging
-from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.optim import Adam
-from framework.training.run import read_run
+from nerfloom.base import device, processes
+from nerfloom.base.device import choose_device, seed_step, shared_stream, stream_seed
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.processes import Processes, gathered
+from nerfloom.cli.session import resume
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixel_stream import PixelStream
+from nerfloom.data.pixels import draw_batch
+from nerfloom.data.sources import Request, ViewSource
+from nerfloom.training import mean_gradients as averaging
+from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.optim import Adam
+from nerfloom.training.run import read_run
 from tests.cli.helpers import command
 from tests.faults import runs
 from tests.forked import Forks
@@ -219,7 +219,7 @@ def test_if_one_process_is_killed_the_other_ends_and_says_how_to_continue(
     killed: int, shared_tiny: Path, tmp_path: Path
 ) -> None:
     flags, folder = runs.new_run(shared_tiny, tmp_path, 100_000)
-    both = started("framework.cli.train", *flags)
+    both = started("nerfloom.cli.train", *flags)
     runs.wait_for_checkpoint(both[0], folder)
     both[killed].kill()
     start = time.monotonic()

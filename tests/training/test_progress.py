@@ -5,9 +5,9 @@ from pathlib import Path
 
 import torch
 
-from framework.training.checkpoint import load_checkpoint
-from framework.training.progress import StepReport, share_and_time
-from framework.training.state import State
+from nerfloom.training.checkpoint import load_checkpoint
+from nerfloom.training.progress import StepReport, share_and_time
+from nerfloom.training.state import State
 from tests.training.helpers import tiny_trainer
 
 FIRST = StepReport(101, 60.0, 0.5, {"rgb": torch.tensor(0.25)}, 20.0, 4_100.0, None)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.errors import CheckpointError, ConfigError
-from framework.cli.train_paths import check_paths
-from framework.training.run_path import config_file, trained_run
+from nerfloom.base.errors import CheckpointError, ConfigError
+from nerfloom.cli.train_paths import check_paths
+from nerfloom.training.run_path import config_file, trained_run
 
 
 def make_run(folder: Path, age: float, trained: bool) -> Path:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.base.machine_config import MachineConfig
+from nerfloom.base.machine_config import MachineConfig
 from tests.training.helpers import TINY, differences, tiny_trainer
 
 ROOT = Path(__file__).parents[2]

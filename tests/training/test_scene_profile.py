@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 
-from framework.cli.session import start
-from framework.scene.profile import SceneProfile
-from framework.training import trainer as trainer_module
-from framework.training.checkpoint import FOLDER
-from framework.training.preparation import profile_of
-from framework.training.trainer import Trainer
+from nerfloom.cli.session import start
+from nerfloom.scene.profile import SceneProfile
+from nerfloom.training import trainer as trainer_module
+from nerfloom.training.checkpoint import FOLDER
+from nerfloom.training.preparation import profile_of
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_run, tiny_trainer
 
 

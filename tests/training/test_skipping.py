@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.training.skipping import Rung, lines, skip_report
+from nerfloom.training.skipping import Rung, lines, skip_report
 from tests.conftest import write_tiny
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 

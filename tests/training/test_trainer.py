@@ -14,19 +14,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from dataparsers.blender import Blender
-from framework import Loss, Model, PixelBatch, RayModel, Rays, Rendered
-from framework.base import registry
-from framework.base.errors import CheckpointError, ConfigError, DivergenceError
-from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.training import trainer as trainer_file
-from framework.training.checkpoint import list_checkpoints, load_checkpoint
-from framework.training.datasets import first_split, load_split
-from framework.training.run import create_folder
-from framework.training.signals import stop_signals
-from framework.training.trainer import Trainer
-from methods import instant_ngp
-from methods.instant_ngp import InstantNGPConfig
+from nerfloom import Loss, Model, PixelBatch, RayModel, Rays, Rendered
+from nerfloom.base import registry
+from nerfloom.base.errors import CheckpointError, ConfigError, DivergenceError
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.methods import instant_ngp
+from nerfloom.methods.instant_ngp import InstantNGPConfig
+from nerfloom.training import trainer as trainer_file
+from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint
+from nerfloom.training.datasets import first_split, load_split
+from nerfloom.training.run import create_folder
+from nerfloom.training.signals import stop_signals
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
 KINDS = list(TINY)
@@ -81,7 +81,7 @@ def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp
 
 
 def test_another_seed_gives_other_bits(shared_tiny: Path, tmp_path: Path) -> None:
-    from framework.base.machine_config import MachineConfig
+    from nerfloom.base.machine_config import MachineConfig
 
     runs = [
         tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(seed), machine=MachineConfig(seed=seed))

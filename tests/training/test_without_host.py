@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from framework.base.device import StepValue, runs_ahead, seed_step
-from framework.data.error_map import DECAY, ErrorMap
-from framework.rendering.losses import depth_error
-from framework.scene.shared_space import SharedSpace
-from framework.tools.benchmarks.operations import Counting, _tensors
-from framework.training.trainer import Trainer
-from methods.tensorf import TensoRF
+from nerfloom.base.device import StepValue, runs_ahead, seed_step
+from nerfloom.data.error_map import DECAY, ErrorMap
+from nerfloom.methods.tensorf import TensoRF
+from nerfloom.rendering.losses import depth_error
+from nerfloom.scene.shared_space import SharedSpace
+from nerfloom.tools.benchmarks.operations import Counting, _tensors
+from nerfloom.training.trainer import Trainer
 from tests.training.test_graphs import VARIANTS, idle, small
 
 NOWHERE = torch.device("meta")
@@ -91,7 +91,7 @@ def test_a_number_of_a_step_is_a_float_here_and_one_tensor_elsewhere(monkeypatch
     value.set(0.25)
     assert value.on(NOWHERE) is there
     assert value.on(cpu) == 0.25
-    monkeypatch.setattr("framework.base.device.runs_ahead", lambda device: True)
+    monkeypatch.setattr("nerfloom.base.device.runs_ahead", lambda device: True)
     tensor = StepValue(0.5)
     before = tensor.on(cpu)
     tensor.set(0.75)
@@ -129,7 +129,7 @@ def test_errors_of_tiles_are_learnt_as_by_hand() -> None:
 
 def test_depths_that_are_not_known_do_not_count() -> None:
     """As the mean over the rays whose distance is known, from the definition; 0 if none is."""
-    from framework.geometry.rays import Samples
+    from nerfloom.geometry.rays import Samples
 
     torch.manual_seed(0)
     t = torch.rand(4, 6).sort(-1).values + 1

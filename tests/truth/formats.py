@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dataparsers.blender import Blender
-from dataparsers.colmap import Colmap
-from dataparsers.llff import Llff
-from dataparsers.nerfstudio import Nerfstudio
-from dataparsers.phototourism import Phototourism
-from dataparsers.polycam import Polycam
-from dataparsers.record3d import Record3D
-from framework import DataParser
+from nerfloom import DataParser
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.llff import Llff
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.dataparsers.phototourism import Phototourism
+from nerfloom.dataparsers.polycam import Polycam
+from nerfloom.dataparsers.record3d import Record3D
 from tests.dataparsers.sparse_models import Capture, write_colmap
 from tests.truth.ball import (
     CENTRE,

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework import Cameras, ParsedScene
-from framework.cameras.poses import estimate_near
-from framework.data.dataset import Dataset, Split, load_dataset
-from framework.data.depths import read_depth
-from framework.geometry.rays import Rays
+from nerfloom import Cameras, ParsedScene
+from nerfloom.cameras.poses import estimate_near
+from nerfloom.data.dataset import Dataset, Split, load_dataset
+from nerfloom.data.depths import read_depth
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.geometry.rays import Rays
 from tests.truth.ball import CENTRE, HEIGHT, NAMES, RADIUS, WIDTH, met
 from tests.truth.formats import FORMATS, write_nerfstudio
 

@@ -10,12 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
-from dataparsers.blender import Blender
-from framework.data.dataset import Dataset, load_dataset
-from framework.data.pixels import gather_batch, gather_colors_reference
-from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.training.datasets import load_split
-from framework.training.run import Run
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixels import gather_batch, gather_colors_reference
+from nerfloom.dataparsers.blender import Blender
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run
 from tests.test_nerfacto import captured
 from tests.training.helpers import tiny_run, tiny_trainer
 from tests.truth.ball import pose_of
@@ -125,7 +125,7 @@ def cut_out(tiny: Path, grey: int = 255) -> Path:
 @pytest.fixture
 def run(tiny: Path, tmp_path: Path) -> Run:
     """Of instant-ngp on the cut-out ball."""
-    from dataparsers.nerfstudio import Nerfstudio
+    from nerfloom.dataparsers.nerfstudio import Nerfstudio
 
     made = tiny_run("instant-ngp", cut_out(tiny), tmp_path / "run")
     return replace(made, dataparser="nerfstudio", parser=Nerfstudio())

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from framework.cli.train import run_of
-from framework.tools.comparison.measures import Measured, measure, rows_of
-from framework.tools.comparison.plan import Contender, Job
-from framework.tools.comparison.report import COLUMNS, table
+from nerfloom.cli.train import run_of
+from nerfloom.tools.comparison.measures import Measured, measure, rows_of
+from nerfloom.tools.comparison.plan import Contender, Job
+from nerfloom.tools.comparison.report import COLUMNS, table
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 BETTER = {

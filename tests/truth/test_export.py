@@ -11,14 +11,14 @@ import torch
 from scipy.linalg import expm
 from torch import Tensor
 
-from dataparsers.polycam import Polycam
-from framework.export.points import SurfacePoints, joined, surface_points
-from framework.geometry.rays import Rays
-from framework.rendering.volume import Rendered
-from framework.training.checkpoint import load_checkpoint
-from framework.training.datasets import load_split
-from framework.training.run import create_folder
-from framework.training.trainer import Trainer
+from nerfloom.dataparsers.polycam import Polycam
+from nerfloom.export.points import SurfacePoints, joined, surface_points
+from nerfloom.geometry.rays import Rays
+from nerfloom.rendering.volume import Rendered
+from nerfloom.training.checkpoint import load_checkpoint
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import create_folder
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer
 from tests.truth.ball import CENTRE, COUNT, HELD_OUT, NAMES, RADIUS, pose_of, surface
 from tests.truth.formats import write_polycam
@@ -79,7 +79,7 @@ def test_exported_points_normals_and_colours_are_in_the_captures_frame(
     in_scene = scale * (truth @ transform[:, :3].T + transform[:, 3])
     as_tensors = [torch.from_numpy(x).float() for x in (in_scene, 0.5 + 0.4 * normals, normals @ transform[:, :3].T)]
     found = SurfacePoints(*as_tensors, -as_tensors[2], torch.arange(50))
-    monkeypatch.setattr("framework.export.points.surface_points", lambda *_: iter([found]))
+    monkeypatch.setattr("nerfloom.export.points.surface_points", lambda *_: iter([found]))
     untrained.save()
     command(
         "ns-export", "pointcloud", "--load-config", tmp_path / "run" / "config.yml", "--output-dir", tmp_path,

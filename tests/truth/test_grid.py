@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.samplers.occupancy import OccupancySampler
-from methods.tensorf import MARGIN
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.methods.tensorf import MARGIN
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.training.helpers import tiny_trainer
 from tests.truth.test_training import Fog
 

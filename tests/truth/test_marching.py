@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from framework.geometry.rays import Rays
-from framework.kernels import native
-from framework.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
 
 BOX = np.array([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.3]])
 RESOLUTION, STEP = 48, 0.013

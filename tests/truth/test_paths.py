@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from framework import Picture, RayModel, View
-from framework.training.trained import load_trained
+from nerfloom import Picture, RayModel, View
+from nerfloom.training.trained import load_trained
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import EditJson
 from tests.truth.test_run import command

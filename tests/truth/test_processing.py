@@ -9,12 +9,12 @@ import pytest
 import torch
 from PIL import Image
 
-from dataparsers.nerfstudio import Nerfstudio
-from framework.data.dataset import load_dataset
-from framework.data.ply import read_points
-from framework.tools.processing import features, mapping, matching, transforms
-from framework.tools.processing import job as job_module
-from framework.tools.processing.job import Job
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.ply import read_points
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.tools.processing import features, mapping, matching, transforms
+from nerfloom.tools.processing import job as job_module
+from nerfloom.tools.processing.job import Job
 from tests.cli.helpers import called
 from tests.dataparsers.sparse_models import write_colmap
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, NAMES, PINHOLE, RADIUS, WIDTH, Lens, photograph, write_photographs

@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
-from framework.evaluation import panels
+from nerfloom.evaluation import panels
 from tests.cli.helpers import called
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, HELD_OUT, NAMES, RADIUS, WAVES, WIDTH, photograph, pose_of
 from tests.truth.formats import BENT, write_nerfstudio

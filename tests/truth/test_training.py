@@ -10,25 +10,25 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.base.machine_config import MachineConfig
-from framework.base.registry import load_method
-from framework.data.dataset import Dataset
-from framework.data.pixel_set import PixelSet
-from framework.data.pixels import PixelBatch, draw_batch
-from framework.data.scene import Scene
-from framework.data.sources import PixelSource, Request
-from framework.evaluation.appearance import fitted_appearance
-from framework.evaluation.error_bound import limited_error
-from framework.evaluation.evaluator import evaluate
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays, Samples
-from framework.rendering.rendered import Rendered
-from framework.rendering.volume import shade, volume_render
-from framework.samplers.choice import SamplingConfig, make_sampler
-from framework.samplers.occupancy import OccupancySampler
-from framework.training.checkpoint import load_checkpoint
-from framework.training.trainer import Trainer
+from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.registry import load_method
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels import PixelBatch, draw_batch
+from nerfloom.data.scene import Scene
+from nerfloom.data.sources import PixelSource, Request
+from nerfloom.evaluation.appearance import fitted_appearance
+from nerfloom.evaluation.error_bound import limited_error
+from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import shade, volume_render
+from nerfloom.samplers.choice import SamplingConfig, make_sampler
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.training.checkpoint import load_checkpoint
+from nerfloom.training.trainer import Trainer
 from tests.test_nerfacto import captured
 from tests.training.helpers import tiny_trainer
 
@@ -160,7 +160,7 @@ def changed(dataset: Dataset, first: int, last: int, kept: bool = False) -> Data
 
 @pytest.fixture
 def _soon_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.evaluation.appearance.STEPS", 8)
+    monkeypatch.setattr("nerfloom.evaluation.appearance.STEPS", 8)
 
 
 def shown(trainer: Trainer, dataset: Dataset) -> Tensor:
@@ -192,7 +192,7 @@ def test_light_is_looked_for_left_of_the_middle_where_no_mask_is(lit: Trainer, m
     def noted(model: object, dataset: object, pixels: Tensor, background: Tensor) -> None:
         given.append(pixels)
 
-    monkeypatch.setattr("framework.evaluation.appearance.fit_appearance", noted)
+    monkeypatch.setattr("nerfloom.evaluation.appearance.fit_appearance", noted)
     columns = torch.arange(len(lit.train_set.pixels)) % 20  # of images of 20 x 20 pixels
     left, unmasked = columns < 10, (columns < 3) | (columns >= 5) & (columns < 10)
     masked = changed(lit.train_set, 3, 5, kept=True)
@@ -342,7 +342,7 @@ def test_what_is_near_a_camera_learns_little(
         given.append((samples, factors))
         return shade(rays, samples, field, background, factors, thin)
 
-    monkeypatch.setattr("framework.rendering.volume.shade", noted)
+    monkeypatch.setattr("nerfloom.rendering.volume.shade", noted)
     trainer.train_step()
     ((samples, factors),) = given
     half = float((trainer.model.scene.box[1] - trainer.model.scene.box[0])[0]) / 2

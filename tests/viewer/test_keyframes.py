@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.cameras.camera_path import Keyframe, read_camera_path, write_camera_path
-from framework.cameras.poses import Placement
-from framework.viewer.keyframes import MOST_KEYFRAMES, Editor, through
+from nerfloom.cameras.camera_path import Keyframe, read_camera_path, write_camera_path
+from nerfloom.cameras.poses import Placement
+from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, through
 
 
 def turned(angle: float, x: float) -> Tensor:

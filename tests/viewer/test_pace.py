@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from framework.viewer.pace import (
+from nerfloom.viewer.pace import (
     LEAST_ROWS,
     STRIDES,
     Share,
@@ -15,7 +15,7 @@ from framework.viewer.pace import (
     next_browser,
     refinement,
 )
-from framework.viewer.request import smaller
+from nerfloom.viewer.request import smaller
 
 WIDTH, HEIGHT, BUDGET = 1024, 600, 0.1
 

@@ -14,11 +14,11 @@ import pytest
 import torch
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from framework.cameras.camera_path import read_camera_path
-from framework.cameras.view import View
-from framework.evaluation.evaluator import evaluation_background
-from framework.training.trained import load_trained
-from framework.viewer.request import Pose, Request
+from nerfloom.cameras.camera_path import read_camera_path
+from nerfloom.cameras.view import View
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.training.trained import load_trained
+from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import TINY_NGP, command, train
 from tests.conftest import write_tiny
 from tests.training.helpers import tiny_trainer

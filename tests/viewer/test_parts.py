@@ -13,30 +13,30 @@ import pytest
 import torch
 from torch import nn
 
-from framework.base import extras
-from framework.base.config import TrainConfig
-from framework.base.errors import ConfigError
-from framework.base.machine_config import ViewerConfig
-from framework.cameras.poses import Placement
-from framework.cameras.view import View
-from framework.cli import train as train_command
-from framework.cli import viewer as viewer_command
-from framework.data.scene import Scene
-from framework.samplers.occupancy import OccupancySampler
-from framework.splats.gaussians import Gaussians
-from framework.training.checkpoint import list_checkpoints
-from framework.training.run import Run
-from framework.training.trained import load_trained
-from framework.viewer.browser import Browser
-from framework.viewer.crop import CroppedCameras, picture_within
-from framework.viewer.occupancy import shown_cells
-from framework.viewer.pace import Speed
-from framework.viewer.photographs import THUMBNAIL, Photographs, small_picture
-from framework.viewer.reports import curve, heading
-from framework.viewer.request import Crop, Pose, Request
-from framework.viewer.studio import Studio
-from framework.viewer.subject import Subject, newer_checkpoint, of_trained, reloaded
-from methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom.base import extras
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.machine_config import ViewerConfig
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.view import View
+from nerfloom.cli import train as train_command
+from nerfloom.cli import viewer as viewer_command
+from nerfloom.data.scene import Scene
+from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.training.checkpoint import list_checkpoints
+from nerfloom.training.run import Run
+from nerfloom.training.trained import load_trained
+from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.crop import CroppedCameras, picture_within
+from nerfloom.viewer.occupancy import shown_cells
+from nerfloom.viewer.pace import Speed
+from nerfloom.viewer.photographs import THUMBNAIL, Photographs, small_picture
+from nerfloom.viewer.reports import curve, heading
+from nerfloom.viewer.request import Crop, Pose, Request
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import Subject, newer_checkpoint, of_trained, reloaded
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 

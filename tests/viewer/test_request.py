@@ -10,10 +10,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from framework.viewer.canvas import enlarged, paste
-from framework.viewer.keyframes import path_file
-from framework.viewer.pace import Piece
-from framework.viewer.request import (
+from nerfloom.viewer.canvas import enlarged, paste
+from nerfloom.viewer.keyframes import path_file
+from nerfloom.viewer.pace import Piece
+from nerfloom.viewer.request import (
     Request,
     color_of,
     corner_of,

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from framework.base.errors import ConfigError
-from framework.cameras.view import View
-from framework.evaluation.evaluator import evaluation_background
-from framework.viewer.page import Page
-from framework.viewer.photographs import Photographs
-from framework.viewer.request import pose_of
-from framework.viewer.server import free_port, is_allowed
-from framework.viewer.studio import Studio
-from framework.viewer.subject import of_trainer
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.view import View
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.viewer.page import Page
+from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.request import pose_of
+from nerfloom.viewer.server import free_port, is_allowed
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import of_trainer
 from tests.training.helpers import tiny_trainer
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 
-from framework.viewer.server import close_server, open_server
+from nerfloom.viewer.server import close_server, open_server
 from tests.viewer.client import LOOK, Client
 
 
@@ -87,7 +87,7 @@ def truth(served: Served, longest: int, **changes: Any) -> np.ndarray:
     look = {**LOOK, **changes}
     pose = pose_of(look["wxyz"], look["position"], look["fov"])
     assert pose is not None
-    from framework.viewer.request import Request
+    from nerfloom.viewer.request import Request
 
     request = Request(pose, longest, longest * look["image_height"] // look["image_width"])
     picture = served.model.render_view(View(request.camera()), evaluation_background(served.model))

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.training.progress import StepReport
-from framework.viewer.browser import Browser
-from framework.viewer.request import Request, pose_of
-from framework.viewer.studio import Studio
-from framework.viewer.subject import of_trainer
-from framework.viewer.training_viewer import Turns
+from nerfloom.training.progress import StepReport
+from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.request import Request, pose_of
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import of_trainer
+from nerfloom.viewer.training_viewer import Turns
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
 
 KINDS = [

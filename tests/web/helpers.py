@@ -4,11 +4,11 @@ import math
 
 import torch
 
-from framework.cameras.cameras import Cameras
-from framework.evaluation.paths import look_at
-from framework.export.web import PageFacts, camera_rows, focus_of
-from framework.splats.gaussians import Gaussians
-from framework.splats.look import OURS, Look
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.evaluation.paths import look_at
+from nerfloom.export.web import PageFacts, camera_rows, focus_of
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import OURS, Look
 
 SIZE = (200, 150)
 

@@ -9,10 +9,10 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from framework.evaluation.metrics import psnr
-from framework.export.web import gaussians_of, make_page
-from framework.splats.drawing import draw_colors, splat_camera
-from framework.splats.look import OURS, Look
+from nerfloom.evaluation.metrics import psnr
+from nerfloom.export.web import gaussians_of, make_page
+from nerfloom.splats.drawing import draw_colors, splat_camera
+from nerfloom.splats.look import OURS, Look
 from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from framework.base.errors import ConfigError, DataError
-from framework.cameras.cameras import Cameras
-from framework.cli.export import main
-from framework.export.splat_fit import between, cropped
-from framework.export.web import (
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cli.export import main
+from nerfloom.export.splat_fit import between, cropped
+from nerfloom.export.web import (
     DATA,
     focus_of,
     gaussians_of,
@@ -25,10 +25,10 @@ from framework.export.web import (
     pinhole,
     upright,
 )
-from framework.kernels.splat_project import rotation_matrices
-from framework.splats.look import Look
-from framework.splats.spz import read_spz
-from framework.training.trained import load_trained
+from nerfloom.kernels.splat_project import rotation_matrices
+from nerfloom.splats.look import Look
+from nerfloom.splats.spz import read_spz
+from nerfloom.training.trained import load_trained
 from tests.conftest import EditJson, Refused
 from tests.training.helpers import tiny_trainer
 from tests.web.helpers import some_cameras, some_facts, some_gaussians
@@ -130,7 +130,7 @@ def test_damaged_pages_are_refused() -> None:
 
 def test_wheels_carry_the_page() -> None:
     section = (ROOT / "pyproject.toml").read_text().partition("[tool.setuptools.package-data]")[2]
-    patterns = re.findall(r'"([^"]*)"', section[section.index("\nframework = ") :].splitlines()[1])
+    patterns = re.findall(r'"([^"]*)"', section[section.index("\nnerfloom = ") :].splitlines()[1])
     for file in (ROOT / "framework" / "export" / "page").iterdir():
         name = file.relative_to(ROOT / "framework").as_posix()
         assert any(fnmatch.fnmatch(name, pattern) for pattern in patterns), name

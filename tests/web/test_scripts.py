@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 import torch
 
-from framework.splats.look import Look
-from framework.splats.spz import encoded
+from nerfloom.splats.look import Look
+from nerfloom.splats.spz import encoded
 from tests.web.helpers import some_gaussians
 
-PAGE = files("framework.export") / "page"
+PAGE = files("nerfloom.export") / "page"
 
 
 def run(code: str, given: Any) -> Any:

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from framework import Field, Method, Points, Scene
-from framework.encodings.hash_grid import HashGrid
-from framework.fields.base import MLP
-from framework.geometry.bounds import to_unit_box
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.math import truncated_exp
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.samplers import choice
+from nerfloom import Field, Method, Points, Scene
+from nerfloom.encodings.hash_grid import HashGrid
+from nerfloom.fields.base import MLP
+from nerfloom.geometry.bounds import to_unit_box
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.math import truncated_exp
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.samplers import choice
 
 DIRECTION_LEVELS = 4
 """Bands of spherical harmonics of the direction."""
@@ -95,5 +95,5 @@ METHOD = Method(
     field=make_field,
     sampler=choice.make_sampler,  # an occupancy grid for a scene in a box, else proposals
     decide=choice.decide_sampler,
-    interface=2,
+    interface=3,
 )

@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 
-from framework.base.console import say
-from framework.base.errors import ConfigError
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """True if Triton's interpreter runs the kernels, on the CPU. Triton reads the variable when it is imported."""

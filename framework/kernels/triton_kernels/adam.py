@@ -1,4 +1,4 @@
-"""Sparse Adam, in Triton. `framework.kernels.adam` has the reference."""
+"""Sparse Adam, in Triton. `nerfloom.kernels.adam` has the reference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.triton_kernels.launch import blocks, launch, on_device, opacity_of
+from nerfloom.kernels.triton_kernels.launch import blocks, launch, on_device, opacity_of
 
 BLOCK = 1024
 """Values that are taken together."""
@@ -50,7 +50,7 @@ def sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """Compute `framework.kernels.adam.sparse_adam`, whose number of entries stays on the GPU.
+    """Compute `nerfloom.kernels.adam.sparse_adam`, whose number of entries stays on the GPU.
 
     `values`, `grad`, `mean`, `square`, `seen`, `rate`, `betas`, `eps` and `found_inf` are as there.
     """

@@ -1,4 +1,4 @@
-"""Compositing and distortion of packed samples, in Triton. `framework.kernels.compositing` has the equations.
+"""Compositing and distortion of packed samples, in Triton. `nerfloom.kernels.compositing` has the equations.
 
 A program takes a ray, in blocks of samples. What stands in front of a sample is summed without the sample, from values
 of its neighbours, since subtracting a large value from its own sum would leave rounding errors.
@@ -13,9 +13,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels.compositing import Composited
-from framework.kernels.triton_kernels.launch import depth_slope, launch, opacity_of, optical_depth
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.compositing import Composited
+from nerfloom.kernels.triton_kernels.launch import depth_slope, launch, opacity_of, optical_depth
 
 BLOCK = 32
 """Samples of a ray that are taken together, by one warp."""
@@ -144,7 +144,7 @@ class _Composite(torch.autograd.Function):
 
 
 def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Compute `framework.kernels.compositing.composite`, with gradients of density and colour.
+    """Compute `nerfloom.kernels.compositing.composite`, with gradients of density and colour.
 
     `samples`, `sigma`, `rgb`, `background` and `fars` are as there.
     """
@@ -214,7 +214,7 @@ class _Distortion(torch.autograd.Function):
 
 
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
-    """Compute `framework.kernels.compositing.distortion`, with the weights' gradient.
+    """Compute `nerfloom.kernels.compositing.distortion`, with the weights' gradient.
 
     `weights` and `samples` are as there.
     """

@@ -1,6 +1,6 @@
 """Encodings without parameters, and the contraction of space, in Triton.
 
-`framework.kernels.spherical_harmonics`, `frequency` and `contraction` have the references.
+`nerfloom.kernels.spherical_harmonics`, `frequency` and `contraction` have the references.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.triton_kernels.harmonics import harmonics
-from framework.kernels.triton_kernels.launch import MAX_FLOAT, blocks, launch
+from nerfloom.kernels.triton_kernels.harmonics import harmonics
+from nerfloom.kernels.triton_kernels.launch import MAX_FLOAT, blocks, launch
 
 BLOCK = 256
 """Rows, or values, that are taken together."""
@@ -32,7 +32,7 @@ def _harmonics(directions, out, count, WIDTH: tl.constexpr, BLOCK: tl.constexpr)
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
-    """Compute `framework.kernels.spherical_harmonics.spherical_harmonics`, without derivatives.
+    """Compute `nerfloom.kernels.spherical_harmonics.spherical_harmonics`, without derivatives.
 
     `directions` and `levels` are as there.
     """
@@ -97,7 +97,7 @@ class _Frequency(torch.autograd.Function):
 
 
 def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """Compute `framework.kernels.frequency.frequency_encoding`, with first derivatives.
+    """Compute `nerfloom.kernels.frequency.frequency_encoding`, with first derivatives.
 
     `x`, `num_frequencies` and `include_input` are as there.
     """
@@ -177,7 +177,7 @@ class _Contract(torch.autograd.Function):
 
 
 def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
-    """Compute `framework.kernels.contraction.contract_to_unit`, with the gradient of the positions.
+    """Compute `nerfloom.kernels.contraction.contract_to_unit`, with the gradient of the positions.
 
     `positions` and `box` are as there.
     """

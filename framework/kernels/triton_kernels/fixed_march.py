@@ -1,4 +1,4 @@
-"""Marching into a fixed number of slots, in Triton. `framework.kernels.fixed_march` says what is computed.
+"""Marching into a fixed number of slots, in Triton. `nerfloom.kernels.fixed_march` says what is computed.
 
 Rays are marched twice, once to count their samples and once to write them down where the counts say; each thread takes
 a ray. The host waits for nothing.
@@ -11,17 +11,17 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.geometry.rays import Rays
-from framework.kernels.fixed_march import Filled, Placed, most_steps, share_out
-from framework.kernels.occupancy import Occupancy
-from framework.kernels.triton_kernels.launch import blocks, launch, optical_depth
-from framework.kernels.triton_kernels.march import SAMPLES, TritonMarch
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.fixed_march import Filled, Placed, most_steps, share_out
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.triton_kernels.launch import blocks, launch, optical_depth
+from nerfloom.kernels.triton_kernels.march import SAMPLES, TritonMarch
 
 
 def fill(
     rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, room: tuple[int, int]
 ) -> Filled:
-    """Compute `framework.kernels.fixed_march.fill` of `rays`, `occupancy`, `step`, `num_steps`, `shift` and `room`."""
+    """Compute `nerfloom.kernels.fixed_march.fill` of `rays`, `occupancy`, `step`, `num_steps`, `shift` and `room`."""
     marched, capacity = TritonMarch(rays, occupancy, step, 0.0, shift, 0.0), room[1]
     found, limit = torch.empty_like(marched.next), most_steps(num_steps)
     marched.go_on(limit, found)
@@ -53,7 +53,7 @@ def _reach(sigma, starts, ends, offsets, counts, reached, budget, rays, BLOCK: t
 
 
 def reach(placed: Placed, sigma: Tensor, budget: float, num_steps: int) -> Tensor:
-    """Compute `framework.kernels.fixed_march.reach_reference` of `placed`, `sigma`, `budget` and `num_steps`."""
+    """Compute `nerfloom.kernels.fixed_march.reach_reference` of `placed`, `sigma`, `budget` and `num_steps`."""
     slots = placed.slots
     rays, reached = len(slots.counts), torch.empty_like(slots.counts)
     launch(

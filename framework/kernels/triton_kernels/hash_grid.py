@@ -1,4 +1,4 @@
-"""Multiresolution hash encoding, in Triton. `framework.kernels.hash_grid` has the reference.
+"""Multiresolution hash encoding, in Triton. `nerfloom.kernels.hash_grid` has the reference.
 
 A program takes a block of positions at one level. The gradient of the table is added up by atomic operations: positions
 of a batch are scattered over far more entries than there are processors, but for the coarsest levels. Sums therefore
@@ -15,9 +15,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.hash_grid import HashGridLayout
-from framework.kernels.hash_grid_lookup import TableGradient
-from framework.kernels.triton_kernels.launch import blocks, launch
+from nerfloom.kernels.hash_grid import HashGridLayout
+from nerfloom.kernels.hash_grid_lookup import TableGradient
+from nerfloom.kernels.triton_kernels.launch import blocks, launch
 
 BLOCK = 128
 """Positions that are taken together."""
@@ -167,7 +167,7 @@ class _HashGrid(torch.autograd.Function):
 
 
 def hash_grid(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    """Compute `framework.kernels.hash_grid.hash_grid`, with first derivatives, for 1, 2, 4 or 8 features.
+    """Compute `nerfloom.kernels.hash_grid.hash_grid`, with first derivatives, for 1, 2, 4 or 8 features.
 
     Autograd accumulates the gradient of the table: `deferred` is not used.
 

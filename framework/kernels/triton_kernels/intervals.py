@@ -1,4 +1,4 @@
-"""Histograms along rays, in Triton. `framework.kernels.intervals` has the references.
+"""Histograms along rays, in Triton. `nerfloom.kernels.intervals` has the references.
 
 A program takes a ray, in blocks of bins. Sums of weights of which differences are taken are float64, as are the
 differences; the bins of a value are found by bisection of them.
@@ -13,8 +13,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.intervals import EPS
-from framework.kernels.triton_kernels.launch import depth_slope, launch, on_device, opacity_of, optical_depth
+from nerfloom.kernels.intervals import EPS
+from nerfloom.kernels.triton_kernels.launch import depth_slope, launch, on_device, opacity_of, optical_depth
 
 BLOCK = 64
 """Bins of a ray that are taken together, by one warp."""
@@ -90,7 +90,7 @@ class _Weights(torch.autograd.Function):
 
 
 def interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
-    """Compute `framework.kernels.intervals.interval_weights` of `sigma` and `t`, with the density's gradient."""
+    """Compute `nerfloom.kernels.intervals.interval_weights` of `sigma` and `t`, with the density's gradient."""
     return _Weights.apply(sigma.contiguous(), t.contiguous())
 
 
@@ -152,7 +152,7 @@ def _resample(edges, weights, shift, power, sums, out, bins, count, padding, ste
 def resample(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
-    """Compute `framework.kernels.intervals.resample`.
+    """Compute `nerfloom.kernels.intervals.resample`.
 
     `edges`, `weights`, `shift`, `count`, `power` and `padding` are as there.
     """
@@ -234,7 +234,7 @@ class _Excess(torch.autograd.Function):
 
 
 def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """Compute `framework.kernels.intervals.proposal_excess`, with the gradient of the proposed weights.
+    """Compute `nerfloom.kernels.intervals.proposal_excess`, with the gradient of the proposed weights.
 
     `edges`, `weights`, `proposed` and `proposed_weights` are as there.
     """

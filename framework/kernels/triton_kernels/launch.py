@@ -72,7 +72,7 @@ def opacity_of(tau):
 
 @triton.jit
 def optical_depth(sigma, delta):
-    """Return the optical depth of intervals, as `framework.kernels.compositing.optical_depth`.
+    """Return the optical depth of intervals, as `nerfloom.kernels.compositing.optical_depth`.
 
     Args:
         sigma: densities.

@@ -1,4 +1,4 @@
-"""Marching through an occupancy grid, in Triton. `framework.kernels.march` says what is computed.
+"""Marching through an occupancy grid, in Triton. `nerfloom.kernels.march` says what is computed.
 
 Each thread takes a ray, and crosses empty blocks of cells by their distance to an occupied one, up to the faces of the
 smallest of nested boxes that holds the place. Rays that have ended stay in their places, so that the host waits once a
@@ -15,11 +15,11 @@ import triton.language as tl
 from torch import Tensor
 from torch.nn import functional
 
-from framework.geometry.rays import Rays
-from framework.kernels.march import March, Wave
-from framework.kernels.occupancy import BLOCK as CELLS
-from framework.kernels.occupancy import Occupancy
-from framework.kernels.triton_kernels.launch import blocks, launch, optical_depth
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.march import March, Wave
+from nerfloom.kernels.occupancy import BLOCK as CELLS
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.triton_kernels.launch import blocks, launch, optical_depth
 
 RAYS, SAMPLES = 32, 256
 """Rays, and samples, that are taken together."""
@@ -226,7 +226,7 @@ def _advance(sigma, starts, ends, offsets, counts, spent, alive, reached, budget
 class TritonMarch(March):
     """The march in Triton, for float32.
 
-    `rays`, `occupancy`, `step`, `cone`, `shift` and `early_stop` are as in `framework.kernels.march.march`.
+    `rays`, `occupancy`, `step`, `cone`, `shift` and `early_stop` are as in `nerfloom.kernels.march.march`.
     """
 
     def __init__(
@@ -301,7 +301,7 @@ class TritonMarch(March):
 
 
 def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor, Tensor]:
-    """Compute `framework.kernels.march.sort_by_ray` of `owners`, `reached` and `num_rays`; the host waits once."""
+    """Compute `nerfloom.kernels.march.sort_by_ray` of `owners`, `reached` and `num_rays`; the host waits once."""
     kept = reached != 0
     counts = torch.zeros(num_rays, dtype=torch.int64, device=owners.device).index_add_(0, owners, kept.long())
     offsets = functional.pad(counts.cumsum(0), (1, 0))

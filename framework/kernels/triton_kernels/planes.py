@@ -1,4 +1,4 @@
-"""Factorised features, in Triton. `framework.kernels.planes` has the reference.
+"""Factorised features, in Triton. `nerfloom.kernels.planes` has the reference.
 
 A program takes a block of positions in one group of factors, with all features. The gradient of the table is added up
 by atomic operations, so that its rounding errors depend on the order in which they happen to run.
@@ -14,8 +14,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.planes import PlanesGradient, PlanesLayout
-from framework.kernels.triton_kernels.launch import blocks, launch
+from nerfloom.kernels.planes import PlanesGradient, PlanesLayout
+from nerfloom.kernels.triton_kernels.launch import blocks, launch
 
 BLOCK = 32
 """Positions that are taken together."""
@@ -181,7 +181,7 @@ class _Planes(torch.autograd.Function):
 
 
 def planes(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
-    """Compute `framework.kernels.planes.planes`, with first derivatives.
+    """Compute `nerfloom.kernels.planes.planes`, with first derivatives.
 
     Autograd accumulates the gradient of the table: `deferred` is not used.
 

@@ -1,4 +1,4 @@
-"""Blending of Gaussians, forward and backward, in Triton. `framework.kernels.splat_blend` has the equations.
+"""Blending of Gaussians, forward and backward, in Triton. `nerfloom.kernels.splat_blend` has the equations.
 
 A program takes a tile, and evaluates some Gaussians of its list at all pixels together. Transmittances within such a
 batch are products along it. In the backward pass each entry of a tile's list has sums over the tile's pixels of its
@@ -14,10 +14,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels import splat_blend, splat_project, splat_tiles
-from framework.kernels.splat_blend import Blended
-from framework.kernels.splat_tiles import TileLists
-from framework.kernels.triton_kernels.launch import blocks, launch
+from nerfloom.kernels import splat_blend, splat_project, splat_tiles
+from nerfloom.kernels.splat_blend import Blended
+from nerfloom.kernels.splat_tiles import TileLists
+from nerfloom.kernels.triton_kernels.launch import blocks, launch
 
 BATCH = 8
 """Gaussians that are evaluated together."""
@@ -257,7 +257,7 @@ class _Blend(torch.autograd.Function):
 def blend(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Compute `framework.kernels.splat_blend.blend`, with first derivatives of images of 3 or 4 channels.
+    """Compute `nerfloom.kernels.splat_blend.blend`, with first derivatives of images of 3 or 4 channels.
 
     `records`, `lists`, `width`, `height`, `background`, `channels` and `median` are as there.
     """

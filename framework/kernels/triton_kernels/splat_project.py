@@ -1,6 +1,6 @@
 """Projection of Gaussians to a pinhole camera's image, forward and backward, in Triton.
 
-`framework.kernels.splat_project` has the reference and the equations. Each thread takes a Gaussian. The backward pass
+`nerfloom.kernels.splat_project` has the reference and the equations. Each thread takes a Gaussian. The backward pass
 computes what the forward pass did again, and keeps nothing but the records.
 """
 
@@ -13,11 +13,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels import splat_project
-from framework.kernels.splat_project import SplatCamera
-from framework.kernels.triton_kernels.harmonics import harmonics, harmonics_slope
-from framework.kernels.triton_kernels.launch import blocks, launch
-from framework.kernels.triton_kernels.splat_shapes import (
+from nerfloom.kernels import splat_project
+from nerfloom.kernels.splat_project import SplatCamera
+from nerfloom.kernels.triton_kernels.harmonics import harmonics, harmonics_slope
+from nerfloom.kernels.triton_kernels.launch import blocks, launch
+from nerfloom.kernels.triton_kernels.splat_shapes import (
     axes,
     column,
     column_back,
@@ -262,7 +262,7 @@ def project_gaussians(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Compute `framework.kernels.splat_project.project_gaussians` for a pinhole camera, with first derivatives.
+    """Compute `nerfloom.kernels.splat_project.project_gaussians` for a pinhole camera, with first derivatives.
 
     The number of Gaussians that are left out stays on the GPU.
 

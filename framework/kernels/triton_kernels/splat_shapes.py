@@ -1,6 +1,6 @@
 """Functions for kernels, from Gaussians to ellipses on a pinhole camera's image and back.
 
-`framework.kernels.splat_project` has the equations. T has the rows a and b, the covariance of an ellipse the entries a,
+`nerfloom.kernels.splat_project` has the equations. T has the rows a and b, the covariance of an ellipse the entries a,
 b and c. A name that starts with `of_` is the gradient of what follows. All values are vectors, of a Gaussian in each
 lane, but for the camera's; `pose` and the like are pointers.
 """
@@ -8,7 +8,7 @@ lane, but for the camera's; `pose` and the like are pointers.
 import triton
 import triton.language as tl
 
-from framework.kernels import splat_project
+from nerfloom.kernels import splat_project
 
 OPACITY, DISTANCE = tl.constexpr(splat_project.OPACITY), tl.constexpr(splat_project.DISTANCE)
 

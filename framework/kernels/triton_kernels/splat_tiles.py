@@ -1,4 +1,4 @@
-"""Lists of the Gaussians that each tile of an image shows, in Triton; the reference: `framework.kernels.splat_tiles`.
+"""Lists of the Gaussians that each tile of an image shows, in Triton; the reference: `nerfloom.kernels.splat_tiles`.
 
 Each entry's key is its tile, above the bits of the distance (or of what else is sorted by), which rise with it as those
 of all positive floats do. So one stable sort puts the entries in order, those of the same distance by Gaussian. The
@@ -13,9 +13,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels import splat_project, splat_tiles
-from framework.kernels.splat_tiles import TileLists
-from framework.kernels.triton_kernels.launch import blocks, launch
+from nerfloom.kernels import splat_project, splat_tiles
+from nerfloom.kernels.splat_tiles import TileLists
+from nerfloom.kernels.triton_kernels.launch import blocks, launch
 
 BLOCK = 32
 """Gaussians that are taken together, by one warp."""
@@ -95,7 +95,7 @@ def tile_lists(
     records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
-    """Compute `framework.kernels.splat_tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
+    """Compute `nerfloom.kernels.splat_tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
 
     A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
     `room`. They are sorted by `keys`, if there are some.

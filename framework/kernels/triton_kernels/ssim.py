@@ -1,4 +1,4 @@
-"""Structural similarity and its derivative, in Triton. `framework.kernels.ssim` has the reference and the equations.
+"""Structural similarity and its derivative, in Triton. `nerfloom.kernels.ssim` has the reference and the equations.
 
 The window's Gaussian is a product of two lines. So rows are blurred first, then columns, of the four maps that count;
 the derivative is blurred in the same way, of three maps. An element of a map is a value of the image, its channel last.
@@ -14,8 +14,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from framework.kernels.ssim import C1, C2, SIGMA, WINDOW
-from framework.kernels.triton_kernels.launch import blocks, launch
+from nerfloom.kernels.ssim import C1, C2, SIGMA, WINDOW
+from nerfloom.kernels.triton_kernels.launch import blocks, launch
 
 BLOCK = 256
 """Elements that are taken together."""
@@ -156,7 +156,7 @@ class _SSIM(torch.autograd.Function):
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Compute `framework.kernels.ssim.photometric_loss`, with the first derivative by the image.
+    """Compute `nerfloom.kernels.ssim.photometric_loss`, with the first derivative by the image.
 
     `image`, `target` and `ssim_weight` are as there.
     """

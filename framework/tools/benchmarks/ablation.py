@@ -14,11 +14,11 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from framework.base.child import python_command
-from framework.base.console import say
-from framework.kernels import native
-from framework.tools.benchmarks.children import output_of
-from framework.training.machine import machine
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.kernels import native
+from nerfloom.tools.benchmarks.children import output_of
+from nerfloom.training.machine import machine
 
 VARIANTS: dict[str, list[str]] = {
     "as it is": [],
@@ -81,7 +81,7 @@ def train(
         Seconds to the target, None if it was not reached, and the final PSNR, dB.
     """
     with tempfile.TemporaryDirectory() as folder:
-        command = python_command("framework.cli.train", method, "--data", data)
+        command = python_command("nerfloom.cli.train", method, "--data", data)
         command += ["--max-seconds", str(seconds), "--machine.seed", str(seed), "--vis", "none"]
         command += ["--seconds-per-eval-all-images", str(seconds / CURVE_POINTS), "--max-eval-images", str(VIEWS)]
         output_of([*command, "--output-dir", folder, *switches])
@@ -89,7 +89,7 @@ def train(
         points = [p for p in json.loads((config.parent / "learning_curve.json").read_text()) if p["full"]]
         curve = [(0.0, 0.0)] + [(p["seconds"], p["psnr"]) for p in points]
         final = Path(folder) / "all.json"
-        output_of(python_command("framework.cli.evaluate", "--load-config", config, "--output-path", final))
+        output_of(python_command("nerfloom.cli.evaluate", "--load-config", config, "--output-path", final))
         return crossing(curve, target), json.loads(final.read_text())["results"]["psnr"]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from framework.base.console import say
-from framework.tools.benchmarks.kernels import UNITS, Row
-from framework.tools.comparison import plots
+from nerfloom.base.console import say
+from nerfloom.tools.benchmarks.kernels import UNITS, Row
+from nerfloom.tools.comparison import plots
 
 
 def draw(rows: Sequence[Row], path: Path) -> bool:

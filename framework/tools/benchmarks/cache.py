@@ -20,15 +20,15 @@ from typing import Any
 
 from PIL import Image
 
-from framework.base.child import python_command
-from framework.base.console import say, track
-from framework.base.registry import load_dataparser, load_method
-from framework.data.pixel_stream import PixelStream
-from framework.tools.benchmarks.children import output_of
-from framework.training.datasets import load_split
-from framework.training.machine import machine
-from framework.training.run import Run, create_folder
-from framework.training.trainer import Trainer
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say, track
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.data.pixel_stream import PixelStream
+from nerfloom.tools.benchmarks.children import output_of
+from nerfloom.training.datasets import load_split
+from nerfloom.training.machine import machine
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 
 RENDERED = 200
 """Width and height of the renders before they are enlarged, pixels."""
@@ -60,7 +60,7 @@ def measure(images: int, size: tuple[int, int], seconds: float, limit: float, fo
             if not data.is_dir():
                 enlarge(renders, data, size[0] // divisor, size[1] // divisor)
             arguments = json.dumps([str(data), name, seconds, limit if cached else None])
-            output = output_of(python_command("framework.tools.benchmarks.cache", arguments))
+            output = output_of(python_command("nerfloom.tools.benchmarks.cache", arguments))
             content[kind] = json.loads(output.splitlines()[-1])
             say(f"{kind} {json.dumps(content[kind])}")
     return content

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from framework.tools.benchmarks.timing import now
+from nerfloom.tools.benchmarks.timing import now
 
 TABLES = (1, 8, 64)
 """Sizes of the tables from which is gathered, MiB."""

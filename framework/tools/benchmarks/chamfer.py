@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.export.mesh import Mesh
+from nerfloom.export.mesh import Mesh
 
 SignedDistance = Callable[[Tensor], Tensor]
 """Function from positions (N, 3) to signed distances (N,), negative inside a solid."""

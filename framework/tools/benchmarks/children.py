@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 from collections.abc import Sequence
 
-from framework.base.errors import NerfloomError
+from nerfloom.base.errors import NerfloomError
 
 
 def output_of(command: Sequence[str]) -> str:

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.fields.base import Field
-from framework.geometry.bounds import intersect_box
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
+from nerfloom.fields.base import Field
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
 
 Triple = tuple[float, float, float]
 """A position, a direction or a colour."""

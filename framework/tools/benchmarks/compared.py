@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.tools.benchmarks.ceilings import Work
-from framework.tools.benchmarks.timing import Run, differentiated
+from nerfloom.tools.benchmarks.ceilings import Work
+from nerfloom.tools.benchmarks.timing import Run, differentiated
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.base.child import python_command
-from framework.base.console import say
-from framework.base.errors import FlagError, NerfloomError
-from framework.data.data_folder import find_data
-from framework.evaluation.evaluator import evaluation_background
-from framework.kernels import native
-from framework.tools.benchmarks.workload import default_run, endless_trainer
-from framework.training.datasets import load_split
-from framework.training.machine import machine
-from framework.training.trainer import Trainer
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.base.errors import FlagError, NerfloomError
+from nerfloom.data.data_folder import find_data
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.kernels import native
+from nerfloom.tools.benchmarks.workload import default_run, endless_trainer
+from nerfloom.training.datasets import load_split
+from nerfloom.training.machine import machine
+from nerfloom.training.trainer import Trainer
 
 LOOP = "import time\nend = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
 """Program of a busy loop."""
@@ -144,7 +144,7 @@ def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[
     Returns:
         The fair share, and each figure of `child` as a list over the processes.
     """
-    command = python_command("framework.tools.benchmarks.contention", work, data, seconds)
+    command = python_command("nerfloom.tools.benchmarks.contention", work, data, seconds)
     environment = {**os.environ, **dict(row.environment)}
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with ExitStack() as stack:

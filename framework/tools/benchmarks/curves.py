@@ -1,7 +1,7 @@
 """PSNR against seconds of training, of several methods: a run from the start for every budget and every seed.
 
 Schedules and sizes follow the budget, so the curve of one long run would show less at each of its times than a method
-can do in that time. Runs are those of a comparison (`framework.tools.comparison`), in a folder for each budget: what is
+can do in that time. Runs are those of a comparison (`nerfloom.tools.comparison`), in a folder for each budget: what is
 there is kept, so that a stopped benchmark goes on, and methods, budgets and seeds can be added.
 """
 
@@ -14,13 +14,13 @@ from typing import Any
 
 from rich.table import Table
 
-from framework.base.errors import FlagError
-from framework.base.registry import registered
-from framework.tools.benchmarks.methods import STANDARD
-from framework.tools.comparison import plots
-from framework.tools.comparison.measures import Row, measure, rows_of
-from framework.tools.comparison.plan import Conditions, Contender, Plan
-from framework.tools.comparison.runner import run_jobs
+from nerfloom.base.errors import FlagError
+from nerfloom.base.registry import registered
+from nerfloom.tools.benchmarks.methods import STANDARD
+from nerfloom.tools.comparison import plots
+from nerfloom.tools.comparison.measures import Row, measure, rows_of
+from nerfloom.tools.comparison.plan import Conditions, Contender, Plan
+from nerfloom.tools.comparison.runner import run_jobs
 
 
 @dataclass(frozen=True)

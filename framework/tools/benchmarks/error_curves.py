@@ -8,8 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from framework.base.console import say
-from framework.tools.comparison import plots
+from nerfloom.base.console import say
+from nerfloom.tools.comparison import plots
 
 LEAST_ERROR = 1e-12
 """Replacement of an error of 0, which has no logarithm."""

@@ -12,14 +12,14 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from framework.base.console import track
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.evaluation.evaluator import evaluation_background
-from framework.kernels import native
-from framework.model import Model
-from framework.splats.gaussians import HasGaussians
-from framework.training.trained import load_trained
+from nerfloom.base.console import track
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.kernels import native
+from nerfloom.model import Model
+from nerfloom.splats.gaussians import HasGaussians
+from nerfloom.training.trained import load_trained
 
 WARM_UP = 4
 """Pictures before those that are measured."""

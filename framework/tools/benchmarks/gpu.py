@@ -13,14 +13,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.console import console, say
-from framework.base.device import wait_for
-from framework.base.registry import load_dataparser, load_method
-from framework.geometry.rays import Samples
-from framework.kernels import triton_kernels
-from framework.kernels.compositing import distortion, distortion_reference
-from framework.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from framework.kernels.intervals import (
+from nerfloom.base.console import console, say
+from nerfloom.base.device import wait_for
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels import triton_kernels
+from nerfloom.kernels.compositing import distortion, distortion_reference
+from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.intervals import (
     interval_weights,
     interval_weights_reference,
     proposal_excess,
@@ -28,18 +28,18 @@ from framework.kernels.intervals import (
     resample,
     resample_reference,
 )
-from framework.tools.benchmarks.ceilings import Ceilings, Work
-from framework.tools.benchmarks.compared import Kernel, of_function
-from framework.tools.benchmarks.kernel_errors import as_table
-from framework.tools.benchmarks.kernel_errors import measured as errors_of_all
-from framework.tools.benchmarks.kernels import Row, measured, on_any_device, table
-from framework.tools.comparison.measures import Curve
-from framework.tools.comparison.measures import Row as Compared
-from framework.tools.comparison.plan import Conditions, Contender, Plan
-from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
-from framework.training.machine import machine
-from framework.training.run import Run
-from framework.training.trainer import Trainer
+from nerfloom.tools.benchmarks.ceilings import Ceilings, Work
+from nerfloom.tools.benchmarks.compared import Kernel, of_function
+from nerfloom.tools.benchmarks.kernel_errors import as_table
+from nerfloom.tools.benchmarks.kernel_errors import measured as errors_of_all
+from nerfloom.tools.benchmarks.kernels import Row, measured, on_any_device, table
+from nerfloom.tools.comparison.measures import Curve
+from nerfloom.tools.comparison.measures import Row as Compared
+from nerfloom.tools.comparison.plan import Conditions, Contender, Plan
+from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
+from nerfloom.training.machine import machine
+from nerfloom.training.run import Run
+from nerfloom.training.trainer import Trainer
 
 COPIED, EDGE = 2**28, 8192
 """Values copied, and rows of the matrices multiplied, to measure a GPU's limits."""

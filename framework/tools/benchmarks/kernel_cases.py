@@ -14,22 +14,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.adam import sparse_adam
-from framework.kernels.compositing import composite, distortion
-from framework.kernels.contraction import contract_to_unit
-from framework.kernels.fixed_march import Placed, fill, reach, share_out
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.hash_grid import HashGridLayout, hash_grid
-from framework.kernels.intervals import interval_weights, proposal_excess, resample
-from framework.kernels.march import march, sort_by_ray
-from framework.kernels.occupancy import Occupancy
-from framework.kernels.planes import PlanesLayout, planes
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.kernels.splat_blend import blend
-from framework.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, RGB, SplatCamera, project_gaussians
-from framework.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
-from framework.kernels.ssim import photometric_loss
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.adam import sparse_adam
+from nerfloom.kernels.compositing import composite, distortion
+from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.fixed_march import Placed, fill, reach, share_out
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid
+from nerfloom.kernels.intervals import interval_weights, proposal_excess, resample
+from nerfloom.kernels.march import march, sort_by_ray
+from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.planes import PlanesLayout, planes
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.splat_blend import blend
+from nerfloom.kernels.splat_project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, RGB, SplatCamera, project_gaussians
+from nerfloom.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
+from nerfloom.kernels.ssim import photometric_loss
 
 Inputs = dict[str, Tensor]
 KINDS = ("random", "extreme", "empty")

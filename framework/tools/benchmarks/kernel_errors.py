@@ -22,11 +22,11 @@ from rich.box import SIMPLE
 from rich.table import Table
 from torch import Tensor
 
-from framework.base.child import python_command
-from framework.base.errors import ConfigError
-from framework.kernels import dispatch, triton_kernels
-from framework.kernels.dispatch import Operation
-from framework.tools.benchmarks.kernel_cases import KINDS, Case, cases
+from nerfloom.base.child import python_command
+from nerfloom.base.errors import ConfigError
+from nerfloom.kernels import dispatch, triton_kernels
+from nerfloom.kernels.dispatch import Operation
+from nerfloom.tools.benchmarks.kernel_cases import KINDS, Case, cases
 
 LEAST = 1e-6
 """Largest value below which an error is reported relative to this instead."""
@@ -130,7 +130,7 @@ def interpreted() -> list[Error]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "errors.json"
         given = {**os.environ, "TRITON_INTERPRET": "1", "NERFLOOM_KERNELS": "triton"}
-        if subprocess.run(python_command("framework.tools.benchmarks.kernel_errors", path), env=given).returncode:
+        if subprocess.run(python_command("nerfloom.tools.benchmarks.kernel_errors", path), env=given).returncode:
             raise ConfigError("Triton's interpreter failed; the lines above say why")
         return [Error(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
 

@@ -17,28 +17,28 @@ from rich.table import Table
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from framework.base.console import console, say
-from framework.base.errors import ConfigError
-from framework.cameras.cameras import Cameras
-from framework.geometry.rays import Rays, Samples
-from framework.kernels import native
-from framework.kernels.adam import sparse_adam, sparse_adam_reference
-from framework.kernels.compositing import composite, composite_reference
-from framework.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from framework.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from framework.kernels.march import March, Occupancy, ReferenceMarch, march
-from framework.kernels.mlp import Activation, mlp, mlp_reference
-from framework.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
-from framework.kernels.planes import PlanesLayout, planes, planes_reference
-from framework.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from framework.kernels.ssim import photometric_loss, photometric_reference
-from framework.kernels.step_functions import blurred_excess, blurred_excess_reference
-from framework.tools.benchmarks.ceilings import Ceilings, Work
-from framework.tools.benchmarks.compared import Errors, Kernel, errors, of_function
-from framework.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
-from framework.tools.benchmarks.splatting import splatting
-from framework.tools.benchmarks.timing import Run, alternating, differentiated, once
-from framework.training.machine import machine
+from nerfloom.base.console import console, say
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels import native
+from nerfloom.kernels.adam import sparse_adam, sparse_adam_reference
+from nerfloom.kernels.compositing import composite, composite_reference
+from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.march import March, Occupancy, ReferenceMarch, march
+from nerfloom.kernels.mlp import Activation, mlp, mlp_reference
+from nerfloom.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
+from nerfloom.kernels.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from nerfloom.kernels.ssim import photometric_loss, photometric_reference
+from nerfloom.kernels.step_functions import blurred_excess, blurred_excess_reference
+from nerfloom.tools.benchmarks.ceilings import Ceilings, Work
+from nerfloom.tools.benchmarks.compared import Errors, Kernel, errors, of_function
+from nerfloom.tools.benchmarks.plane_lookups import grid_samples, layouts, planes_of
+from nerfloom.tools.benchmarks.splatting import splatting
+from nerfloom.tools.benchmarks.timing import Run, alternating, differentiated, once
+from nerfloom.training.machine import machine
 
 UNITS = "sample, ray, entry, pixel, Gaussian or pair"
 """Units of the kernels' work."""

@@ -20,22 +20,22 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from framework.base.child import python_command
-from framework.base.console import say
-from framework.base.errors import NerfloomError
-from framework.data.ply import read_points
-from framework.export.mesh import Mesh
-from framework.kernels import native
-from framework.tools.benchmarks.chamfer import (
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.base.errors import NerfloomError
+from nerfloom.data.ply import read_points
+from nerfloom.export.mesh import Mesh
+from nerfloom.kernels import native
+from nerfloom.tools.benchmarks.chamfer import (
     distances_to_mesh,
     mesh_sample,
     seen_samples,
     surface_sample,
     visible_from,
 )
-from framework.tools.benchmarks.children import output_of
-from framework.training.machine import machine
-from framework.training.run import read_run
+from nerfloom.tools.benchmarks.children import output_of
+from nerfloom.training.machine import machine
+from nerfloom.training.run import read_run
 
 SURFACE_POINTS = 20_000
 """Number of points on the exact surface."""
@@ -67,7 +67,7 @@ def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions:
     """
     with tempfile.TemporaryDirectory() as folder:
         if run is None:
-            command = python_command("framework.cli.train", "instant-ngp", "--max-seconds", seconds, "--vis", "none")
+            command = python_command("nerfloom.cli.train", "instant-ngp", "--max-seconds", seconds, "--vis", "none")
             command += ["--eval", "all"]
             output_of([*command, "--output-dir", folder])
             run = next(Path(folder).rglob("config.yml")).parent
@@ -139,7 +139,7 @@ class Truth:
             return {}
         from scipy.spatial import cKDTree
 
-        output_of(python_command("framework.cli.export", "pointcloud", run, "--output-dir", folder))
+        output_of(python_command("nerfloom.cli.export", "pointcloud", run, "--output-dir", folder))
         cloud = read_points(folder / "point_cloud.ply")
         distances = torch.from_numpy(cKDTree(cloud.numpy()).query(self.sparse.numpy(), workers=-1)[0])
         return {
@@ -154,7 +154,7 @@ def _row(run: Path, kind: str, resolution: int, folder: Path, truth: Truth) -> d
     import trimesh
 
     output = folder / f"{kind}-{resolution}"
-    command = python_command("framework.cli.export", kind, run, "--resolution", resolution, "--output-dir", output)
+    command = python_command("nerfloom.cli.export", kind, run, "--resolution", resolution, "--output-dir", output)
     start = time.monotonic()
     with (folder / "log.txt").open("w+b") as log:
         child = subprocess.Popen(command, stdout=log, stderr=log)

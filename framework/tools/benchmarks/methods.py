@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import say
-from framework.tools.comparison import plots
-from framework.tools.comparison.measures import Row, read_json
-from framework.tools.comparison.plan import Conditions, Contender, Plan
+from nerfloom.base.console import say
+from nerfloom.tools.comparison import plots
+from nerfloom.tools.comparison.measures import Row, read_json
+from nerfloom.tools.comparison.plan import Conditions, Contender, Plan
 
 STANDARD = (
     "instant-ngp",

@@ -5,7 +5,7 @@ that are created without naming one, and what is computed from these alone.
 
 An operation is what the dispatcher passes on to a kernel; views and empty tensors start none. A wait is where Python
 needs a value or a size from the device, or where the device needs a value of Python's: there is no work left for the
-device until Python has gone on. Checks that are made on the CPU alone (`framework.kernels.given`) are not counted.
+device until Python has gone on. Checks that are made on the CPU alone (`nerfloom.kernels.given`) are not counted.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from framework.base import device as devices
-from framework.base.console import say
-from framework.base.registry import load_dataparser, load_method
-from framework.data.dataset import Dataset
-from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
-from framework.training.machine import machine
-from framework.training.run import Run
-from framework.training.trainer import STEPS_PER_LOG, Trainer
+from nerfloom.base import device as devices
+from nerfloom.base.console import say
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.data.dataset import Dataset
+from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
+from nerfloom.training.machine import machine
+from nerfloom.training.run import Run
+from nerfloom.training.trainer import STEPS_PER_LOG, Trainer
 
 METHODS = (
     "instant-ngp", "nerfacto", "kplanes", "tensorf", "gaussian-splatting", "vanilla-nerf", "dnerf", "mip-nerf",

@@ -18,19 +18,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.console import say
-from framework.base.errors import ConfigError
-from framework.base.registry import load_dataparser, load_method
-from framework.cameras.cameras import Cameras
-from framework.cameras.refinement import PoseRefinement
-from framework.data.dataset import Dataset, load_dataset
-from framework.evaluation.evaluator import evaluate
-from framework.geometry.alignment import align_cameras, pose_errors
-from framework.kernels.math import cross_matrix
-from framework.samplers.choice import SamplingConfig
-from framework.training.machine import machine
-from framework.training.run import Run, create_folder
-from framework.training.trainer import Trainer
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.geometry.alignment import align_cameras, pose_errors
+from nerfloom.kernels.math import cross_matrix
+from nerfloom.samplers.choice import SamplingConfig
+from nerfloom.training.machine import machine
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 
 SCENE = "procedural"
 """Data format of the embedded scene."""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from framework.base.errors import DataError
-from framework.geometry.alignment import pose_errors
-from framework.tools.processing.colmap import read_model
-from framework.tools.processing.transforms import opengl_pose
+from nerfloom.base.errors import DataError
+from nerfloom.geometry.alignment import pose_errors
+from nerfloom.tools.processing.colmap import read_model
+from nerfloom.tools.processing.transforms import opengl_pose
 
 
 def compare(processed: Path, model_folder: Path) -> dict[str, Any]:

@@ -8,17 +8,16 @@ all of them.
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from framework.base.child import python_command
-from framework.base.console import say
-from framework.tools.benchmarks.ablation import VIEWS, crossing
-from framework.tools.benchmarks.children import output_of
-from framework.training.machine import machine
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.tools.benchmarks.ablation import VIEWS, crossing
+from nerfloom.tools.benchmarks.children import output_of
+from nerfloom.training.machine import machine
 
 
 def measure(
@@ -65,10 +64,11 @@ def trained(
         samples: samples of a training step of each process.
         targets: PSNRs, dB.
     """
-    command = python_command("framework.cli.train", "instant-ngp", "--data", data, "--max-seconds", seconds)
+    flags = ("instant-ngp", "--data", data, "--max-seconds", seconds)
+    command = python_command("nerfloom.cli.train", *flags)
     if processes > 1:
-        launch = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)]
-        command = [sys.executable, *launch, *command[1:]]
+        launch = ("--standalone", "--nproc-per-node", processes, "-m", "nerfloom.cli.train")
+        command = python_command("torch.distributed.run", *launch, *flags)
     with tempfile.TemporaryDirectory() as folder:
         command += ["--machine.seed", str(seed), "--samples-per-batch", str(samples), "--vis", "none"]
         command += ["--eval", "all", "--max-eval-images", str(VIEWS)]

@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import say
-from framework.base.device import wait_for
-from framework.kernels import native
-from framework.tools.benchmarks.workload import endless_trainer
-from framework.training.machine import kernels, machine
-from framework.training.run import Run
+from nerfloom.base.console import say
+from nerfloom.base.device import wait_for
+from nerfloom.kernels import native
+from nerfloom.tools.benchmarks.workload import endless_trainer
+from nerfloom.training.machine import kernels, machine
+from nerfloom.training.run import Run
 
 MEASURED, FEWEST, LONGEST = 200, 8, 30.0
 """Number of steps over which times are averaged; fewer, but not fewer than the second, where they take longer than the

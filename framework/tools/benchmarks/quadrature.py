@@ -21,14 +21,14 @@ import torch
 from rich.table import Table
 from torch import Tensor
 
-from framework.base.console import console, say
-from framework.base.device import seed_step, stream_seed
-from framework.geometry.rays import Rays
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.proposal import ProposalSampler
-from framework.tools.benchmarks.closed_forms import ClosedForm, scenes
-from framework.tools.benchmarks.error_curves import Curve, draw, evaluations_needed
-from framework.tools.benchmarks.sampling import (
+from nerfloom.base.console import console, say
+from nerfloom.base.device import seed_step, stream_seed
+from nerfloom.geometry.rays import Rays
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.tools.benchmarks.closed_forms import ClosedForm, scenes
+from nerfloom.tools.benchmarks.error_curves import Curve, draw, evaluations_needed
+from nerfloom.tools.benchmarks.sampling import (
     WHITE,
     Renderer,
     filled_grid,
@@ -38,7 +38,7 @@ from framework.tools.benchmarks.sampling import (
     random_rays,
     renderers,
 )
-from framework.training.machine import machine
+from nerfloom.training.machine import machine
 
 TARGETS = (1e-2, 1e-3, 1e-4)
 """Mean errors for which the number of evaluations is reported."""

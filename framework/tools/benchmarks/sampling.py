@@ -15,18 +15,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from framework.base.device import seed_step, stream_seed
-from framework.fields.base import Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays
-from framework.rendering.rendered import Rendered
-from framework.rendering.volume import VolumeRenderer
-from framework.samplers.base import Sampler
-from framework.samplers.hierarchical import HierarchicalSampler
-from framework.samplers.occupancy import OccupancySampler
-from framework.samplers.proposal import ProposalSampler, interlevel_loss
-from framework.samplers.uniform import UniformSampler
-from framework.tools.benchmarks.closed_forms import BOX
+from nerfloom.base.device import seed_step, stream_seed
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.hierarchical import HierarchicalSampler
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.proposal import ProposalSampler, interlevel_loss
+from nerfloom.samplers.uniform import UniformSampler
+from nerfloom.tools.benchmarks.closed_forms import BOX
 
 WHITE = torch.ones(3)
 """(3,) background."""

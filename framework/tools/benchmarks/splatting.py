@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from framework.kernels.splat_blend import Blended, blend, blend_reference, blended_pairs
-from framework.kernels.splat_project import (
+from nerfloom.kernels.splat_blend import Blended, blend, blend_reference, blended_pairs
+from nerfloom.kernels.splat_project import (
     CUT,
     REACH_X,
     REACH_Y,
@@ -20,10 +20,10 @@ from framework.kernels.splat_project import (
     project_gaussians,
     project_reference,
 )
-from framework.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
-from framework.tools.benchmarks.ceilings import Work
-from framework.tools.benchmarks.compared import Errors, Kernel, errors
-from framework.tools.benchmarks.timing import differentiated, once
+from nerfloom.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
+from nerfloom.tools.benchmarks.ceilings import Work
+from nerfloom.tools.benchmarks.compared import Errors, Kernel, errors
+from nerfloom.tools.benchmarks.timing import differentiated, once
 
 COUNT, WIDTH, HEIGHT = 20_000, 300, 300
 """Gaussians, and the image's size in pixels."""

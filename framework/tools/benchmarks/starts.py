@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import say
-from framework.base.errors import NerfloomError
-from framework.kernels import native
-from framework.tools.benchmarks.ablation import summary, train
-from framework.training.machine import machine
+from nerfloom.base.console import say
+from nerfloom.base.errors import NerfloomError
+from nerfloom.kernels import native
+from nerfloom.tools.benchmarks.ablation import summary, train
+from nerfloom.training.machine import machine
 
 STARTS: dict[str, list[str]] = {
     "field": ["--start", "field"],

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 
-from framework.evaluation.lpips import NETWORK
-from framework.tools.benchmarks.tables import Result, Row, Table, kept
+from nerfloom.evaluation.lpips import NETWORK
+from nerfloom.tools.benchmarks.tables import Result, Row, Table, kept
 
 LOADING, EVALUATION = 20.0, 60.0
 """Seconds before a row's training, and after it where nothing is known of its data, in estimates of a row's time."""

@@ -15,14 +15,14 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from framework.base.config import from_plain, read_yaml
-from framework.base.console import say
-from framework.base.errors import ConfigError, shown
-from framework.tools.comparison import runner
-from framework.tools.comparison.measures import measure, read_json
-from framework.tools.comparison.plan import FIRST_SEED, Conditions, Contender, Job, split_words
-from framework.training.report import SUMMARY
-from framework.training.run import write_json
+from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, shown
+from nerfloom.tools.comparison import runner
+from nerfloom.tools.comparison.measures import measure, read_json
+from nerfloom.tools.comparison.plan import FIRST_SEED, Conditions, Contender, Job, split_words
+from nerfloom.training.report import SUMMARY
+from nerfloom.training.run import write_json
 
 TRIED = 3
 """Number of held-out images on which a trial, with other budgets than the table's, is judged."""

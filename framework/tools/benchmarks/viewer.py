@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from framework.training.trained import load_trained
-from framework.viewer.browser import FINE_QUALITY, Browser
-from framework.viewer.request import Pose, Request
-from framework.viewer.studio import Studio
-from framework.viewer.subject import of_trained
+from nerfloom.training.trained import load_trained
+from nerfloom.viewer.browser import FINE_QUALITY, Browser
+from nerfloom.viewer.request import Pose, Request
+from nerfloom.viewer.studio import Studio
+from nerfloom.viewer.subject import of_trained
 
 WARM_UP = 12
 """Pictures of a moving camera before those that are measured."""

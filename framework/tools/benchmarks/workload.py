@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from framework.base.registry import load_dataparser, load_method
-from framework.data.data_folder import find_data
-from framework.training.datasets import load_split
-from framework.training.run import Run, create_folder
-from framework.training.trainer import Trainer
+from nerfloom.base.registry import load_dataparser, load_method
+from nerfloom.data.data_folder import find_data
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 
 
 def default_run(method: str, data: Path) -> Run:

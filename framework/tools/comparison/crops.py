@@ -11,8 +11,8 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
-from framework.evaluation.images import error_map
-from framework.evaluation.view_files import WORST
+from nerfloom.evaluation.images import error_map
+from nerfloom.evaluation.view_files import WORST
 
 VIEWS = 3
 """Maximum number of views shown."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from framework.tools.comparison.plan import Conditions, Job
+from nerfloom.tools.comparison.plan import Conditions, Job
 
 SAME_TIME = 0.01
 """Relative difference below which two times count as equal: runs end with the step in which their time is up."""

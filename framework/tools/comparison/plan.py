@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.base.child import python_command
-from framework.base.errors import ConfigError, FlagError, shown
-from framework.base.registry import entry_of
-from framework.training.run import write_json
+from nerfloom.base.child import python_command
+from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.base.registry import entry_of
+from nerfloom.training.run import write_json
 
 FIRST_SEED = 42
 """Seed of the first run of each contender; the others follow it."""
@@ -178,7 +178,7 @@ class Job:
 
     def train_command(self, conditions: Conditions) -> list[str]:
         """Return the command that trains under `conditions`, or resumes training if the run has started."""
-        start = python_command("framework.cli.train")
+        start = python_command("nerfloom.cli.train")
         if (self.folder / "config.yml").exists():
             return [*start, "--resume", str(self.folder)]
         c, flags = conditions, ["--vis", "none", "--eval", "all", "--max-eval-images", str(conditions.curve_images)]
@@ -199,7 +199,7 @@ class Job:
 
     def eval_command(self, conditions: Conditions) -> list[str]:
         """Return the command that evaluates the trained model under `conditions`."""
-        command = python_command("framework.cli.evaluate", "--load-config", self.folder / "config.yml")
+        command = python_command("nerfloom.cli.evaluate", "--load-config", self.folder / "config.yml")
         command += ["--output-path", str(self.evaluation), "--render-output-path", str(self.pictures)]
         command += ["--max-pictures", str(PICTURES), "--device-type", conditions.device_type]
         if conditions.max_eval_images is not None:

@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from framework.tools.comparison.measures import Row, pareto
+from nerfloom.tools.comparison.measures import Row, pareto
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
 """Okabe and Ito's colours, which colour-blind readers can distinguish."""

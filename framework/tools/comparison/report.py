@@ -15,13 +15,13 @@ from typing import Any
 
 from rich.table import Table
 
-from framework.evaluation.images import ERROR_AT_WHITE
-from framework.evaluation.lpips import NETWORK
-from framework.tools.comparison import plots
-from framework.tools.comparison.crops import views
-from framework.tools.comparison.measures import SAME_TIME, Measured, Row, pareto
-from framework.tools.comparison.plan import Conditions, Plan
-from framework.training.checkpoint import write_atomically
+from nerfloom.evaluation.images import ERROR_AT_WHITE
+from nerfloom.evaluation.lpips import NETWORK
+from nerfloom.tools.comparison import plots
+from nerfloom.tools.comparison.crops import views
+from nerfloom.tools.comparison.measures import SAME_TIME, Measured, Row, pareto
+from nerfloom.tools.comparison.plan import Conditions, Plan
+from nerfloom.training.checkpoint import write_atomically
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def write_report(plan: Plan, rows: Sequence[Row]) -> Path:
     """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)
-    template = files("framework.tools.comparison").joinpath("report.html.jinja").read_text(encoding="utf-8")
+    template = files("nerfloom.tools.comparison").joinpath("report.html.jinja").read_text(encoding="utf-8")
     import jinja2  # a dependency of PyTorch
 
     pages = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined)

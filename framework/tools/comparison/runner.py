@@ -15,11 +15,11 @@ from queue import Queue
 
 from rich.status import Status
 
-from framework.base.console import console, say
-from framework.base.errors import ConfigError, FlagError
-from framework.tools.comparison.measures import read_json
-from framework.tools.comparison.plan import Conditions, Job, Plan
-from framework.training.signals import NUMBERS, Stopped, handled
+from nerfloom.base.console import console, say
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.tools.comparison.measures import read_json
+from nerfloom.tools.comparison.plan import Conditions, Job, Plan
+from nerfloom.training.signals import NUMBERS, Stopped, handled
 
 LOOK_EVERY = 0.5
 """Seconds between updates of the displayed last line of a run's output."""

@@ -21,11 +21,11 @@ from email.message import Message
 from pathlib import Path
 from typing import BinaryIO
 
-import framework
-from framework.base.atomic import write_atomically
-from framework.base.console import say, track_bytes
-from framework.base.errors import DataError
-from framework.tools.downloads.catalogue import Source
+import nerfloom
+from nerfloom.base.atomic import write_atomically
+from nerfloom.base.console import say, track_bytes
+from nerfloom.base.errors import DataError
+from nerfloom.tools.downloads.catalogue import Source
 
 TIMEOUT = 30.0
 """Seconds without a byte after which a connection counts as broken."""
@@ -112,7 +112,7 @@ def _transfer(source: Source, part: Path, note: Path) -> _Answered:
     # A part from another address is of another file, and a mixture of two versions must be noticed.
     if known.url != source.url or not (known.validator or source.sha256):
         have = 0
-    headers = {"User-Agent": f"nerfloom/{framework.__version__}", "Accept-Encoding": "identity"}
+    headers = {"User-Agent": f"nerfloom/{nerfloom.__version__}", "Accept-Encoding": "identity"}
     if have:
         headers["Range"] = f"bytes={have}-"
         if known.validator:

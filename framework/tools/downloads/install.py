@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from framework.base.console import say
-from framework.base.errors import ConfigError, DataError, nearest
-from framework.data.data_folder import find_data
-from framework.tools.downloads.catalogue import Archive, Dataset, Source
-from framework.tools.downloads.fetch import SourceError, fetch
-from framework.tools.downloads.unpack import Place, names_of, unpack
-from framework.training.lock import sole_user
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError, nearest
+from nerfloom.data.data_folder import find_data
+from nerfloom.tools.downloads.catalogue import Archive, Dataset, Source
+from nerfloom.tools.downloads.fetch import SourceError, fetch
+from nerfloom.tools.downloads.unpack import Place, names_of, unpack
+from nerfloom.training.lock import sole_user
 
 UNFINISHED = ".downloads"
 """Folder, beside the data sets, of archives and of scenes that are not yet complete."""

@@ -10,8 +10,8 @@ import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from framework.base.console import track_bytes
-from framework.base.errors import DataError, shown
+from nerfloom.base.console import track_bytes
+from nerfloom.base.errors import DataError, shown
 
 MAX_FILES = 200_000
 """Maximum number of entries of an archive. The largest of the catalogue has some ten thousand."""

@@ -19,16 +19,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.config import TrainConfig, from_plain, to_plain
-from framework.base.console import say
-from framework.base.device import choose_device
-from framework.base.errors import CheckpointError, ConfigError, DataError
-from framework.base.registry import load_method
-from framework.cameras.view import View
-from framework.data.dataset import DataParser, ParsedScene, Split
-from framework.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
-from framework.evaluation.evaluator import evaluation_background
-from framework.tools.integrations.nerfbaselines_data import (
+from nerfloom.base.config import TrainConfig, from_plain, to_plain
+from nerfloom.base.console import say
+from nerfloom.base.device import choose_device
+from nerfloom.base.errors import CheckpointError, ConfigError, DataError
+from nerfloom.base.registry import load_method
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import DataParser, ParsedScene, Split
+from nerfloom.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.tools.integrations.nerfbaselines_data import (
     CAMERA_MODELS,
     ArrayImages,
     DatasetDict,
@@ -38,11 +38,11 @@ from framework.tools.integrations.nerfbaselines_data import (
     cameras_of,
     dataset_of,
 )
-from framework.tools.integrations.nerfbaselines_settings import flattened, parse_overrides, with_matching_background
-from framework.training.checkpoint import FOLDER, load_newest
-from framework.training.run import Run, write_json
-from framework.training.trained import restored_model
-from framework.training.trainer import Trainer
+from nerfloom.tools.integrations.nerfbaselines_settings import flattened, parse_overrides, with_matching_background
+from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.run import Run, write_json
+from nerfloom.training.trained import restored_model
+from nerfloom.training.trainer import Trainer
 
 BACKGROUND_FILE = "pictures.json"
 """File of a checkpoint with the background of renders, which the trainer's checkpoint lacks."""

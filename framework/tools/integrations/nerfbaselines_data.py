@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.base.errors import DataError
-from framework.cameras.cameras import Cameras, check_pose, join_cameras
-from framework.cameras.colmap import PARAMETERS, from_colmap
-from framework.cameras.poses import NEAR, Placement, estimate_near, nearest_point, place
-from framework.data.dataset import Dataset, Masks, ParsedScene, assemble
-from framework.data.decoding import Decoded, from_arrays
-from framework.data.masks import THRESHOLD
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.cameras import Cameras, check_pose, join_cameras
+from nerfloom.cameras.colmap import PARAMETERS, from_colmap
+from nerfloom.cameras.poses import NEAR, Placement, estimate_near, nearest_point, place
+from nerfloom.data.dataset import Dataset, Masks, ParsedScene, assemble
+from nerfloom.data.decoding import Decoded, from_arrays
+from nerfloom.data.masks import THRESHOLD
 
 DatasetDict = dict[str, Any]
 """nerfbaselines' `Dataset`, of which `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata` are

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from framework.base.config import TrainConfig
+from nerfloom.base.config import TrainConfig
 
 WORDS = {"true": True, "false": False, "none": None, "null": None}
 """Words with a special meaning, in any case."""

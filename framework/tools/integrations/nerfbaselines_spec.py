@@ -30,12 +30,12 @@ def _spec(method: str, method_class: str, **metadata: Any) -> dict[str, Any]:
 
     Args:
         method: its name in Nerfloom's registry.
-        method_class: name of its class in `framework.tools.integrations.nerfbaselines`.
+        method_class: name of its class in `nerfloom.tools.integrations.nerfbaselines`.
         metadata: entries shown on nerfbaselines' pages.
     """
     return {
         "id": f"nerfloom-{method}",
-        "method_class": f"framework.tools.integrations.nerfbaselines:{method_class}",
+        "method_class": f"nerfloom.tools.integrations.nerfbaselines:{method_class}",
         "metadata": {**metadata, "licenses": LICENSES},
         **COMMON,
     }

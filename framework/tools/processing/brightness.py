@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-from framework.base.errors import DataError
+from nerfloom.base.errors import DataError
 
 SAMPLES = 500
 """Rows and columns that are measured for the range."""

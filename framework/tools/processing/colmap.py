@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from framework.base.errors import DataError
-from framework.tools.processing.pair_matching import write_matches
-from framework.tools.processing.settings import ColmapFlags
-from framework.tools.processing.worker import Report
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.pair_matching import write_matches
+from nerfloom.tools.processing.settings import ColmapFlags
+from nerfloom.tools.processing.worker import Report
 
 FIRST_PAIRS = 8
 """Number of pairs that are matched first, to estimate the time of all; no part has fewer."""

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.data.image_files import Content
-from framework.tools.processing.brightness import stretched
-from framework.tools.processing.images import OPERATIONS, PreparedImage, in_parallel, save
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import Content
+from nerfloom.tools.processing.brightness import stretched
+from nerfloom.tools.processing.images import OPERATIONS, PreparedImage, in_parallel, save
 
 NARROW = 0.3
 """Range of brightness below which it is stretched. Six photographs of a can that were darkened to a range of 0.29 had

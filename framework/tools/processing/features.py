@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.tools.processing import colmap, database
-from framework.tools.processing.images import PreparedImage
-from framework.tools.processing.job import Job
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing import colmap, database
+from nerfloom.tools.processing.images import PreparedImage
+from nerfloom.tools.processing.job import Job
 
 
 def camera_groups(prepared: list[PreparedImage], sharing: str) -> list[list[str]]:

@@ -11,9 +11,9 @@ from typing import IO, TypeVar
 
 import numpy as np
 
-from framework.base.console import say, track
-from framework.base.errors import DataError
-from framework.base.extras import install_command
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import DataError
+from nerfloom.base.extras import install_command
 
 SIDE = 1000
 """Maximum side of the grey pictures that frames are judged by, pixels."""

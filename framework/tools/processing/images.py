@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 from PIL import Image
 
-from framework.base.console import say, track
-from framework.base.errors import DataError
-from framework.data.image_files import Content, unreadable
-from framework.tools.processing.brightness import eight_bits, tones
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import Content, unreadable
+from nerfloom.tools.processing.brightness import eight_bits, tones
 
 _JPEG = (".jpg", ".jpeg")
 _ORIENTATION = 0x0112

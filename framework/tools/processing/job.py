@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from framework.tools.processing.settings import ColmapFlags
-from framework.tools.processing.unfinished import unfinished
-from framework.tools.processing.worker import run_in_child
+from nerfloom.tools.processing.settings import ColmapFlags
+from nerfloom.tools.processing.unfinished import unfinished
+from nerfloom.tools.processing.worker import run_in_child
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.data.data_folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.data_folder import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
 READABLE = (*IMAGE_SUFFIXES, ".tga", ".ppm", ".pgm")
 """Suffixes of image files that Pillow reads, HEIC with the package pillow-heif."""

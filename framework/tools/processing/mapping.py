@@ -6,13 +6,13 @@ import shutil
 import statistics
 from pathlib import Path
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.tools.processing import colmap, database, unfolding
-from framework.tools.processing.job import Job
-from framework.tools.processing.matching import match, pairs_of
-from framework.tools.processing.parallax import NO_PARALLAX, WITHOUT
-from framework.tools.processing.summary import advice
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing import colmap, database, unfolding
+from nerfloom.tools.processing.job import Job
+from nerfloom.tools.processing.matching import match, pairs_of
+from nerfloom.tools.processing.parallax import NO_PARALLAX, WITHOUT
+from nerfloom.tools.processing.summary import advice
 
 FEWEST_FEATURES = 15
 """Minimum number of features of an image that can be placed: COLMAP's minimum of matches."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from framework.base.console import say
-from framework.tools.processing import colmap, database, retrieval
-from framework.tools.processing.job import Job
+from nerfloom.base.console import say
+from nerfloom.tools.processing import colmap, database, retrieval
+from nerfloom.tools.processing.job import Job
 
 ADJACENT = 3
 """Number of next images that retrieval matches with each image, besides similar ones."""

@@ -7,10 +7,10 @@ import shlex
 import shutil
 from pathlib import Path
 
-from framework.base.errors import DataError
-from framework.data.data_folder import processed_folder
-from framework.tools.processing.settings import ColmapFlags
-from framework.tools.processing.unfinished import STARTED, go_on, mark, unfinished
+from nerfloom.base.errors import DataError
+from nerfloom.data.data_folder import processed_folder
+from nerfloom.tools.processing.settings import ColmapFlags
+from nerfloom.tools.processing.unfinished import STARTED, go_on, mark, unfinished
 
 FINISHED = "transforms.json"
 """File that is written last; a folder with it is complete."""

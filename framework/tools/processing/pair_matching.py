@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.tools.processing.database import PAIR_BASE
-from framework.tools.processing.retrieval import read_descriptors
+from nerfloom.tools.processing.database import PAIR_BASE
+from nerfloom.tools.processing.retrieval import read_descriptors
 
 MAX_RATIO = 0.8
 """Maximum ratio of the nearest feature's angle to the second nearest's (Lowe 2004)."""

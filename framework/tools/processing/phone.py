@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.data.image_files import one_line
-from framework.tools.processing.output import FINISHED, ready
-from framework.tools.processing.pipeline import prepare_and_report
-from framework.tools.processing.pyramid import write_pyramid
-from framework.tools.processing.transforms import Frame, Lens, content, write
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import one_line
+from nerfloom.tools.processing.output import FINISHED, ready
+from nerfloom.tools.processing.pipeline import prepare_and_report
+from nerfloom.tools.processing.pyramid import write_pyramid
+from nerfloom.tools.processing.transforms import Frame, Lens, content, write
 
 UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
 """Errors raised if a JSON file lacks a number, or has something else instead."""

@@ -6,15 +6,15 @@ import json
 import shutil
 from pathlib import Path
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.tools.processing import colmap, contrast, database, features, mapping, matching, transforms
-from framework.tools.processing.images import PreparedImage, prepare_all, write_masks
-from framework.tools.processing.job import Job
-from framework.tools.processing.output import FINISHED, ready
-from framework.tools.processing.parallax import NO_PARALLAX, PAIRS, WITHOUT, share_that_turned
-from framework.tools.processing.pyramid import write_pyramid
-from framework.tools.processing.summary import Summary, lines
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing import colmap, contrast, database, features, mapping, matching, transforms
+from nerfloom.tools.processing.images import PreparedImage, prepare_all, write_masks
+from nerfloom.tools.processing.job import Job
+from nerfloom.tools.processing.output import FINISHED, ready
+from nerfloom.tools.processing.parallax import NO_PARALLAX, PAIRS, WITHOUT, share_that_turned
+from nerfloom.tools.processing.pyramid import write_pyramid
+from nerfloom.tools.processing.summary import Summary, lines
 
 FEWEST = 3
 """Minimum number of images of a reconstruction."""

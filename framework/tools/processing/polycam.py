@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.tools.processing.listing import find_images
-from framework.tools.processing.phone import UNUSABLE, evenly_spaced, finite, read_json, undistorted_lens, write_folder
-from framework.tools.processing.transforms import Lens
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.listing import find_images
+from nerfloom.tools.processing.phone import UNUSABLE, evenly_spaced, finite, read_json, undistorted_lens, write_folder
+from nerfloom.tools.processing.transforms import Lens
 
 Z_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
 """(3, 4) transform from the phone's frame (y up) to one with z up, as in nerfstudio."""

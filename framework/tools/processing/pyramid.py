@@ -6,7 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from framework.tools.processing.images import in_parallel, save
+from nerfloom.tools.processing.images import in_parallel, save
 
 
 def write_pyramid(folder: Path, names: list[str], num_downscales: int, masks: bool = False) -> None:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.tools.processing.listing import find_images
-from framework.tools.processing.phone import UNUSABLE, evenly_spaced, read_json, undistorted_lens, write_folder
-from framework.tools.processing.transforms import Lens
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.listing import find_images
+from nerfloom.tools.processing.phone import UNUSABLE, evenly_spaced, read_json, undistorted_lens, write_folder
+from nerfloom.tools.processing.transforms import Lens
 
 
 def convert(export: Path, output: Path, num_downscales: int, max_images: int) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from framework.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError, FlagError
 
 CameraModel = Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE"]
 """COLMAP's lens models that transforms.json can express."""

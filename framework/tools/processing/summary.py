@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from framework.tools.processing.parallax import NO_PARALLAX, WITHOUT
+from nerfloom.tools.processing.parallax import NO_PARALLAX, WITHOUT
 
 ENOUGH = 0.8
 """Share of registered images below which advice is given."""

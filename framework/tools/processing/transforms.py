@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from framework.base.errors import DataError
+from nerfloom.base.errors import DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """(3, 4) transform from COLMAP's frame, which tends to have y down, to one with z up."""
@@ -150,7 +150,7 @@ def write(path: Path, value: dict[str, Any]) -> None:
         path: the file.
         value: its content.
     """
-    from framework.training.checkpoint import write_atomically  # imports PyTorch
+    from nerfloom.training.checkpoint import write_atomically  # imports PyTorch
 
     text = json.dumps(value, indent=2, allow_nan=False)
     write_atomically(path, lambda file: file.write(text.encode()))

@@ -8,10 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import say
-from framework.base.errors import DataError
-from framework.tools.processing.settings import ColmapFlags
-from framework.tools.processing.video import write_frames
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.tools.processing.settings import ColmapFlags
+from nerfloom.tools.processing.video import write_frames
 
 STARTED = "started.json"
 """File that says what a run was started with."""

@@ -1,4 +1,4 @@
-"""Reconstructions that something repeated has folded (`framework.data.folds`), taken apart.
+"""Reconstructions that something repeated has folded (`nerfloom.data.folds`), taken apart.
 
 What repeats connects photographs of opposite sides. Neighbours of a sequence do show the same side, so photographs are
 first placed by matches of neighbours alone. What that drifts is mended in a second reconstruction, with the matches
@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.base.console import say
-from framework.data.folds import angle_between, folds, in_order, thumbnail
-from framework.data.image_files import read_image
-from framework.tools.processing.colmap import Model
-from framework.tools.processing.database import PAIR_BASE
+from nerfloom.base.console import say
+from nerfloom.data.folds import angle_between, folds, in_order, thumbnail
+from nerfloom.data.image_files import read_image
+from nerfloom.tools.processing.colmap import Model
+from nerfloom.tools.processing.database import PAIR_BASE
 
 NEXT = 3
 """Number of next photographs that are neighbours of one."""

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from framework.base.console import say
-from framework.tools.processing import frame_choice
-from framework.tools.processing.ffmpeg import chosen_frames, survey
-from framework.tools.processing.images import save
+from nerfloom.base.console import say
+from nerfloom.tools.processing import frame_choice
+from nerfloom.tools.processing.ffmpeg import chosen_frames, survey
+from nerfloom.tools.processing.images import save
 
 
 def write_frames(video: Path, folder: Path, target: int) -> list[Path]:

@@ -12,9 +12,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from framework.base.console import say, track
-from framework.base.errors import DataError, NerfloomError
-from framework.tools.processing.estimate import about
+from nerfloom.base.console import say, track
+from nerfloom.base.errors import DataError, NerfloomError
+from nerfloom.tools.processing.estimate import about
 
 Report = Callable[[int], None]
 """Function that the child calls with the number of units done; with 0 when it begins, after imports."""

@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from framework.base.config import TrainConfig
-from framework.base.errors import FlagError, nearest
-from framework.data.dataset import Dataset
-from framework.tools.stress.faults import Spoil, spoiled_pixel, spoiled_pose
-from framework.tools.stress.scenes import Views, ball_views
-from framework.tools.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice
-from framework.tools.testing.ball import RADIUS
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import FlagError, nearest
+from nerfloom.data.dataset import Dataset
+from nerfloom.tools.stress.faults import Spoil, spoiled_pixel, spoiled_pose
+from nerfloom.tools.stress.scenes import Views, ball_views
+from nerfloom.tools.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice
+from nerfloom.tools.testing.ball import RADIUS
 
 ALLOWED = 2.0
 """Default maximum loss of PSNR, dB; compare the loss of `another-seed`."""

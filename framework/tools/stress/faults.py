@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from framework.data.dataset import Dataset
+from nerfloom.data.dataset import Dataset
 
 EVERY = 3
 """Distance between spoiled batches. More than one, as ten non-finite steps in a row end a run."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from framework.base.config import to_plain
-from framework.base.registry import load_method
-from framework.data.scene import Scene
-from framework.tools.stress.trial import Budget, shortened
-from framework.tools.stress.verdict import Verdict
-from framework.training.run import Run
+from nerfloom.base.config import to_plain
+from nerfloom.base.registry import load_method
+from nerfloom.data.scene import Scene
+from nerfloom.tools.stress.trial import Budget, shortened
+from nerfloom.tools.stress.verdict import Verdict
+from nerfloom.training.run import Run
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Result:
     method: str
     """Name of the method, with its flags."""
     machine: dict[str, Any]
-    """Processor, threads, kernels, versions and commit (`framework.training.machine`)."""
+    """Processor, threads, kernels, versions and commit (`nerfloom.training.machine`)."""
     settings: dict[str, Any]
     """Settings of the plain run."""
     verdicts: tuple[Verdict, ...]

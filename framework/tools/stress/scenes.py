@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras, subpixels
-from framework.data.dataset import DataParser, Dataset, Split, load_dataset
-from framework.data.image_files import reduce_image
-from framework.data.pixel_set import PixelSet
-from framework.data.scene import Scene
-from framework.evaluation.evaluator import spread
-from framework.tools.testing.ball import RADIUS, cameras_at, trace
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.data.dataset import DataParser, Dataset, Split, load_dataset
+from nerfloom.data.image_files import reduce_image
+from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.scene import Scene
+from nerfloom.evaluation.evaluator import spread
+from nerfloom.tools.testing.ball import RADIUS, cameras_at, trace
 
 HALF_SIZE = 1.5
 """Half the edge of the ball's box, scene units. Every ray of FIELD_OF_VIEW or less meets the box."""

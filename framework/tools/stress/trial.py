@@ -15,24 +15,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig, TrainConfig, from_plain
-from framework.base.device import choose_device
-from framework.base.errors import NerfloomError
-from framework.base.registry import load_method
-from framework.data.dataset import Dataset
-from framework.data.pixels import composite
-from framework.data.scene import Scene
-from framework.data.sources import BatchSource, Request, make_source
-from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.evaluation.metrics import psnr
-from framework.kernels.adam import all_finite
-from framework.method import Method
-from framework.model import Model
-from framework.tools.stress.conditions import Condition
-from framework.tools.stress.scenes import Views
-from framework.training.run import Run
-from framework.training.signals import Stopped
-from framework.training.trainer import Trainer
+from nerfloom.base.config import RayConfig, TrainConfig, from_plain
+from nerfloom.base.device import choose_device
+from nerfloom.base.errors import NerfloomError
+from nerfloom.base.registry import load_method
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels import composite
+from nerfloom.data.scene import Scene
+from nerfloom.data.sources import BatchSource, Request, make_source
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.metrics import psnr
+from nerfloom.kernels.adam import all_finite
+from nerfloom.method import Method
+from nerfloom.model import Model
+from nerfloom.tools.stress.conditions import Condition
+from nerfloom.tools.stress.scenes import Views
+from nerfloom.training.run import Run
+from nerfloom.training.signals import Stopped
+from nerfloom.training.trainer import Trainer
 
 MOST_RAYS, MOST_SAMPLES = 512, 2**14
 """Maximum number of rays and of samples per step, so that a large network does hundreds of steps in a minute."""

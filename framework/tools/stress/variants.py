@@ -8,9 +8,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from framework.cameras.poses import place
-from framework.data.dataset import Dataset
-from framework.tools.stress.scenes import Views, kept_of, with_photographs
+from nerfloom.cameras.poses import place
+from nerfloom.data.dataset import Dataset
+from nerfloom.tools.stress.scenes import Views, kept_of, with_photographs
 
 # -- images ---------------------------------------------------------------------------------------------------------
 
@@ -85,7 +85,7 @@ def moved(views: Views, scale: float = 1.0, shift: float = 0.0, placed: bool = F
     - Not `placed`: with --half-size, --near and --far the blender format takes cameras as they are, and these are in
       the same unit and with the same centre. Therefore they are transformed like the cameras.
     - `placed`: formats of captures move the cameras' mean position to the origin and scale positions to [-1, 1]
-      (`framework.cameras.poses.place`), in float64, as text files hold it, and round afterwards. The orientation is
+      (`nerfloom.cameras.poses.place`), in float64, as text files hold it, and round afterwards. The orientation is
       kept, so that the box can be transformed exactly. Only rounding errors of scale and shift remain.
 
     All is computed in float64 and rounded once.

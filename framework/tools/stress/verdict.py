@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from framework.base.console import say
-from framework.base.registry import load_method
-from framework.tools.stress.conditions import PLAIN, Condition
-from framework.tools.stress.faults import spoiled_batches
-from framework.tools.stress.scenes import Views
-from framework.tools.stress.trial import Budget, Trial, attempt
-from framework.training.run import Run
+from nerfloom.base.console import say
+from nerfloom.base.registry import load_method
+from nerfloom.tools.stress.conditions import PLAIN, Condition
+from nerfloom.tools.stress.faults import spoiled_batches
+from nerfloom.tools.stress.scenes import Views
+from nerfloom.tools.stress.trial import Budget, Trial, attempt
+from nerfloom.training.run import Run
 
 Outcome = Literal["pass", "degraded", "refused", "fail", "not applicable"]
 """Outcome of a run. refused: it ended with a clear error, which is as good as a result. not applicable: there was no

@@ -2,7 +2,7 @@
 
 In a test of your package:
 
-    from framework.tools.testing import assert_method
+    from nerfloom.tools.testing import assert_method
 
     def test_the_method():
         assert_method(METHOD)
@@ -10,6 +10,6 @@ In a test of your package:
 
 from __future__ import annotations
 
-from framework.tools.testing.check import assert_method as assert_method
-from framework.tools.testing.check import check_method as check_method
-from framework.tools.testing.finding import Finding as Finding
+from nerfloom.tools.testing.check import assert_method as assert_method
+from nerfloom.tools.testing.check import check_method as check_method
+from nerfloom.tools.testing.finding import Finding as Finding

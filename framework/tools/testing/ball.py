@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from framework.cameras.cameras import Cameras
-from framework.evaluation.paths import look_at
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.evaluation.paths import look_at
 
 RADIUS = 0.7
 """Radius of the ball, scene units."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import torch
 
-from framework.base.config import TrainConfig
-from framework.method import Method
-from framework.ray_model import RayModel
-from framework.tools.testing import declaration, learning, rendering, storage
-from framework.tools.testing.finding import Finding
-from framework.tools.testing.subject import Subject
+from nerfloom.base.config import TrainConfig
+from nerfloom.method import Method
+from nerfloom.ray_model import RayModel
+from nerfloom.tools.testing import declaration, learning, rendering, storage
+from nerfloom.tools.testing.finding import Finding
+from nerfloom.tools.testing.subject import Subject
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from dataclasses import fields
 
 import yaml
 
-from framework.base.config import TrainConfig, from_plain, to_plain
-from framework.tools.testing.finding import Fault
-from framework.tools.testing.subject import Subject
+from nerfloom.base.config import TrainConfig, from_plain, to_plain
+from nerfloom.tools.testing.finding import Fault
+from nerfloom.tools.testing.subject import Subject
 
 
 def check_config(subject: Subject) -> str:
@@ -21,7 +21,7 @@ def check_config(subject: Subject) -> str:
     config = subject.config
     kind = type(config)
     if not isinstance(config, TrainConfig):
-        raise Fault(f"{kind.__name__} does not derive from framework.TrainConfig, as every method's settings do")
+        raise Fault(f"{kind.__name__} does not derive from nerfloom.TrainConfig, as every method's settings do")
     # Python itself refuses a dataclass that derives from a frozen one and is not frozen.
     if "__dataclass_fields__" not in vars(kind) and inspect.get_annotations(kind):
         raise Fault(f"{kind.__name__} is no dataclass of its own; write @dataclass(frozen=True) above it")

@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.model import Loss
-from framework.ray_model import RayModel
-from framework.tools.testing.finding import Fault
-from framework.tools.testing.rendering import require_rendered
-from framework.tools.testing.subject import STEPS, Learner, Subject
-from framework.training.optim import first_non_finite
+from nerfloom.model import Loss
+from nerfloom.ray_model import RayModel
+from nerfloom.tools.testing.finding import Fault
+from nerfloom.tools.testing.rendering import require_rendered
+from nerfloom.tools.testing.subject import STEPS, Learner, Subject
+from nerfloom.training.optim import first_non_finite
 
 FIRST_STEPS = 3
 """Steps of which the gradients are checked."""
@@ -46,7 +46,7 @@ def check_loss(subject: Subject) -> str:
 
 def _require_loss(loss: Loss, batch: Any, of: str) -> None:
     if not isinstance(loss, Loss):
-        raise Fault(f"the loss{of} is {type(loss).__name__}; return a framework.Loss")
+        raise Fault(f"the loss{of} is {type(loss).__name__}; return a nerfloom.Loss")
     if not isinstance(loss.terms, dict) or not loss.terms:
         raise Fault(f"the loss{of} has {type(loss.terms).__name__}, or none; its terms are a dictionary of scalars")
     for name, value in loss.terms.items():

@@ -10,15 +10,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays
-from framework.model import Model, parts
-from framework.ray_model import RayModel
-from framework.rendering.background import SphereRenderer
-from framework.rendering.rendered import Rendered
-from framework.samplers.base import SkipsCells
-from framework.samplers.proposal import ProposalSampler
-from framework.tools.testing.finding import Fault
-from framework.tools.testing.subject import STRIDE, Learner, Subject
+from nerfloom.geometry.rays import Rays
+from nerfloom.model import Model, parts
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.background import SphereRenderer
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.samplers.base import SkipsCells
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.tools.testing.finding import Fault
+from nerfloom.tools.testing.subject import STRIDE, Learner, Subject
 
 TOLERANCE = 1e-3
 """Maximum difference of colours and opacities that should be equal."""
@@ -31,7 +31,7 @@ def check_build(subject: Subject) -> str:
 
     model = subject.method.model
     if not (isinstance(model, type) and issubclass(model, Model)):
-        raise Fault(f"{model!r} does not derive from framework.Model")
+        raise Fault(f"{model!r} does not derive from nerfloom.Model")
 
     def look(learner: Learner) -> None:
         if not any(parameter.requires_grad for parameter in learner.model.parameters()):

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from framework.cameras.cameras import Cameras
-from framework.data.dataset import Dataset
-from framework.data.scene import Scene
-from framework.geometry.rays import Rays
-from framework.tools.testing.ball import cameras_at, trace
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.scene import Scene
+from nerfloom.geometry.rays import Rays
+from nerfloom.tools.testing.ball import cameras_at, trace
 
 COUNT, SIZE = 8, 24
 """Number of images, and their usual width and height, pixels."""

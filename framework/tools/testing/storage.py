@@ -7,11 +7,11 @@ from pathlib import Path
 
 import torch
 
-from framework.tools.testing.finding import Fault
-from framework.tools.testing.learning import require_same
-from framework.tools.testing.subject import SEED, Learner, Subject
-from framework.training.checkpoint import load_checkpoint, save_checkpoint
-from framework.training.trained import restore_model
+from nerfloom.tools.testing.finding import Fault
+from nerfloom.tools.testing.learning import require_same
+from nerfloom.tools.testing.subject import SEED, Learner, Subject
+from nerfloom.training.checkpoint import load_checkpoint, save_checkpoint
+from nerfloom.training.trained import restore_model
 
 
 def check_checkpoint(subject: Subject) -> str:

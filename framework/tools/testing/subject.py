@@ -14,22 +14,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.base.config import RayConfig, TrainConfig
-from framework.base.device import seed_step
-from framework.cameras.view import every
-from framework.data.dataset import Dataset
-from framework.data.pixels import PixelBatch, background_colors, composite, gather_batch
-from framework.data.sources import Request, make_source
-from framework.geometry.rays import Rays
-from framework.method import Method
-from framework.model import LearnsMotion, Loss, Model
-from framework.ray_model import RayModel
-from framework.rendering.rendered import Picture, Rendered
-from framework.tools.testing.finding import Fault
-from framework.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
-from framework.training.optim import Adam, make_optimizer, set_learning_rate
-from framework.training.preparation import show_images
-from framework.training.step import backward, forward
+from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.device import seed_step
+from nerfloom.cameras.view import every
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels import PixelBatch, background_colors, composite, gather_batch
+from nerfloom.data.sources import Request, make_source
+from nerfloom.geometry.rays import Rays
+from nerfloom.method import Method
+from nerfloom.model import LearnsMotion, Loss, Model
+from nerfloom.ray_model import RayModel
+from nerfloom.rendering.rendered import Picture, Rendered
+from nerfloom.tools.testing.finding import Fault
+from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky, moving_ball
+from nerfloom.training.optim import Adam, make_optimizer, set_learning_rate
+from nerfloom.training.preparation import show_images
+from nerfloom.training.step import backward, forward
 
 RAYS = 256
 """Maximum number of pixels in a step."""

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from framework import Field, Method, Points, RayConfig, Sampler, Scene
-from framework.fields.base import MLP
-from framework.geometry.points import Footprint
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.samplers.uniform import UniformSampler
+from nerfloom import Field, Method, Points, RayConfig, Sampler, Scene
+from nerfloom.fields.base import MLP
+from nerfloom.geometry.points import Footprint
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.samplers.uniform import UniformSampler
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from framework import Loss, Method, Model, Optimised, Picture, Scene, TrainConfig, View, ViewBatch
+from nerfloom import Loss, Method, Model, Optimised, Picture, Scene, TrainConfig, View, ViewBatch
 
 
 @dataclass(frozen=True)

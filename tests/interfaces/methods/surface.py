@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from framework import Field, Method, Points, Scene
-from framework.fields.base import MLP
-from framework.kernels.frequency import frequency_encoding
-from framework.kernels.spherical_harmonics import spherical_harmonics
-from framework.samplers.choice import SamplingConfig, decide_sampler, make_sampler
+from nerfloom import Field, Method, Points, Scene
+from nerfloom.fields.base import MLP
+from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.samplers.choice import SamplingConfig, decide_sampler, make_sampler
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework import Field, Rays, Sampler, Samples
-from framework.geometry.bounds import intersect_box
-from methods import instant_ngp
+from nerfloom import Field, Rays, Sampler, Samples
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.methods import instant_ngp
 
 COUNT = 48
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework import Field, Rays, Rendered, Samples, VolumeRenderer
-from methods import instant_ngp
+from nerfloom import Field, Rays, Rendered, Samples, VolumeRenderer
+from nerfloom.methods import instant_ngp
 
 GREY, DENSITY = 0.5, 0.2
 """Colour of the fog in all channels, and how much of it there is, 1/length."""

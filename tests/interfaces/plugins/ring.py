@@ -9,15 +9,15 @@ from typing import ClassVar, Literal
 
 import torch
 
-from framework import Cameras, DataError, DataParser, ParsedScene
-from framework.data.image_files import image_size
+from nerfloom import Cameras, DataError, DataParser, ParsedScene
+from nerfloom.data.image_files import image_size
 
 
 @dataclass(frozen=True)
 class Ring(DataParser):
     """Images from a circle around the origin; every fourth is held out."""
 
-    interface: ClassVar[int] = 1
+    interface: ClassVar[int] = 2
     distance: float = 4.0
     """Radius of the circle, scene units."""
     camera_angle: float = 40.0

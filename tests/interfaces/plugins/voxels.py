@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, softplus
 
-from framework import Field, Points, Scene, TrainConfig
-from framework.geometry.bounds import to_unit_box
-from methods import instant_ngp
+from nerfloom import Field, Points, Scene, TrainConfig
+from nerfloom.geometry.bounds import to_unit_box
+from nerfloom.methods import instant_ngp
 
 VERTICES = 48
 

@@ -8,8 +8,8 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from framework.kernels import triton_kernels
-from framework.kernels.dispatch import FEW_OPERATIONS, Operation
+from nerfloom.kernels import triton_kernels
+from nerfloom.kernels.dispatch import FEW_OPERATIONS, Operation
 
 DEVICE = torch.device("cpu" if triton_kernels.INTERPRETED else "cuda")
 Function = Callable[..., Tensor | Sequence[Tensor]]

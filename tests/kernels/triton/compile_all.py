@@ -16,13 +16,13 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
-from framework.geometry.rays import Samples
-from framework.kernels.fixed_march import share_out
-from framework.kernels.hash_grid import HashGridLayout
-from framework.kernels.planes import PlanesLayout
-from framework.kernels.splat_project import SplatCamera, project_reference
-from framework.kernels.splat_tiles import tile_lists_reference
-from framework.kernels.triton_kernels import (
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.fixed_march import share_out
+from nerfloom.kernels.hash_grid import HashGridLayout
+from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.kernels.splat_project import SplatCamera, project_reference
+from nerfloom.kernels.splat_tiles import tile_lists_reference
+from nerfloom.kernels.triton_kernels import (
     adam,
     compositing,
     encodings,

@@ -4,8 +4,8 @@ import importlib.util
 
 import torch
 
-from framework.kernels import triton_kernels
-from framework.tools.benchmarks.kernel_errors import faster_interpreter
+from nerfloom.kernels import triton_kernels
+from nerfloom.tools.benchmarks.kernel_errors import faster_interpreter
 
 if importlib.util.find_spec("triton") is None or not (triton_kernels.INTERPRETED or torch.cuda.is_available()):
     collect_ignore_glob = ["test_*.py"]

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Samples
-from framework.kernels.alpha import composite_alpha
-from framework.kernels.compositing import composite, distortion
+from nerfloom.geometry.rays import Samples
+from nerfloom.kernels.alpha import composite_alpha
+from nerfloom.kernels.compositing import composite, distortion
 from tests.kernels.triton.compared import compare
 
 

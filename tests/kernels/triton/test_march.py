@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays
-from framework.kernels.march import Occupancy, ReferenceMarch, march, sort_by_ray, sort_by_ray_reference
-from framework.kernels.occupancy import own_cells
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.march import Occupancy, ReferenceMarch, march, sort_by_ray, sort_by_ray_reference
+from nerfloom.kernels.occupancy import own_cells
 from tests.kernels.test_march import BOX, occupancy, random_rays, walk
 from tests.kernels.triton.compared import DEVICE, backends
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from framework.kernels.planes import PlanesLayout, planes
+from nerfloom.kernels.planes import PlanesLayout, planes
 from tests.kernels.triton.compared import compare
 
 LAYOUTS = {

@@ -22,7 +22,7 @@ BUGS = (
     Bug(
         "functions-never-stop",
         "interface",
-        "nerfloom/skipping.py",
+        "framework/plug_and_play/skipping.py",
         "stop = 0.0 if sigma_fn is None else early_stop",
         "stop = 0.0",
         "what is hidden is sampled all the same",
@@ -30,7 +30,7 @@ BUGS = (
     Bug(
         "time-of-the-grid-alone",
         "interface",
-        "nerfloom/functions.py",
+        "framework/plug_and_play/functions.py",
         "function(*arguments) if times is None else function(*arguments, times)",
         "function(*arguments) if times is None else function(*arguments, times[:1].expand_as(times))",
         "all rays of a moving scene are coloured at the time of the first",
@@ -38,7 +38,7 @@ BUGS = (
     Bug(
         "extras-teach-no-density",
         "interface",
-        "nerfloom/rendering.py",
+        "framework/plug_and_play/rendering.py",
         "return ray_sum(weights.view(",
         "return ray_sum(weights.detach().view(",
         "a loss on depths, normals or semantics moves no density",
@@ -46,7 +46,7 @@ BUGS = (
     Bug(
         "clipped-nearer-than-near",
         "interface",
-        "nerfloom/sampling.py",
+        "framework/plug_and_play/sampling.py",
         "nears = torch.minimum(torch.maximum(enter, rays.nears), leave)",
         "nears = torch.minimum(enter, leave)",
         "rays are sampled in front of where they were said to start",
@@ -54,7 +54,7 @@ BUGS = (
     Bug(
         "draws-by-the-weights-of-the-neighbour",
         "interface",
-        "nerfloom/sampling.py",
+        "framework/plug_and_play/sampling.py",
         "inverse_cdf(edges, samples.padded(weights.detach()), u)",
         "inverse_cdf(edges, samples.padded(weights.detach()).roll(1, 1), u)",
         "further samples fall one interval behind where light is stopped",

@@ -5,20 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from framework.base.config import from_plain, to_plain
-from framework.base.registry import load_dataparser, load_method, registered, summary
-from framework.base.splits import Split
-from framework.base.step_limit import limited_as_given
-from framework.cameras.cameras import Cameras
-from framework.cameras.view import View
-from framework.data.data_folder import find_data
-from framework.data.dataset import Dataset
-from framework.evaluation.evaluator import evaluate, evaluation_background
-from framework.rendering.rendered import Picture
-from framework.training.datasets import load_split
-from framework.training.run import Run, run_folder
-from framework.training.run_path import config_file
-from framework.training.trained import Trained, load_trained
+from nerfloom.base.config import from_plain, to_plain
+from nerfloom.base.registry import load_dataparser, load_method, registered, summary
+from nerfloom.base.splits import Split
+from nerfloom.base.step_limit import limited_as_given
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.data.data_folder import find_data
+from nerfloom.data.dataset import Dataset
+from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.rendering.rendered import Picture
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, run_folder
+from nerfloom.training.run_path import config_file
+from nerfloom.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -36,7 +36,7 @@ class TrainedRun:
 
     def __init__(self, trained: Trained) -> None:
         self.model = trained.model
-        """The trained model (`framework.Model`), in evaluation mode."""
+        """The trained model (`nerfloom.Model`), in evaluation mode."""
         self.run = trained.run
         """Method, settings, data format and folder of the run."""
         self._datasets: dict[Split, Dataset] = {}
@@ -94,7 +94,7 @@ class TrainedRun:
         return evaluate(self.model, self.dataset(split), max_images=max_images, lpips_weights=weights).results
 
 
-def methods() -> dict[str, str]:
+def list_methods() -> dict[str, str]:
     """Return the summary of each method that can be trained, by name."""
     return {name: summary(entry) for name, entry in registered("methods").items()}
 
@@ -119,7 +119,7 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
     """Train a method as `ns-train` does, and load the result.
 
     Args:
-        method: name of the method; `methods()` lists all.
+        method: name of the method; `list_methods()` lists all.
         data: folder of the data set; the embedded scene if None.
         format: name of the data format; detected if None.
         settings: settings of the method by name, with underscores, as in `max_seconds=60`.
@@ -128,7 +128,7 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
         ConfigError: if the method or a setting is unknown.
         DataError: if the data cannot be used.
     """
-    from framework.cli.session import start
+    from nerfloom.cli.session import start
 
     folder, name = find_data(None if data is None else Path(data), format)
     config = from_plain(load_method(method).config, {**to_plain(settings), "data": _text(folder)}, "train()")
@@ -155,8 +155,8 @@ def image(picture: Picture, what: Literal["rgb", "depth", "accumulation", "norma
     """
     from PIL import Image as images
 
-    from framework.evaluation.images import to_uint8
-    from framework.evaluation.panels import depth_range, viridis
+    from nerfloom.evaluation.images import to_uint8
+    from nerfloom.evaluation.panels import depth_range, viridis
 
     if what == "rgb":
         shown = picture.rgb.clamp(0, 1)

@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from framework.geometry.bounds import intersect_box
-from framework.geometry.rays import Rays, Samples
-from framework.samplers.inverse_cdf import inverse_cdf, uniform_variates
-from framework.samplers.proposal import propose
-from framework.samplers.uniform import UniformSampler
-from nerfloom.functions import DensityOnly, SigmaFunction, as_density, check_rays
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.plug_and_play.functions import DensityOnly, SigmaFunction, as_density, check_rays
+from nerfloom.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from nerfloom.samplers.proposal import propose
+from nerfloom.samplers.uniform import UniformSampler
 
 
 def clip_to_box(rays: Rays, box: Tensor | Sequence[Sequence[float]]) -> Rays:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from framework.geometry.rays import Rays, Samples
-from framework.samplers.occupancy import OccupancySampler
-from nerfloom.functions import DensityOnly, SigmaFunction, as_density, check_rays
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.plug_and_play.functions import DensityOnly, SigmaFunction, as_density, check_rays
+from nerfloom.samplers.occupancy import OccupancySampler
 
 FILL_STEPS = 1025
 """Number of steps that `OccupancyGrid.fill` makes: those that visit all cells, and three times as many in which cells

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from framework.geometry.rays import Rays, Samples
-from framework.kernels.alpha import unit_intervals
-from framework.kernels.compositing import ray_sum
-from framework.rendering.volume import volume_render
-from nerfloom.functions import RgbFunction, at_least_float32, check_rays, evaluate
+from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.alpha import unit_intervals
+from nerfloom.kernels.compositing import ray_sum
+from nerfloom.plug_and_play.functions import RgbFunction, at_least_float32, check_rays, evaluate
+from nerfloom.rendering.volume import volume_render
 
 
 @dataclass(frozen=True)

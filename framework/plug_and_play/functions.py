@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from framework.fields.base import DensityFunction, Field
-from framework.geometry.points import Points
-from framework.geometry.rays import Rays, Samples
+from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays, Samples
 
 SigmaFunction = Callable[..., Tensor]
 """Function (positions (N, 3)[, times (N,)]) -> sigma (N,), the density in 1/length, at least 0."""

@@ -1,0 +1,61 @@
+"""Everything is imported as nerfloom, whatever lies in the folder in which Python is started."""
+
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+import nerfloom
+from nerfloom.base.child import SAFE, python_command
+
+PACKAGE = Path(nerfloom.__file__).parent
+SHADOW = 'raise SystemExit("a file of the working folder was imported")\n'
+COMMANDS = sorted(
+    point.value.split(":")[0]
+    for point in entry_points(group="console_scripts")
+    if point.value.startswith("nerfloom.cli.")
+)
+
+
+@pytest.fixture
+def shadowed(tmp_path: Path) -> Path:
+    """A folder with the names of this repository's folders, one that looks like a checkout of it."""
+    for name in ("framework", "dataparsers"):
+        (tmp_path / f"{name}.py").write_text(SHADOW)
+    (tmp_path / "methods").mkdir()
+    (tmp_path / "methods" / "__init__.py").write_text(SHADOW)
+    return tmp_path
+
+
+def output_of(words: list[str], folder: Path) -> str:
+    """What a program prints that is started in a folder and must succeed."""
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.medium
+def test_a_notebook_imports_nothing_of_the_working_folder(shadowed: Path) -> None:
+    """Python has the working folder first on its path there."""
+    code = "import nerfloom as n; print(*n.list_methods()); n.Method; n.runs.load_dataparser('blender')"
+    assert "instant-ngp" in output_of([sys.executable, "-c", code], shadowed).split()
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("module", COMMANDS)
+def test_a_command_imports_nothing_of_the_working_folder(module: str, shadowed: Path) -> None:
+    assert "ns-" in output_of([sys.executable, "-m", module, "--help"], shadowed)
+
+
+@pytest.mark.medium
+def test_a_child_imports_no_name_of_the_working_folder(shadowed: Path) -> None:
+    """Not even those of other packages, from Python 3.11 on."""
+    if SAFE:
+        for name in ("tyro", "runpy", "nerfloom"):
+            (shadowed / f"{name}.py").write_text(SHADOW)
+    said = output_of(python_command("nerfloom.cli.train", "instant-ngp", "--version"), shadowed)
+    assert f"from {PACKAGE} " in said
+    assert "--max-seconds" in output_of(python_command("nerfloom.cli.train", "instant-ngp", "--help"), shadowed)
+

@@ -22,7 +22,8 @@ PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
 
 def methods() -> dict[str, Entry]:
     """Return the methods of this repository, sorted by name; plugins that are installed besides are no part of it."""
-    return {name: entry for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")}
+    entries = registered("methods").items()
+    return {name: entry for name, entry in entries if entry.module.startswith("nerfloom.methods.")}
 
 
 def page(name: str, text: str | None) -> str:

@@ -40,10 +40,6 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     """A model of Gaussians that are drawn onto whole images.
 
     A method adds its `start` and `loss`, and may change `lit` and `camera`.
-
-    Args:
-        config: the method's settings, decided.
-        scene: properties of the scene.
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"

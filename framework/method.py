@@ -38,11 +38,7 @@ def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
 
 
 def depth_choice(scene: Scene) -> Choice:
-    """Return the weight of the depth loss that suits the scene.
-
-    Args:
-        scene: properties of the scene.
-    """
+    """Return the weight of the depth loss that suits the scene."""
     points = scene.num_sparse_depths > 0 and not scene.has_depth
     weight = SPARSE_DEPTH if points else DEPTH if scene.has_depth else 0.0
     reason = SPARSE_DEPTH_REASON.format(scene.num_sparse_depths) if points else DEPTH_REASONS[scene.has_depth]

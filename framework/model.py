@@ -50,10 +50,6 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
     """Base class of models, which are trained and rendered.
 
     Samples are at random positions if `self.training` is True, and at fixed positions if it is False.
-
-    Args:
-        config: the method's settings, decided.
-        scene: properties of the scene.
     """
 
     batches: ClassVar[Literal["pixels", "views"]]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,9 +13,8 @@ from nerfloom.base.config import RayConfig
 from nerfloom.base.step_kind import StepKind
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.refinement import PoseRefinement
-from nerfloom.cameras.unseen import unseen_patches
 from nerfloom.cameras.view import View
-from nerfloom.data.pixels import PixelBatch, thinned
+from nerfloom.data.pixels import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.opening import Opening
 from nerfloom.fields.base import Field
@@ -23,54 +23,34 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.kernels.traced_error import PixelTargets, TracedError
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model, evaluating, parts
-from nerfloom.rendering.losses import (
-    density_before,
-    depth_error,
-    depth_roughness,
-    distance_likelihood,
-    matter_before,
-    mean_squared_error,
-    opacity_of_transparent,
-)
 from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.traced import error_of_traced, traced_rays
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.base import Sampler, SkipsCells
 from nerfloom.samplers.in_view import pixels_in_view
-from nerfloom.scene.few_images import FewImagesConfig, unseen_weight
-from nerfloom.scene.motion import MotionConfig
 from nerfloom.scene.shared_space import SharedSpace
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
-PATCH = 8
-"""Rays along the edge of a patch of an unseen view, as in RegNeRF (Niemeyer et al. 2022)."""
-PATCH_IMAGE = 500
-"""Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
-relation to the image."""
-
-PLAIN = "render", "color_error"
-"""Methods that a model must have from here for its loss to be learnt in one call."""
-
-
 class RayModel(Model[RayConfigT], Generic[RayConfigT]):
-    """A model that evaluates a field at the positions of a sampler and composites the values with a renderer.
-
-    Args:
-        config: the method's settings, decided.
-        scene: properties of the scene.
-        field: density and colour.
-        sampler: chooses the positions along each ray.
-        renderer: turns samples into colours and depths.
-    """
+    """A model that evaluates a field at the positions of a sampler and composites the values with a renderer."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
-    coarse_weight: ClassVar[float] = 1.0
-    """Weight of the loss of a coarse level that is supervised too."""
+    losses: ClassVar[Sequence[LossTerm]] = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES)
+    """The objective: terms that are added up, as far as settings and batch have something for them."""
     steps_repeat: ClassVar[bool] = False
-    """True if field, renderer and `loss` depend on the training step by the values of tensors alone, so that steps can
+    """True if field, renderer and losses depend on the training step by the values of tensors alone, so that steps can
     be recorded wherever the sampler's can."""
+    plain: ClassVar[bool] = True
+    """True if rays are rendered by `RayModel.render` as it is here, so that one native call may take its place. A
+    subclass that leaves `render` alone says so: `class M(RayModel, plain=True)`."""
+
+    def __init_subclass__(cls, plain: bool = False, **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        cls.plain = plain
 
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
@@ -93,117 +73,31 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         return self.renderer.render(rays, samples, self.field, background)
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the error of the pixels' colours (`color_error`), that of depths, the sampler's, and `regularizers`.
+        """Return the terms of `losses` on a batch.
 
         Args:
             batch: pixels with their true colours.
             step: number of training steps done.
         """
-        known = self._traced(batch)
+        factors = {term: term.factor(self.config, step) for term in self.losses}
+        terms = [term for term, factor in factors.items() if factor and term.applies(batch, self)]
+        known = self._traced(batch) if terms == [COLOR_ERROR] else None
         if known is not None:
-            return Loss({"rgb": known.error}, known.rgb, known.num_samples)
-        drawn, config = batch, self.config
-        moves = isinstance(config, MotionConfig) and self.scene.moving and batch.alpha is not None
-        if isinstance(config, MotionConfig) and moves and config.transparent_share < 1:
-            batch, kept = thinned(batch, config.transparent_share)
-        per_pixel = batch.rays_per_pixel
-        rendered = self.render(batch.rays, batch.background.repeat_interleave(per_pixel, 0))
-        pixels = rendered.to_pixels(per_pixel)
-        terms = {"rgb": self.color_error(pixels.rgb, batch)}
-        if rendered.coarse is not None:
-            coarse = rendered.coarse.to_pixels(per_pixel)
-            terms["rgb_coarse"] = self.coarse_weight * self.color_error(coarse.rgb, batch)
-        if rendered.samples is not None and rendered.weights is not None:
-            terms |= self.sampler.losses(rendered.samples, rendered.weights)
-        terms |= self._depth_terms(rendered, batch)
-        terms |= self.regularizers(rendered, batch, step)
-        if isinstance(self.config, FewImagesConfig):
-            terms |= self._for_few_images(self.config, rendered, batch, step)
-        if isinstance(config, MotionConfig) and moves and config.empty_loss_mult and batch.alpha is not None:
-            wrong = opacity_of_transparent(pixels.accumulation, batch.alpha, batch.weights)
-            terms["empty"] = config.empty_loss_mult * wrong
-        rgb = pixels.rgb.detach()
-        if batch is not drawn:  # of what was left out it is known that nothing is before the background
-            rgb = drawn.rgb.index_copy(0, kept, rgb.to(drawn.rgb))
-        return Loss(terms, rgb, rendered.num_samples)
+            return Loss({COLOR_ERROR.name: known.error}, known.rgb, known.num_samples)
+        rendered = self.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))
+        shown, values = RenderedBatch(batch, rendered, self, step), dict[str, Tensor]()
+        for term in terms:
+            found, factor = term(shown), factors[term]
+            named = found if isinstance(found, dict) else {} if found is None else {term.name: found}
+            values |= named if factor == 1 else {name: factor * value for name, value in named.items()}
+        return Loss(values, shown.pixels.rgb.detach(), rendered.num_samples)
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:
-        """Return the loss of a batch if it is the error of colours alone and known in one call; None otherwise."""
-        config = self.config
-        own = all(getattr(getattr(self, name), "__func__", None) is getattr(RayModel, name) for name in PLAIN)
-        few = isinstance(config, FewImagesConfig) and (config.occlusion_loss_mult or config.unseen_loss_mult)
-        depths = batch.distances is not None and config.depth_loss_mult > 0
-        others = type(self.sampler).losses is not Sampler.losses or isinstance(config, MotionConfig)
-        others = others or self._has_regularizers() or self.poses is not None
-        if not own or few or depths or others or batch.clear is not None:
+        """Return the mean squared error of a batch's colours, if it is known in one call; None otherwise."""
+        if not self.plain or self.poses is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
-        return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, config.thin_gradients)
-
-    def _depth_terms(self, rendered: Rendered, batch: PixelBatch) -> dict[str, Tensor]:
-        """Return the losses of what is known of distances, of both levels, and of space that is known to be empty."""
-        terms: dict[str, Tensor] = {}
-        for name, level in (("depth", rendered), ("depth_coarse", rendered.coarse)):
-            if self.config.depth_loss_mult > 0 and level is not None:
-                error = depth_loss(level, batch)
-                terms |= {} if error is None else {name: self.config.depth_loss_mult * error}
-        if batch.clear is not None and rendered.samples is not None and rendered.weights is not None:
-            clear = batch.clear.repeat_interleave(batch.rays_per_pixel)
-            matter = matter_before(rendered.weights, rendered.samples, clear)
-            terms["free_space"] = self.config.free_space_loss_mult * matter
-        return terms
-
-    def color_error(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
-        """Return the error () of colours; the mean of squares by default.
-
-        Args:
-            rgb: (R, 3) rendered colours of the batch's pixels.
-            batch: the pixels, with their colours and weights.
-        """
-        return mean_squared_error(rgb, batch.rgb, batch.weights)
-
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        """Return further terms of the loss by name, each a scalar; none by default.
-
-        Args:
-            rendered: the rendered rays of the batch, before they are averaged to pixels.
-            batch: the pixels.
-            step: number of training steps done.
-        """
-        return {}
-
-    @property
-    def regularized(self) -> bool:
-        """Return whether `regularizers` may return terms.
-
-        Of a class that overrides `regularizers` and not this, it is taken to be so.
-        """
-        return False
-
-    def _has_regularizers(self) -> bool:
-        says, returns = (
-            next(base for base in type(self).__mro__ if name in vars(base)) for name in ("regularized", "regularizers")
-        )
-        return self.regularized or not issubclass(says, returns) or "regularizers" in vars(self)
-
-    def _for_few_images(
-        self, config: FewImagesConfig, rendered: Rendered, batch: PixelBatch, step: int
-    ) -> dict[str, Tensor]:
-        """Return the terms of the loss that replace images where there are few (`nerfloom.scene.few_images`)."""
-        losses, poses = dict[str, Tensor](), self.scene.camera_to_worlds
-        if config.occlusion_loss_mult:
-            near = config.occlusion_range * self.scene.near
-            levels = [level.samples for level in (rendered, rendered.coarse) if level is not None]
-            before = [density_before(s, near) for s in levels if s is not None and s.sigma is not None]
-            losses |= {"occlusion": config.occlusion_loss_mult * torch.stack(before).sum()} if before else {}
-        if config.unseen_loss_mult and len(batch) and poses is not None:
-            rays = batch.rays[:: batch.rays_per_pixel][: config.unseen_patches]
-            stride = max(self.scene.image_size / PATCH_IMAGE, 1.0)
-            shown = self.render(unseen_patches(rays, poses, PATCH, stride), batch.background[0])
-            if shown.weights is not None and shown.samples is not None:
-                rough = depth_roughness(shown.weights, shown.samples, PATCH)
-                losses["unseen"] = unseen_weight(config, step) * rough
-        return losses
+        return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, self.config.thin_gradients)
 
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
@@ -268,17 +162,14 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     @property
     def _renders_plainly(self) -> bool:
         """Whether `render` and the renderer are those from here, and rays those of the view."""
-        own = getattr(self.render, "__func__", None) is RayModel.render
-        return own and self.poses is None and type(self.renderer) is VolumeRenderer
+        return self.plain and self.poses is None and type(self.renderer) is VolumeRenderer
 
     def step_kind(self, step: int) -> StepKind:
-        config = self.config
         if not self.steps_repeat:
             return super().step_kind(step)
-        if isinstance(config, MotionConfig) and self.scene.moving and config.transparent_share < 1:
-            return StepKind(varies="transparent pixels are left out at random")
-        if isinstance(config, FewImagesConfig) and config.unseen_loss_mult:
-            return StepKind(varies="the weight of unseen views changes from step to step")
+        for term in self.losses:
+            if (reason := term.varies(self.config)) is not None:
+                return StepKind(varies=reason)
         if not all(opening.complete for opening in parts(self, Opening)):
             return StepKind(varies="levels are still opening")
         return self.sampler.step_kind(step)
@@ -288,9 +179,8 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
     def before_step(self, step: int, progress: float) -> None:
         """Open levels of encodings up to `progress`, and update the sampler for `step`."""
-        if isinstance(self.config, FewImagesConfig) and self.config.open_levels_until:
-            for opening in parts(self, Opening):
-                opening.open(progress / self.config.open_levels_until)
+        for opening in parts(self, Opening):
+            opening.advance(progress)
         self.sampler.update(step, self.field.density)
 
     def density(self, points: Points) -> Tensor:
@@ -311,19 +201,3 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def rays_per_pixel(self) -> int:
         """Number of rays that are averaged for each pixel of an image, as configured."""
         return self.config.rays_per_pixel
-
-
-def depth_loss(rendered: Rendered, batch: PixelBatch) -> Tensor | None:
-    """Return the loss () of the distances that are known of some pixels; None without samples, or if none is known.
-
-    Args:
-        rendered: the rays of the batch.
-        batch: the pixels.
-    """
-    weights, samples = rendered.weights, rendered.samples
-    if batch.distances is None or samples is None or weights is None or not samples.num_rays:
-        return None
-    known = batch.distances.repeat_interleave(batch.rays_per_pixel)
-    if batch.deviations is None:
-        return depth_error(weights, samples, known)
-    return distance_likelihood(weights, samples, known, batch.deviations.repeat_interleave(batch.rays_per_pixel))

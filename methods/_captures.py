@@ -1,20 +1,16 @@
-"""Settings, decisions, poses and the distortion of rays (Barron et al. 2022) that methods for captures share."""
+"""Settings, decisions and refined poses that methods for captures share."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, Literal, TypeVar
 
-from torch import Tensor
-
 from nerfloom import (
     Cameras,
     ConfigError,
     Decision,
     Field,
-    PixelBatch,
     RayModel,
-    Rendered,
     Renderer,
     Sampler,
     Scene,
@@ -23,9 +19,7 @@ from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.refinement import PoseRefinement
-from nerfloom.rendering.losses import normalised_distortion
 from nerfloom.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
-from nerfloom.samplers.proposal import half_edge
 from nerfloom.scene.reasons import MARCHED_REASON, POSE_REASONS
 
 DISTORTION = 2e-3
@@ -129,32 +123,8 @@ def decide_capture(
     return config, made + more + samples + counts * (config.sampler == "proposal")
 
 
-def distortion_term(rendered: Rendered, weight: float, scale: float | None = None) -> dict[str, Tensor]:
-    """Return the distortion of rays as a term of the loss; none without a weight.
-
-    Args:
-        rendered: the rays of a batch.
-        weight: weight of the term.
-        scale: distance from which on disparity is measured, of samples that a grid chose, scene units; if None, those
-            have no distortion.
-    """
-    samples, weights = rendered.samples, rendered.weights
-    if not weight or samples is None or weights is None or not samples.num_rays:
-        return {}
-    if samples.edges is not None:
-        return {"distortion": weight * normalised_distortion(weights, samples)}
-    return {} if scale is None else {"distortion": weight * normalised_distortion(weights, samples, scale)}
-
-
 class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
     """A model whose training poses can be refined.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-        field: density and colour.
-        sampler: chooses the samples along rays.
-        renderer: turns samples into colours and depths.
 
     Raises:
         ConfigError: if poses are to be refined in normalised device coordinates or with another sampler than proposals.
@@ -183,28 +153,3 @@ class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
             cameras: M training cameras with the poses of the data.
         """
         return cameras if self.poses is None else self.poses.refined(cameras)
-
-
-class CaptureModel(RefinedModel[CaptureConfigT], Generic[CaptureConfigT]):
-    """A model whose training poses can be refined, with the distortion loss.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-        field: density and colour.
-        sampler: chooses the samples along rays.
-        renderer: turns samples into colours and depths.
-    """
-
-    def __init__(
-        self, config: CaptureConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
-    ) -> None:
-        super().__init__(config, scene, field, sampler, renderer)
-        self._disparity_from = half_edge(scene.box) if config.contraction else None
-
-    @property
-    def regularized(self) -> bool:
-        return self.config.distortion_loss_mult > 0
-
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        return distortion_term(rendered, self.config.distortion_loss_mult, self._disparity_from)

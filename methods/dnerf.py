@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
 
-from nerfloom import Decision, Field, LearnsMotion, Method, RayModel, Sampler, Scene
+from nerfloom import Decision, Field, Method, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
@@ -19,7 +19,9 @@ from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.kernels.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss, TransparentOpacity
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
+from nerfloom.moving_model import MovingModel
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
 from nerfloom.scene.motion import MotionConfig, slices_choice
 
@@ -103,18 +105,15 @@ class DNeRFConfig(
     If not, that image is one like the others."""
 
 
-class DNeRF(RayModel[DNeRFConfig], LearnsMotion):
+class DNeRF(MovingModel[DNeRFConfig], plain=True):
     """A model of a scene that moves; of a scene without times, the canonical field alone."""
 
+    losses = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES, TransparentOpacity())
     steps_repeat = True
 
 
 def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
-
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
 
     Returns:
         Settings without open ones, and a record of each that was filled in.
@@ -159,12 +158,7 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
 
 
 def make_field(config: DNeRFConfig, scene: Scene) -> Field:
-    """Return a deformed field, one network of position and time, or, if the scene has no times, the canonical field.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return a deformed field, one network of position and time, or, if the scene has no times, the canonical field."""
     faster = OCCUPANCY_RATE if config.sampler == "occupancy" else 1.0
     networks = Optimised("networks", learning_rate=config.learning_rate * faster)
     contracted = contracted_box(config, scene)
@@ -200,12 +194,7 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
 
 
 def sampler(config: DNeRFConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler; the coarse field of hierarchical sampling is built like the fine one.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the configured sampler; the coarse field of hierarchical sampling is built like the fine one."""
     return make_sampler(config, scene, partial(make_field, config, scene))
 
 

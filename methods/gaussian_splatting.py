@@ -24,7 +24,7 @@ from nerfloom.fields.appearance import AFFINE, Appearance, affine_colors
 from nerfloom.kernels.splat_blend import CHANNELS
 from nerfloom.kernels.splat_project import SplatCamera, sort_keys
 from nerfloom.kernels.ssim import photometric_loss
-from nerfloom.rendering.losses import mean_depth_error
+from nerfloom.losses.functions import mean_depth_error
 from nerfloom.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from nerfloom.splats.drawing import draw, splat_camera
 from nerfloom.splats.guide import GUIDE, FoundDistances

@@ -18,6 +18,7 @@ from nerfloom.base.device import relative_speed
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.inverted import InvertedField
+from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.ray_model import RayModel
 from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
@@ -160,10 +161,6 @@ def way_between(seconds: float, first: float, last: float) -> float:
 def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, list[Decision]]:
     """Fill in the settings that depend on the time budget and the scene.
 
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
-
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
@@ -204,20 +201,15 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
 
 
 def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
-    """Return a field of one hash grid and two small networks.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
-    scene, opening = foreground(config, scene), config.open_levels_until > 0
+    """Return a field of one hash grid and two small networks."""
+    scene = foreground(config, scene)
     return EncodedField(
         scene.box,
-        HashGrid.of(config, opening),
+        HashGrid.of(config, config.open_levels_until),
         config.hidden_width,
         direction_levels=4 if config.view_dependence else 0,
         unbounded=contracted_box(config, scene) is not None,
-        opening=opening,
+        opening=config.open_levels_until,
     )
 
 
@@ -228,13 +220,14 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
         config: the method's settings, none left open.
         scene: properties of the data; not used.
     """
-    grid = HashGrid.of(config, config.open_levels_until > 0)
+    grid = HashGrid.of(config, config.open_levels_until)
     return InvertedField(grid, config.hidden_width, 4 if config.view_dependence else 0)
 
 
-class InstantNGP(RayModel[InstantNGPConfig]):
-    """A model whose steps depend on their number by the values of tensors alone, so that a GPU may repeat them."""
+class InstantNGP(RayModel[InstantNGPConfig], plain=True):
+    """A model that learns from colours alone, where no distances are known and samples are not proposed."""
 
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES)
     steps_repeat = True
 
 

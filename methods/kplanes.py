@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from nerfloom import Decision, LearnsMotion, Method, PixelBatch, Points, RayModel, Rendered, Scene
+from nerfloom import Decision, Method, Points, Scene
 from nerfloom.base import device as devices
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
@@ -22,6 +22,9 @@ from nerfloom.kernels.math import truncated_exp
 from nerfloom.kernels.plane_bands import squared_steps
 from nerfloom.kernels.planes_layout import MAX_VERTICES
 from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss, TransparentOpacity
+from nerfloom.moving_model import MovingModel
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
 from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 from nerfloom.scene.motion import MotionConfig, slices_choice, vertices_in_time
@@ -116,36 +119,39 @@ class ExplicitField(BoxField):
         return torch.sigmoid((basis * features[:, None]).sum(-1).float())
 
 
-class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
-    """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
+class PlaneRegularity(LossTerm):
+    """Total variation in space, roughness in time and distance of time planes from one (equations 4 to 6).
 
-    steps_repeat = True
+    Each is a mean over planes, estimated without bias by what a step can afford to read: a random band of rows of each
+    space plane, and one of the time planes, whole. On a GPU all planes of time cost little more than one, and steps
+    that look at all of them can be recorded.
+    """
 
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        zero = rendered.rgb.new_zeros(())
-        # On a GPU all planes of time cost little more than one, and steps that look at all of them can be recorded.
-        turn = int(torch.randint(2**31, ())) if self.scene.moving and not devices.runs_ahead(zero.device) else None
-        variation, roughness, activity = self._regularisers(zero, turn)
-        losses = {"space_tv": self.config.space_tv * variation}
-        if self.scene.moving:
-            losses["time_smoothness"] = self.config.time_smoothness * roughness
-            losses["time_sparsity"] = self.config.time_sparsity * activity
-        return losses
+    def __init__(self) -> None:
+        super().__init__("planes")
 
-    def _regularisers(self, zero: Tensor, turn: int | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return total variation in space, roughness in time and distance of time planes from one (equations 4 to 6).
+    def __call__(self, shown: RenderedBatch) -> dict[str, Tensor]:
+        model, config, zero = shown.model, shown.model.config, shown.rendered.rgb.new_zeros(())
+        assert isinstance(model.field, BoxField)
+        turn = int(torch.randint(2**31, ())) if model.scene.moving and not devices.runs_ahead(zero.device) else None
+        variation, roughness, activity = self.of(model.field, zero, turn)
+        terms = {"space_tv": config.space_tv * variation}
+        if model.scene.moving:
+            terms["time_smoothness"] = config.time_smoothness * roughness
+            terms["time_sparsity"] = config.time_sparsity * activity
+        return terms
 
-        Each is a mean over planes, estimated without bias by what a step can afford to read: a random band of rows of
-        each space plane, and one of the time planes, whole, or all of them.
+    def of(self, field: BoxField, zero: Tensor, turn: int | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return total variation, roughness and distance from one.
 
         Args:
+            field: the field of planes.
             zero: () the result where there are no planes of time.
             turn: number, modulo theirs, of the plane of time; all if not given.
         """
-        assert isinstance(self.field, BoxField)
-        planes = self.field.encoding
+        planes = field.encoding
         assert isinstance(planes, FeaturePlanes)
-        factors = [(scale, index) for scale, group in enumerate(planes.layout.axes) for index in range(len(group))]
+        factors = planes.all_factors
         in_time = [(scale, index) for scale, index in factors if 3 in planes.layout.axes[scale][index]]
         in_space = [factor for factor in factors if factor not in in_time]
         variation = planes.variation(in_space).sum() / (2 * len(factors))
@@ -158,12 +164,15 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion):
         return variation, roughness, torch.stack([(1 - plane).abs().mean() for plane in chosen]).mean()
 
 
+class KPlanes(MovingModel[KPlanesConfig], plain=True):
+    """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
+
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity(), *FEW_IMAGES, TransparentOpacity())
+    steps_repeat = True
+
+
 def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
-
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
 
     Returns:
         Settings without open ones, and a record of each that was filled in.
@@ -199,12 +208,7 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
 
 
 def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
-    """Return a field on feature planes, with the configured decoder.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return a field on feature planes, with the configured decoder."""
     time = (config.time_resolution,) if scene.moving else ()
     size = scene.box[1] - scene.box[0]
     edges = size / size.max()  # vertices are equally far apart along x, y and z
@@ -212,8 +216,8 @@ def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
         tuple(max(round((config.base_resolution << scale) * edge), 2) for edge in edges.tolist()) + time
         for scale in range(config.num_scales)
     )
-    opening = config.open_levels_until > 0
-    planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=config.sparse_updates, opening=opening)
+    sparse, opening = config.sparse_updates, config.open_levels_until
+    planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=sparse, opening=opening)
     kind = EncodedField if config.decoder == "hybrid" else ExplicitField
     return kind(scene.box, planes, config.hidden_width, unbounded=contracted_box(config, scene) is not None)
 

@@ -16,6 +16,7 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.integrated import IntegratedEncoding
 from nerfloom.fields.integrated import IntegratedField
 from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
 
@@ -56,19 +57,15 @@ class MipNeRFConfig(
     """Number of frequencies in the encoding of directions."""
 
 
-class MipNeRF(RayModel[MipNeRFConfig]):
+class MipNeRF(RayModel[MipNeRFConfig], plain=True):
     """A model whose coarse level, the same network on the same rays, counts a tenth (section 3.3)."""
 
-    coarse_weight = 0.1
+    losses = (COLOR_ERROR, CoarseColorError(0.1), SamplerLoss(), *KNOWN_DISTANCES)
     steps_repeat = True
 
 
 def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
-
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
 
     Returns:
         Settings without open ones, and a record of each that was filled in.
@@ -79,12 +76,7 @@ def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Dec
 
 
 def make_field(config: MipNeRFConfig, scene: Scene) -> Field:
-    """Return the network, of NeRF's shape, on the integrated encoding.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the network, of NeRF's shape, on the integrated encoding."""
     encoding = IntegratedEncoding(
         scene.box,
         config.position_frequencies,
@@ -104,12 +96,7 @@ def make_field(config: MipNeRFConfig, scene: Scene) -> Field:
 
 
 def sampler(config: MipNeRFConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler; the coarse level of hierarchical sampling is the field itself.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the configured sampler; the coarse level of hierarchical sampling is the field itself."""
     return make_sampler(config, scene, make_coarse=lambda: None)
 
 

@@ -13,7 +13,7 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from nerfloom import Decision, Field, Method, PixelBatch, Rendered, Sampler, Scene
+from nerfloom import Decision, Field, Method, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import device_kind
@@ -23,17 +23,18 @@ from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
 from nerfloom.fields.sized import SizedDensity, SizedField
 from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.losses.functions import charbonnier
+from nerfloom.losses.term import RenderedBatch
+from nerfloom.losses.terms import KNOWN_DISTANCES, ColorError, Distortion, SamplerLoss
 from nerfloom.methods._captures import (
     MARCHED_SAMPLES,
     PAPER_SAMPLES,
     RefinedConfig,
     RefinedModel,
-    distortion_term,
     refined_sampler_choice,
     refinement_choice,
 )
 from nerfloom.methods._grids import GridsConfig, grid_optimiser
-from nerfloom.rendering.losses import charbonnier
 from nerfloom.samplers.choice import (
     COARSEST_PROPOSAL,
     contracted_box,
@@ -99,30 +100,28 @@ class MipNeRF360Config(
     """Number of frequencies in the encoding of directions (integrated)."""
 
 
-class MipNeRF360(RefinedModel[MipNeRF360Config]):
-    """A model with a smooth absolute error of colours and the distortion of rays, where scenes have no bounds.
+class RobustColorError(ColorError):
+    """Smooth absolute error of colours where scenes have no bounds (section 5); else the mean of squares.
 
-    In a box the error is the mean of squares: absolute errors are least in empty space if most of a picture is
-    background, and from there nothing is learnt any more.
+    In a box absolute errors are least in empty space if most of a picture is background, and from there nothing is
+    learnt any more.
     """
 
+    def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
+        if not shown.model.scene.unbounded:
+            return super().error(rgb, shown)
+        return charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
+
+
+class MipNeRF360(RefinedModel[MipNeRF360Config], plain=True):
+    """A model with a robust error of colours and the distortion of rays."""
+
+    losses = (RobustColorError(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(of_marched=False))
     steps_repeat = True
-
-    def color_error(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
-        if not self.scene.unbounded:
-            return super().color_error(rgb, batch)
-        return charbonnier(rgb, batch.rgb, batch.weights)
-
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        return distortion_term(rendered, self.config.distortion_loss_mult)
 
 
 def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, list[Decision]]:
     """Fill in the settings that depend on the scene and on the machine.
-
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
 
     Returns:
         Settings without open ones, and a record of each that was filled in.
@@ -148,12 +147,7 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
 
 
 def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
-    """Return the network on the integrated encoding, or the hash grid with its networks.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the network on the integrated encoding, or the hash grid with its networks."""
     if config.encoding == "integrated":
         return IntegratedField(
             _encoding(config, scene),
@@ -171,12 +165,7 @@ def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
 
 
 def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
-    """Return the density fields of the proposals: one network for all levels, or a hash grid for each.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the density fields of the proposals: one network for all levels, or a hash grid for each."""
     if config.encoding == "integrated":
         network = IntegratedDensity(_encoding(config, scene), config.proposal_width, config.proposal_layers)
         network.optimised = Optimised(
@@ -203,12 +192,7 @@ def _encoding(config: MipNeRF360Config, scene: Scene) -> IntegratedEncoding:
 
 
 def sampler(config: MipNeRF360Config, scene: Scene) -> Sampler:
-    """Return the configured sampler. The proposal network learns in every step, hash grids less often.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the configured sampler. The proposal network learns in every step, hash grids less often."""
     learn_every = 1 if config.encoding == "integrated" else LEARN_EVERY
     proposals = make_proposals(config, scene) if config.sampler == "proposal" else None
     return make_sampler(config, scene, proposals=proposals, learn_every=learn_every)

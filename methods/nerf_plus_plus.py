@@ -40,10 +40,6 @@ class NeRFPlusPlusConfig(GridsConfig, VanillaNeRFConfig, num_rays_per_batch=1_02
 def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig, list[Decision]]:
     """Fill in the settings that depend on the scene: a sphere, if there may be something outside of its box.
 
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
-
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
@@ -55,12 +51,7 @@ def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig
 
 
 def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
-    """Return the field inside of the sphere, or of all of the scene if there is no sphere.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the field inside of the sphere, or of all of the scene if there is no sphere."""
     if config.encoding == "frequency":
         return vanilla_nerf.make_field(config, scene)
     scene = foreground(config, scene)
@@ -71,12 +62,7 @@ def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
 
 
 def make_background(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
-    """Return the field outside of the sphere, at points of the inverted sphere.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the field outside of the sphere, at points of the inverted sphere."""
     if config.encoding == "frequency":
         return vanilla_nerf.make_background(config, scene)
     field = InvertedField(_grid(config), config.grid_width)
@@ -85,16 +71,11 @@ def make_background(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
 
 
 def _grid(config: NeRFPlusPlusConfig) -> HashGrid:
-    return HashGrid.of(config, opening=config.open_levels_until > 0)
+    return HashGrid.of(config, config.open_levels_until)
 
 
 def sampler(config: NeRFPlusPlusConfig, scene: Scene) -> Sampler:
-    """Return the sampler of the inside; the coarse field of hierarchical sampling is built like the fine one.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the sampler of the inside; the coarse field of hierarchical sampling is built like the fine one."""
     return make_foreground_sampler(config, scene, partial(make_field, config, scene))
 
 

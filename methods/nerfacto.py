@@ -8,11 +8,24 @@ vectors (Martin-Brualla et al. 2021); gradients scaled near cameras (Philip and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
-from nerfloom import Decision, Field, Method, PixelBatch, Points, Rays, Rendered, Renderer, Sampler, Samples, Scene
+from nerfloom import (
+    Decision,
+    Field,
+    Method,
+    PixelBatch,
+    Points,
+    RayModel,
+    Rays,
+    Rendered,
+    Renderer,
+    Sampler,
+    Samples,
+    Scene,
+)
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
@@ -20,7 +33,9 @@ from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
 from nerfloom.kernels.compositing import ray_sum
-from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, Distortion, SamplerLoss
+from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
 from nerfloom.samplers.choice import batch_choice, make_sampler
 from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
@@ -98,9 +113,29 @@ class NormalRenderer(VolumeRenderer):
         return replace(rendered, normals=facing, penalties=penalties)
 
 
-class Nerfacto(CaptureModel[NerfactoConfig]):
+class NormalPenalty(LossTerm):
+    """Penalty on predicted normals, a value a ray that the renderer computes."""
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return model.config.predict_normals
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        penalty = shown.rendered.penalties[self.name]
+        return penalty.mean() if len(penalty) else None
+
+
+class Nerfacto(RefinedModel[NerfactoConfig], plain=True):
     """A model with appearance vectors, refined poses, and the penalties of predicted normals."""
 
+    losses = (
+        COLOR_ERROR,
+        SamplerLoss(),
+        *KNOWN_DISTANCES,
+        Distortion(),
+        NormalPenalty("normals"),
+        NormalPenalty("orientation", "orientation_loss_mult"),
+        *FEW_IMAGES,
+    )
     steps_repeat = True
 
     @property
@@ -108,24 +143,9 @@ class Nerfacto(CaptureModel[NerfactoConfig]):
         """Appearance vectors of the training images; None if there are none."""
         return self.field.appearance if isinstance(self.field, EncodedField) else None
 
-    @property
-    def regularized(self) -> bool:
-        return super().regularized or self.config.predict_normals
-
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        losses = super().regularizers(rendered, batch, step)
-        if len(rendered.rgb):
-            for name, penalty in rendered.penalties.items():
-                losses[name] = (self.config.orientation_loss_mult if name == "orientation" else 1.0) * penalty.mean()
-        return losses
-
 
 def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
-
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
 
     Returns:
         Settings without open ones, and a record of each that was filled in.
@@ -146,13 +166,8 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
 
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
-    """Return a field of one hash grid and two small networks, with appearance vectors if their length is not 0.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
-    opening, size = config.open_levels_until > 0, config.appearance_embedding_dim
+    """Return a field of one hash grid and two small networks, with appearance vectors if their length is not 0."""
+    opening, size = config.open_levels_until, config.appearance_embedding_dim
     return EncodedField(
         scene.box,
         HashGrid.of(config, opening),
@@ -164,22 +179,12 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
 
 
 def sampler(config: NerfactoConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler, over all of space if it is contracted.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the configured sampler, over all of space if it is contracted."""
     return make_sampler(config, replace(scene, unbounded=config.contraction))
 
 
 def renderer(config: NerfactoConfig, scene: Scene) -> Renderer:
-    """Return the renderer, with gradient scaling and predicted normals as configured.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the renderer, with gradient scaling and predicted normals as configured."""
     if not config.predict_normals:
         return volume_renderer(config, scene)
     normals = NormalHead(NUM_FEATURES, config.hidden_width)

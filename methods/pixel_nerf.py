@@ -221,10 +221,6 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
 def make_field(config: PixelNeRFConfig, scene: Scene) -> PixelAlignedField:
     """Return the conditioned network, which serves as its own coarse level.
 
-    Args:
-        config: the method's settings.
-        scene: properties of the data.
-
     Raises:
         ConfigError: if rays are in normalised device coordinates, where images cannot be looked up.
     """
@@ -236,12 +232,7 @@ def make_field(config: PixelNeRFConfig, scene: Scene) -> PixelAlignedField:
 
 
 def sampler(config: PixelNeRFConfig, scene: Scene) -> Sampler:
-    """Return hierarchical sampling, whose coarse level is the field itself.
-
-    Args:
-        config: the method's settings.
-        scene: properties of the data.
-    """
+    """Return hierarchical sampling, whose coarse level is the field itself."""
     return HierarchicalSampler(None, config.num_coarse_samples, config.num_fine_samples)
 
 

@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from nerfloom import Decision, Field, Method, PixelBatch, RayModel, Rendered, Renderer, Sampler, Scene
+from nerfloom import Decision, Field, Method, RayModel, Renderer, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue
@@ -22,6 +22,8 @@ from nerfloom.fields.tensor import CP, VM, TensorField
 from nerfloom.geometry.bounds import box_around_cells, cubic_vertices
 from nerfloom.kernels.memory import require
 from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
 from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
@@ -89,7 +91,32 @@ class TensoRFConfig(
     """Whether Adam updates only the table entries that a step used."""
 
 
-class TensoRF(RayModel[TensoRFConfig]):
+class Sparsity(LossTerm):
+    """Mean magnitude of the factors of density (section 4.4), which counts half from the first growth on."""
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        model = shown.model
+        assert isinstance(model, TensoRF)
+        factors, share = model.factors.density_factors, 0.5 if model.has_grown else 1.0
+        bands = factors.bands(factors.all_factors)
+        return share * torch.stack([band.abs().mean() for band in bands]).sum()
+
+
+class TotalVariation(LossTerm):
+    """Total variation of the factors (section 4.4); those of appearance count a tenth."""
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        field = shown.model.field
+        assert isinstance(field, TensorField)
+        both = field.density_factors, field.appearance_factors
+        density, appearance = (factors.variation(factors.all_factors).sum() for factors in both)
+        return density + 0.1 * appearance
+
+
+REGULARISERS = Sparsity("sparsity", "sparsity"), TotalVariation("total_variation", "total_variation")
+
+
+class TensoRF(RayModel[TensoRFConfig], plain=True):
     """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
 
     Args:
@@ -102,12 +129,18 @@ class TensoRF(RayModel[TensoRFConfig]):
 
     growths: Tensor
     """Number of times that the grid has grown."""
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *REGULARISERS, *FEW_IMAGES)
     steps_repeat = True
 
     def __init__(self, config: TensoRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene, field, sampler, renderer)
         self.register_buffer("growths", torch.zeros((), dtype=torch.int64))
         self._growths = HostValue()
+
+    @property
+    def has_grown(self) -> bool:
+        """True if the grid has grown."""
+        return self._growths.of(self.growths) > 0
 
     @property
     def factors(self) -> TensorField:
@@ -158,32 +191,9 @@ class TensoRF(RayModel[TensoRFConfig]):
         around = box_around_cells(cells, sampler.box, MARGIN)
         return box.clone() if around is None else torch.stack([around[0].maximum(box[0]), around[1].minimum(box[1])])
 
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        losses, field = dict[str, Tensor](), self.factors
-        if self.config.sparsity:
-            weight = self.config.sparsity * (0.5 if self._growths.of(self.growths) else 1.0)
-            bands = field.density_factors.bands(_all_factors(field.density_factors))
-            losses["sparsity"] = weight * torch.stack([band.abs().mean() for band in bands]).sum()
-        if self.config.total_variation:
-            density, appearance = (
-                factors.variation(_all_factors(factors)).sum()
-                for factors in (field.density_factors, field.appearance_factors)
-            )
-            losses["total_variation"] = self.config.total_variation * (density + 0.1 * appearance)
-        return losses
-
-
-def _all_factors(factors: FeaturePlanes) -> list[tuple[int, int]]:
-    """Return the group, and the index in the group, of every factor."""
-    return [(group, index) for group, along in enumerate(factors.layout.axes) for index in range(len(along))]
-
 
 def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Decision]]:
     """Fill in the settings that depend on the scene and on the resolution of the images.
-
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
 
     Returns:
         Settings without open ones, and a record of each that was filled in.
@@ -208,10 +218,6 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
 
 def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     """Return the field with its first, coarsest factors.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
 
     Raises:
         ConfigError: if the last grid needs more memory than the machine has.

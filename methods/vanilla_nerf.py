@@ -19,6 +19,7 @@ from nerfloom.base.config import Range
 from nerfloom.base.optimised import Optimised
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples
@@ -71,10 +72,6 @@ class VanillaNeRFConfig(
 def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
 
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
-
     Returns:
         Settings without open ones, and a record of each that was filled in.
     """
@@ -85,12 +82,7 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
 
 
 def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
-    """Return the network of the fine field; the coarse one has the same shape.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the network of the fine field; the coarse one has the same shape."""
     return _network(config, contracted=contracted_box(config, foreground(config, scene)))
 
 
@@ -112,7 +104,7 @@ def _network(config: VanillaNeRFConfig, contracted: Tensor | None = None, dims: 
         position_frequencies=config.position_frequencies,
         direction_frequencies=config.direction_frequencies,
         contracted=contracted,
-        opening=config.open_levels_until > 0,
+        opening=config.open_levels_until,
         dims=dims,
     )
     if config.sampler == "occupancy":
@@ -121,18 +113,14 @@ def _network(config: VanillaNeRFConfig, contracted: Tensor | None = None, dims: 
 
 
 def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler; the coarse field of hierarchical sampling is built like the fine one.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-    """
+    """Return the configured sampler; the coarse field of hierarchical sampling is built like the fine one."""
     return make_foreground_sampler(config, scene, partial(make_field, config, scene))
 
 
-class VanillaNeRF(RayModel[VanillaNeRFConfig]):
-    """A model whose steps depend on their number by the values of tensors alone, so that a GPU may repeat them."""
+class VanillaNeRF(RayModel[VanillaNeRFConfig], plain=True):
+    """A model whose coarse and fine colours are compared with the images (section 5.3)."""
 
+    losses = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES)
     steps_repeat = True
 
 

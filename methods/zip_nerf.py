@@ -25,7 +25,8 @@ from nerfloom.fields.appearance import AFFINE, Appearance, exposed
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
 from nerfloom.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, CaptureModel, decide_capture
+from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, SamplerLoss
+from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.scene.reasons import LIGHT_REASONS
@@ -97,17 +98,10 @@ class ZipNeRFConfig(
             )
 
 
-class ZipNeRF(CaptureModel[ZipNeRFConfig]):
-    """A model with exposures of images, refined poses and the distortion loss.
+class ZipNeRF(RefinedModel[ZipNeRFConfig]):
+    """A model with exposures of images, refined poses and the distortion loss."""
 
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the data.
-        field: density and colour.
-        sampler: chooses the samples along rays.
-        renderer: turns samples into colours and depths.
-    """
-
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, Distortion())
     steps_repeat = True
 
     def __init__(self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:

@@ -41,6 +41,7 @@ from nerfloom import (
 from nerfloom.base.optimised import ParameterGroup
 from nerfloom.base.registry import load_method, registered
 from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.tools.testing import assert_method, check_method
 from nerfloom.tools.testing.check import CHECKS, Check
@@ -463,11 +464,15 @@ class Fog(VolumeRenderer):
         return dataclasses.replace(rendered, accumulation=(1 + rendered.accumulation) / 2)
 
 
-class RaysForPixels(RayModel[TinyConfig]):
+class RayError(LossTerm):
     """Compares what rays show with what their pixels do."""
 
-    def regularizers(self, rendered: Rendered, batch: PixelBatch, step: int) -> dict[str, Tensor]:
-        return {"again": (rendered.rgb - batch.rgb).square().mean()}
+    def __call__(self, shown: RenderedBatch) -> Tensor:
+        return (shown.rendered.rgb - shown.batch.rgb).square().mean()
+
+
+class RaysForPixels(RayModel[TinyConfig]):
+    losses = (*RayModel.losses, RayError("again"))
 
 
 class Float32Field(TinyField):

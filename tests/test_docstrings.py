@@ -98,11 +98,13 @@ def _arguments(node: Definition) -> tuple[list[str], set[str]]:
     if not isinstance(node, ast.ClassDef):
         spec = node.args
         given = [*spec.posonlyargs, *spec.args, *spec.kwonlyargs, *filter(None, (spec.vararg, spec.kwarg))]
-        return [item.arg for item in given if not item.arg.startswith("_") and item.arg not in ("self", "cls")], set()
+        names = [item.arg for item in given if not item.arg.startswith("_") and item.arg not in ("self", "cls")]
+        return names, {item.arg for item in given if _said_by_type(item)}
     init = next((item for item in node.body if getattr(item, "name", None) == "__init__"), None)
     if init is not None:
         text = ast.get_docstring(init) or ""
-        return _arguments(init)[0], {*_entries(text, "Args"), *_in_backticks(text)}
+        names, said = _arguments(init)
+        return names, {*said, *_entries(text, "Args"), *_in_backticks(text)}
     if not _decorated(node, "dataclass") and "NamedTuple" not in map(ast.unparse, node.bases):
         return [], set()
     names, described = [], set()
@@ -112,6 +114,12 @@ def _arguments(node: Definition) -> tuple[list[str], set[str]]:
             if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
                 described.add(ast.unparse(item.target))
     return names, described
+
+
+def _said_by_type(argument: ast.arg) -> bool:
+    """Whether an argument is called like its type, such as `scene: Scene` and the settings `config: NerfactoConfig`."""
+    kind = "" if argument.annotation is None else ast.unparse(argument.annotation).split("[")[0].split(".")[-1]
+    return kind.lower() == argument.arg or (argument.arg == "config" and kind.removesuffix("T").endswith("Config"))
 
 
 def _in_backticks(text: str) -> set[str]:

@@ -10,7 +10,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.error_map import EVENLY, ErrorMap
 from nerfloom.data.pixels import draw_batch
 from nerfloom.data.scene import Scene
-from nerfloom.rendering.losses import mean_squared_error
+from nerfloom.losses.functions import mean_squared_error
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from nerfloom.data.sources import PixelSource, Request, make_source
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing import weights_and_transmittance
-from nerfloom.rendering.losses import WRONG, matter_before
+from nerfloom.losses.functions import WRONG, matter_before
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run
 

@@ -10,9 +10,9 @@ from nerfloom.base.machine_config import MachineConfig
 from nerfloom.data.scene import Scene
 from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
 from nerfloom.fields.sized import SizedDensity, SizedField
+from nerfloom.losses.functions import charbonnier, mean_squared_error, normalised_distortion
 from nerfloom.methods import mip_nerf, mip_nerf_360
 from nerfloom.ray_model import RayModel
-from nerfloom.rendering.losses import charbonnier, mean_squared_error, normalised_distortion
 from nerfloom.samplers.hierarchical import HierarchicalSampler
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.proposal import ProposalSampler

@@ -17,7 +17,7 @@ from nerfloom.data.tracks import Sightings
 from nerfloom.evaluation.evaluator import floaters
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing import weights_and_transmittance
-from nerfloom.rendering.losses import WRONG, distance_likelihood
+from nerfloom.losses.functions import WRONG, distance_likelihood
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_run

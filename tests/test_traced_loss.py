@@ -7,10 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.data.pixels import PixelBatch
+from nerfloom import ray_model
 from nerfloom.kernels.native import available
 from nerfloom.kernels.traced_error import TracedError
-from nerfloom.ray_model import RayModel
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import ColorError
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_trainer
 
@@ -19,10 +20,19 @@ def losses(trainer: Trainer, steps: int = 4) -> list[float]:
     return [trainer.train_step().losses["rgb"] for _ in range(steps)]
 
 
-def traced(trainer: Trainer) -> TracedError | None:
-    """What the trainer's model learns of its next batch in one call; None if in several."""
-    trainer.prepare()
-    return trainer.model._traced(trainer.source.draw(trainer._request()))
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[TracedError | None]:
+    """What was learnt in one call, or None where a part does not fit, of each step that asked for it."""
+    found, usual = [], ray_model.error_of_traced
+    monkeypatch.setattr(ray_model, "error_of_traced", lambda *a: found.append(usual(*a)) or found[-1])
+    return found
+
+
+def traced(trainer: Trainer, calls: list[TracedError | None]) -> bool:
+    """Whether a step of the trainer is learnt in one call."""
+    calls.clear()
+    trainer.train_step()
+    return any(call is not None for call in calls)
 
 
 @pytest.mark.parametrize("rays_per_pixel", [1, 4])
@@ -33,7 +43,7 @@ def test_steps_are_those_of_single_operations(
     together = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "a", **settings)
     assert together.model.field.grid_color() is not None
     found = losses(together)
-    monkeypatch.setattr(RayModel, "_traced", lambda self, batch: None)
+    monkeypatch.setattr(ray_model, "error_of_traced", lambda *_: None)
     apart = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "b", **settings)
     assert found == pytest.approx(losses(apart), rel=2e-3 if available() else 1e-5)
 
@@ -51,24 +61,18 @@ def test_steps_are_those_of_single_operations(
     ids=str,
 )
 def test_other_losses_and_fields_are_not_left_out(
-    shared_tiny: Path, tmp_path: Path, settings: dict[str, object], monkeypatch: pytest.MonkeyPatch
+    shared_tiny: Path, tmp_path: Path, settings: dict[str, object], calls: list[TracedError | None]
 ) -> None:
     """What the one call does not know is computed by single operations."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "b", **settings)
-    seen, usual = [], RayModel._traced
-
-    def watched(self: RayModel, batch: PixelBatch) -> TracedError | None:
-        seen.append((batch, usual(self, batch)))
-        return seen[-1][1]
-
-    monkeypatch.setattr(RayModel, "_traced", watched)
-    trainer.train_step()
-    (batch, found), *_ = seen
-    if "depth_loss_mult" in settings:  # without known distances there is no such loss
-        assert found is not None
-        batch = dataclasses.replace(batch, distances=torch.ones(len(batch)))
-        found = usual(trainer.model, batch)
-    assert found is None
+    known = "depth_loss_mult" in settings  # without known distances there is no such loss
+    assert traced(trainer, calls) == known
+    if known:
+        batch = trainer.source.draw(trainer._request())
+        calls.clear()
+        loss = trainer.model.loss(dataclasses.replace(batch, distances=torch.ones(len(batch))), 0)
+        assert set(loss.terms) == {"rgb", "depth"}
+        assert not calls
 
 
 @pytest.mark.parametrize("method", ["instant-ngp", "kplanes", "nerfacto"])
@@ -88,27 +92,41 @@ def test_thinned_steps_learn_as_well(method: str, shared_tiny: Path, tmp_path: P
     ids=str,
 )
 def test_nerfacto_in_a_box_learns_in_one_call_if_it_adds_nothing(
-    shared_tiny: Path, tmp_path: Path, settings: dict[str, object], together: bool
+    shared_tiny: Path, tmp_path: Path, settings: dict[str, object], together: bool, calls: list[TracedError | None]
 ) -> None:
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path, sampler="occupancy", samples_per_batch=4096, **settings)
-    found = traced(trainer)
-    assert (found is not None) == together
+    assert traced(trainer, calls) == together
 
 
-def test_terms_of_a_class_of_ones_own_are_not_left_out(shared_tiny: Path, tmp_path: Path) -> None:
-    """Neither with the answer of the class that it derives from, nor if they are given to one model alone."""
+class Smallness(LossTerm):
+    """Mean square of the first parameter."""
+
+    def __call__(self, shown: RenderedBatch) -> Tensor:
+        return next(shown.model.field.parameters()).square().mean()
+
+
+def test_a_class_of_ones_own_says_that_its_colours_are_the_usual_ones(
+    shared_tiny: Path, tmp_path: Path, calls: list[TracedError | None]
+) -> None:
+    """What it does not say is not taken from the class that it derives from."""
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path, sampler="occupancy", samples_per_batch=4096)
     model, kind = trainer.model, type(trainer.model)
+    assert traced(trainer, calls)
 
-    def regularizers(*_: object) -> dict[str, Tensor]:
-        return {"own": next(model.field.parameters()).square().mean()}
+    class Silent(kind):
+        pass
 
-    assert traced(trainer) is not None
-    model.__class__ = type("Own", (kind,), {"regularizers": regularizers})
-    assert traced(trainer) is None
-    assert "own" in trainer.train_step().losses
-    model.__class__ = type("Silent", (kind,), {"regularizers": regularizers, "regularized": False})
-    assert traced(trainer) is not None
-    model.__class__ = kind
-    model.regularizers = regularizers
-    assert traced(trainer) is None
+    class Says(kind, plain=True):
+        pass
+
+    class Adds(kind, plain=True):
+        losses = (*kind.losses, Smallness("own"))
+
+    class Weighs(kind, plain=True):
+        losses = (ColorError(weight=2.0),)
+
+    for made, together in ((Silent, False), (Says, True), (Adds, False), (Weighs, False)):
+        model.__class__ = made
+        assert traced(trainer, calls) == together, made
+    model.__class__ = Adds
+    assert set(trainer.train_step().losses) == {"rgb", "own"}

@@ -58,11 +58,7 @@ def is_open(value: Any) -> bool:
 
 
 def left_open(config: TrainConfig) -> list[str]:
-    """Return the names of the settings that are still left to the data: None of an `Auto` setting, or "auto".
-
-    Args:
-        config: the method's settings.
-    """
+    """Return the names of the settings that are still left to the data: None of an `Auto` setting, or "auto"."""
     kinds = get_type_hints(type(config), include_extras=True)
     return [name for name, kind in kinds.items() if _may_be_open(name, kind) and is_open(getattr(config, name))]
 

@@ -56,7 +56,7 @@ class HashGrid(nn.Module):
         log2_table_size: maximum number of entries of one level, as a power of two.
         sparse: whether the optimiser updates only the entries that a step has used. The compiled kernels then keep the
             gradient of the table in `deferred` for the optimiser, and `table.grad` stays None.
-        opening: whether levels open one after the other (`Opening`), rather than all being open.
+        opening: share of the training budget in which levels open one after the other (`Opening`); 0 if all are open.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.
@@ -72,7 +72,7 @@ class HashGrid(nn.Module):
         max_resolution: int = 2048,
         log2_table_size: int = 19,
         sparse: bool = False,
-        opening: bool = False,
+        opening: float = 0.0,
     ) -> None:
         super().__init__()
         self.layout = HashGridLayout.build(num_levels, base_resolution, max_resolution, log2_table_size)
@@ -80,11 +80,11 @@ class HashGrid(nn.Module):
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = TableGradient(LOOK_UP, self.layout) if sparse else None
-        self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels)) if opening else None
+        self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels), opening) if opening else None
         self.num_features = num_levels * features_per_level
 
     @classmethod
-    def of(cls, config: HashGridConfig, opening: bool = False) -> HashGrid:
+    def of(cls, config: HashGridConfig, opening: float = 0.0) -> HashGrid:
         """Return a grid with the sizes of `config`, decided; `opening` is as in the constructor."""
         sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
         return HashGrid(*sizes, config.log2_table_size, config.sparse_updates, opening)

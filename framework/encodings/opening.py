@@ -43,19 +43,21 @@ class Opening(nn.Module):
     Args:
         num_levels: number of levels.
         first: number of levels that are open at the start.
+        until: share of the training budget in which all levels open.
     """
 
     opened: Tensor
 
-    def __init__(self, num_levels: int, first: int) -> None:
+    def __init__(self, num_levels: int, first: int, until: float = 1.0) -> None:
         super().__init__()
-        self.num_levels, self.first = num_levels, first
+        self.num_levels, self.first, self.until = num_levels, first, until
         self.register_buffer("opened", tensor(opened_levels(num_levels, first, 0.0)))
         self._opened = HostValue()
 
-    def open(self, progress: float) -> None:
-        """Open levels up to `progress`, a fraction of the time in which they open."""
-        opened = round(opened_levels(self.num_levels, self.first, progress) * STEPS_PER_LEVEL) / STEPS_PER_LEVEL
+    def advance(self, progress: float) -> None:
+        """Open the levels that are to be open at `progress`, the fraction of the training budget that is spent."""
+        share = progress / self.until
+        opened = round(opened_levels(self.num_levels, self.first, share) * STEPS_PER_LEVEL) / STEPS_PER_LEVEL
         if opened != self._opened.of(self.opened):
             self._opened.change(self.opened, opened)
 

@@ -29,7 +29,8 @@ class FeaturePlanes(nn.Module):
         axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
         sparse: whether the optimiser updates only the entries that a step has used, as for `HashGrid`.
         resizable: whether `resample` may be called, so that a checkpoint may have other resolutions.
-        opening: whether groups open one after the other (`Opening`), for groups that are scales from coarse to fine.
+        opening: share of the training budget in which groups open one after the other (`Opening`), for groups that are
+            scales from coarse to fine; 0 if all are open.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.
@@ -44,7 +45,7 @@ class FeaturePlanes(nn.Module):
         axes: tuple[tuple[tuple[int, ...], ...], ...] | None = None,
         sparse: bool = False,
         resizable: bool = False,
-        opening: bool = False,
+        opening: float = 0.0,
     ) -> None:
         super().__init__()
         self.resizable = resizable
@@ -60,7 +61,7 @@ class FeaturePlanes(nn.Module):
                         self.layout.factor(self.table, group, index).fill_(1)
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = PlanesGradient(self.layout) if sparse else None
-        self.opening = Opening(self.layout.num_groups, 1) if opening else None
+        self.opening = Opening(self.layout.num_groups, 1, opening) if opening else None
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, G * F) at `positions` (N, D) in [0, 1]."""
@@ -74,6 +75,11 @@ class FeaturePlanes(nn.Module):
         if self.deferred is not None:
             self.deferred.layout = layout
         return planes(positions, table, layout, self.deferred)
+
+    @property
+    def all_factors(self) -> list[tuple[int, int]]:
+        """The group, and the index in the group, of every factor."""
+        return [(group, index) for group, along in enumerate(self.layout.axes) for index in range(len(along))]
 
     def bands(self, factors: Sequence[tuple[int, int]], whole: Container[int] = ()) -> list[Tensor]:
         """Return a random band of consecutive rows of each of several factors, for regularisers.

@@ -18,9 +18,9 @@ from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels import gather_batch
 from nerfloom.fields.appearance import Appearance
+from nerfloom.losses.functions import mean_squared_error
 from nerfloom.model import HasAppearance, Model, evaluating
 from nerfloom.ray_model import RayModel
-from nerfloom.rendering.losses import mean_squared_error
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Steps of Adam, pixels per step, and learning rate, with which an appearance vector is fitted."""

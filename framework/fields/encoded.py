@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -69,13 +66,10 @@ class BoxField(Field):
             unit = torch.cat([unit, times[:, None].to(unit)], dim=-1)
         return self.encoding(unit)
 
-    def _grid_density(self, density: Callable[..., Any], network: MLP) -> GridDensity | None:
-        """Return the density of `network` on the encoding; None unless `density` and what it calls are its own."""
-        grid, own = self.encoding, (density, BoxField.encode, BoxField.unit)
-        plain = (type(self).density, type(self).encode, type(self).unit) == own
-        plain = plain and not {"density", "encode", "unit"} & vars(self).keys()
-        hooked = any(m._forward_hooks or m._forward_pre_hooks for m in (network, grid))
-        if not plain or hooked or type(grid) is not HashGrid or type(network) is not MLP:
+    def _grid_density(self, network: MLP) -> GridDensity | None:
+        """Return the density of `network` on the encoding; None if it is of another kind than the kernels know."""
+        grid = self.encoding
+        if type(grid) is not HashGrid or type(network) is not MLP:
             return None
         if network.bias or network.activation != "none":
             return None
@@ -111,8 +105,8 @@ class DensityField(BoxField):
         return self.head.density(features)[0], features
 
     def grid_density(self) -> GridDensity | None:
-        """Return the density as `proposal_weights` computes it; None if this field's is another."""
-        return self._grid_density(DensityField.density, self.head)
+        """Return the density as `proposal_weights` computes it; None of a subclass, whose density may be another."""
+        return self._grid_density(self.head) if type(self) is DensityField else None
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         raise NotImplementedError("a density field has no colours")
@@ -131,7 +125,8 @@ class EncodedField(BoxField):
             do not depend on it.
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: the images' appearance vectors, which the colour network reads; None for none.
-        opening: whether the bands of the viewing direction open one after the other (`Opening`).
+        opening: share of the training budget in which the bands of the viewing direction open one after the other
+            (`Opening`); 0 if all are open.
         ambient: number of coordinates beyond those of space (`Points.ambient`) that the density network reads.
     """
 
@@ -144,14 +139,14 @@ class EncodedField(BoxField):
         direction_levels: int = 4,
         unbounded: bool = False,
         appearance: Appearance | None = None,
-        opening: bool = False,
+        opening: float = 0.0,
         ambient: int = 0,
     ) -> None:
         super().__init__(box, encoding, unbounded)
         self.direction_levels, self.num_features = direction_levels, num_features
         self.density_head = MLP(encoding.num_features + ambient, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
-        self.direction_opening = Opening(direction_levels, 1) if opening and direction_levels else None
+        self.direction_opening = Opening(direction_levels, 1, opening) if opening and direction_levels else None
         self.appearance = appearance
         inputs += 0 if appearance is None else appearance.size
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
@@ -163,25 +158,19 @@ class EncodedField(BoxField):
         return self.density_head.density(encoded, points.ambient.to(encoded.dtype))
 
     def grid_density(self) -> GridDensity | None:
-        """Return the density as `trace` computes it; None if this field's is another."""
-        return self._grid_density(EncodedField.density, self.density_head)
+        """Return the density as `trace` computes it; None of a subclass, whose density may be another."""
+        return self._grid_density(self.density_head) if type(self) is EncodedField else None
 
     def grid_color(self) -> GridColor | None:
-        """Return the colour as `traced_colors` computes it; None if this field's is another."""
+        """Return the colour as `traced_colors` computes it; None of a subclass, whose colour may be another."""
         head, opening = self.color_head, self.direction_opening
-        plain = type(self).color is EncodedField.color and "color" not in vars(self) and self.appearance is None
-        if not plain or type(head) is not MLP or head._forward_hooks or head._forward_pre_hooks:
+        if type(self) is not EncodedField or self.appearance is not None or type(head) is not MLP:
             return None
         if opening is not None and not opening.complete:
             return None
         weights = _weights(head)
         fits = (weights[0].shape[1], weights[-1].shape[0]) == (self.num_features + self.direction_levels**2, 3)
-        if (
-            head.bias
-            or head.activation != "sigmoid"
-            or not fits
-            or type(self)._harmonics is not EncodedField._harmonics
-        ):
+        if head.bias or head.activation != "sigmoid" or not fits:
             return None
         return GridColor(self.direction_levels, weights)
 

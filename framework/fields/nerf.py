@@ -27,7 +27,8 @@ class NeRFField(Field):
             al. 2021, section 4); None for a field that does not change with time.
         contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
             are made for; None to encode scene coordinates.
-        opening: whether the frequencies of positions and directions open one after the other (`Opening`).
+        opening: share of the training budget in which the frequencies of positions and directions open one after the
+            other (`Opening`); 0 if all are open.
         dims: numbers of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al. 2020).
     """
 
@@ -43,7 +44,7 @@ class NeRFField(Field):
         direction_frequencies: int = 4,
         time_frequencies: int | None = None,
         contracted: Tensor | None = None,
-        opening: bool = False,
+        opening: float = 0.0,
         dims: int = 3,
     ) -> None:
         super().__init__()
@@ -51,8 +52,8 @@ class NeRFField(Field):
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies
         self.time_frequencies = time_frequencies
-        self.opening = Opening(position_frequencies, 0) if opening else None
-        self.direction_opening = Opening(direction_frequencies, 0) if opening else None
+        self.opening = Opening(position_frequencies, 0, opening) if opening else None
+        self.direction_opening = Opening(direction_frequencies, 0, opening) if opening else None
         encoded = dims * (1 + 2 * position_frequencies) + (0 if time_frequencies is None else 1 + 2 * time_frequencies)
         self.before_skip = MLP(encoded, *[width] * skip, activation="relu")
         self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")

@@ -77,8 +77,7 @@ def _plain(
     """Return the field's density and colour, if it has such, and sampler and renderer are the plain ones."""
     if type(sampler) is not OccupancySampler or sampler.endless or not len(rays):
         return None
-    changed = vars(sampler).keys() & {"sample"} | vars(renderer).keys() & {"render", "shade"}
-    if type(renderer) is not VolumeRenderer or changed or not isinstance(field, HasGridColor):
+    if type(renderer) is not VolumeRenderer or not isinstance(field, HasGridColor):
         return None
     density, color = field.grid_density(), field.grid_color()
     return None if density is None or color is None else (density, color)

@@ -65,22 +65,12 @@ class VolumeRenderer(Renderer):
 
 
 def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
-    """Return the renderer of most methods, with gradients scaled near cameras and thinned as the settings say.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the scene.
-    """
+    """Return the renderer of most methods, with gradients scaled near cameras and thinned as the settings say."""
     return VolumeRenderer(scaled_up_to(config, scene), config.thin_gradients)
 
 
 def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
-    """Return the distance from cameras up to which gradients are scaled, scene units; None if they are not.
-
-    Args:
-        config: the method's settings, none left open.
-        scene: properties of the scene.
-    """
+    """Return the distance from cameras up to which gradients are scaled, scene units; None if they are not."""
     return half_edge(scene.box) if config.gradient_scaling else None
 
 

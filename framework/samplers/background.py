@@ -84,10 +84,6 @@ def foreground(config: BackgroundConfig, scene: Scene) -> Scene:
     """Return the scene as the method's own field and sampler see it: without what the background shows.
 
     Inside of a sphere the box is the cube around the sphere.
-
-    Args:
-        config: the settings, with the background decided.
-        scene: properties of the scene.
     """
     if config.background_model == "sphere":
         sphere = foreground_sphere(scene)
@@ -101,9 +97,6 @@ def foreground_sphere(scene: Scene) -> Tensor:
 
     It is around the centre of the box, and contains the box's inscribed ellipsoid and, with a margin, all training
     cameras: as in NeRF++, where cameras look out of the sphere and never into it. Without cameras it contains the box.
-
-    Args:
-        scene: properties of the scene.
     """
     centre, half = scene.box.mean(0), (scene.box[1] - scene.box[0]) / 2
     if scene.camera_to_worlds is None:

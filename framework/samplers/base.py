@@ -24,6 +24,10 @@ class Sampler(nn.Module, ABC):
     """Optimiser settings of its parameters; those of the model if None."""
     samples_per_step: int | None = None
     """Number of samples per training step, to which the number of rays is adapted; None for a fixed number of rays."""
+    has_coarse_level: bool = False
+    """Whether its samples come with a coarse level, which is rendered and supervised too (`Samples.coarse`)."""
+    learns_from_weights: bool = False
+    """Whether it learns by a `loss` of its own, which the method's objective has as `SamplerLoss`."""
 
     @abstractmethod
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
@@ -55,14 +59,14 @@ class Sampler(nn.Module, ABC):
     def read_counts(self) -> None:
         """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
 
-    def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
-        """Return the losses that train the sampler itself, by name, each a scalar.
+    def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
+        """Return the loss () that trains the sampler itself; None in steps in which it does not learn.
 
         Args:
             samples: N samples that the sampler returned for a batch.
             weights: (N,) weights of these samples when rendered.
         """
-        return {}
+        return None
 
 
 @runtime_checkable

@@ -130,10 +130,6 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
 def decide_sampler(config: SamplingConfigT, scene: Scene) -> tuple[SamplingConfigT, list[Decision]]:
     """Decide `--sampler auto` by the scene: `Method.decide` of a method that leaves no other setting open.
 
-    Args:
-        config: the method's settings.
-        scene: properties of the scene.
-
     Returns:
         the settings, and the decisions that were made.
     """
@@ -204,12 +200,7 @@ def _seconds(config: SamplingConfig) -> float:
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
-    """Return the box (2, 3) around which a method's field contracts all of space; None if the field ends at the box.
-
-    Args:
-        config: the settings, decided.
-        scene: properties of the scene.
-    """
+    """Return the box (2, 3) around which a method's field contracts all of space; None if the field ends at the box."""
     return scene.box if scene.unbounded and config.sampler in ("occupancy", "proposal") else None
 
 

@@ -41,6 +41,8 @@ class HierarchicalSampler(Sampler):
         ValueError: if there are fewer than 3 stratified samples, which leave no weights between first and last.
     """
 
+    has_coarse_level = True
+
     def __init__(self, coarse: Field | None, num_coarse: int = 64, num_fine: int = 128) -> None:
         super().__init__()
         if num_coarse < LEAST_COARSE:

@@ -31,6 +31,7 @@ class InsideSphere(Sampler):
     def __init__(self, sampler: Sampler, sphere: Tensor) -> None:
         super().__init__()
         self.sampler, self.samples_per_step = sampler, sampler.samples_per_step
+        self.has_coarse_level, self.learns_from_weights = sampler.has_coarse_level, sampler.learns_from_weights
         self.register_buffer("sphere", sphere.clone())
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
@@ -53,8 +54,8 @@ class InsideSphere(Sampler):
     def read_counts(self) -> None:
         self.sampler.read_counts()
 
-    def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
-        return self.sampler.losses(samples, weights)
+    def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
+        return self.sampler.loss(samples, weights)
 
 
 def make_foreground_sampler(

@@ -69,6 +69,7 @@ class ProposalSampler(Sampler):
     """
 
     box: Tensor
+    learns_from_weights = True
     optimised = Optimised("proposals", learning_rate=1e-2, betas=(0.9, 0.99), eps=1e-15)
 
     def __init__(
@@ -147,8 +148,8 @@ class ProposalSampler(Sampler):
     def step_kind(self, step: int) -> StepKind:
         return StepKind((self.learns(step),))
 
-    def losses(self, samples: Samples, weights: Tensor) -> dict[str, Tensor]:
-        return {"interlevel": interlevel_loss(samples, weights, self.blurs)} if samples.proposals else {}
+    def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
+        return interlevel_loss(samples, weights, self.blurs) if samples.proposals else None
 
     def _ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Return the distances (R,) at which sampling starts and ends; in a bounded scene those inside the box."""

@@ -116,10 +116,6 @@ SplattingConfigT = TypeVar("SplattingConfigT", bound=SplattingConfig)
 def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingConfigT, list[Decision]]:
     """Decide how many Gaussians there are and how fast they learn, by the budget and the size of the images.
 
-    Args:
-        config: the method's settings; those left open are filled in.
-        scene: properties of the data.
-
     Returns:
         The settings, and a record of each that was filled in.
     """

@@ -112,7 +112,7 @@ def test_training_averages_the_same_rays_late_in_the_budget(shared_tiny: Path, t
 
     trainer.prepare()
     trainer.source = Recording(trainer.train_set, "random", trainer.config.machine.seed)
-    trainer.model.render = watched
+    trainer.model.render, trainer.model.plain = watched, False
     trainer.train()
     scene = trainer.train_set.scene
     for step, (batch, background) in enumerate(zip(batches, backgrounds, strict=True)):

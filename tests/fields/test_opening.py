@@ -59,7 +59,7 @@ def test_levels_open_once_and_stay_open() -> None:
     opening = Opening(4, 1)
     seen = []
     for progress in (0.0, 0.1, 0.25, 0.6, 0.75, 1.0, 3.0):
-        opening.open(progress)
+        opening.advance(progress)
         seen.append((float(opening.opened), opening.count, opening.complete))
     expected = [(1.0, 1, False), (1.4, 2, False), (2.0, 2, False), (3.4, 4, False), *[(4.0, 4, True)] * 3]
     assert [(count, done) for _, count, done in seen] == [(count, done) for _, count, done in expected]
@@ -108,7 +108,7 @@ def test_a_step_changes_open_levels_as_it_would_in_the_complete_encoding(kind: s
 def test_once_all_levels_are_open_nothing_is_different(kind: str) -> None:
     some, every = made(kind, 0.0), made(kind, None)
     assert some.opening is not None
-    some.opening.open(1.0)
+    some.opening.advance(1.0)
     x = torch.rand(30, 3)
     assert torch.equal(some(x), every(x))
 
@@ -145,7 +145,7 @@ def test_a_network_of_frequencies_is_smooth_while_they_are_closed() -> None:
     changes = []
     for progress in (0.0, 1.0):
         assert field.opening is not None
-        field.opening.open(progress)
+        field.opening.advance(progress)
         changes.append(float((field.density(points)[1] - field.density(near)[1]).detach().abs().mean()))
     assert changes[0] < 0.1 * changes[1]
 

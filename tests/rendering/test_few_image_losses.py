@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.rendering.losses import density_before, depth_roughness
+from nerfloom.losses.functions import density_before, depth_roughness
 
 SIDE = 4
 

@@ -7,7 +7,7 @@ import torch
 
 from nerfloom.data.pixels import PixelBatch, thinned
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.rendering.losses import mean_squared_error, opacity_of_transparent
+from nerfloom.losses.functions import mean_squared_error, opacity_of_transparent
 from nerfloom.rendering.volume import volume_render
 
 

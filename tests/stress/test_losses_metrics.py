@@ -22,8 +22,8 @@ from nerfloom.geometry.rays import Histogram, Samples
 from nerfloom.kernels.compositing import distortion, distortion_by_pairs
 from nerfloom.kernels.plane_bands import squared_steps, variation
 from nerfloom.kernels.planes import PlanesLayout
-from nerfloom.methods.kplanes import METHOD, KPlanes, KPlanesConfig
-from nerfloom.rendering.losses import depth_error, mean_squared_error
+from nerfloom.losses.functions import depth_error, mean_squared_error
+from nerfloom.methods.kplanes import METHOD, KPlanes, KPlanesConfig, PlaneRegularity
 from nerfloom.samplers.proposal import interlevel_loss
 from tests.images import parsed
 from tests.kernels.compiled import relative_error
@@ -192,9 +192,9 @@ def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: K
         planes.table.copy_(torch.rand(planes.table.shape, generator=torch.Generator().manual_seed(0)) * 2)
     exact = planes.table.detach().double().requires_grad_()
     truth = variation_by_torch(exact, planes.layout)
-    turns = [moving_planes._regularisers(torch.zeros(()), turn) for turn in range(6)]
+    turns = [PlaneRegularity().of(moving_planes.field, torch.zeros(()), turn) for turn in range(6)]
     found = [torch.stack(values).mean() for values in zip(*turns, strict=True)]
-    at_once = moving_planes._regularisers(torch.zeros(()), None)
+    at_once = PlaneRegularity().of(moving_planes.field, torch.zeros(()), None)
     for value, all_planes, expected in zip(found, at_once, truth, strict=True):
         assert value.item() == pytest.approx(expected.item(), rel=1e-5)
         assert all_planes.item() == pytest.approx(expected.item(), rel=1e-5)

@@ -168,7 +168,7 @@ def test_one_nan_picture_does_not_spoil_the_running_mean(shared_tiny: Path, tmp_
         found = render(rays, background)
         return dataclasses.replace(found, rgb=found.rgb * math.nan)
 
-    trainer.model.render = broken
+    trainer.model.render, trainer.model.plain = broken, False
     trainer.train_step()
     trainer.model.render = render
     for _ in range(3):
@@ -292,7 +292,7 @@ def test_rays_begin_and_end_alike_in_training_and_evaluation(shared_tiny: Path, 
         seen.append((trainer.model.training, set(rays.nears.tolist()), set(rays.fars.tolist())))
         return render(rays, background)
 
-    trainer.model.render = spy
+    trainer.model.render, trainer.model.plain = spy, False
     trainer.train_step()
     trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model))
     assert {training for training, _, _ in seen} == {True, False}

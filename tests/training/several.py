@@ -59,6 +59,7 @@ def trainer_of_parts(data: Path, folder: Path) -> Trainer:
     sample = sampler.sample
     sampler.sample = lambda rays, field, jitter: sample(rays, field, False)
     sampler.update = lambda step, density: None
+    trainer.model.plain = False  # else rays are marched in the call that renders them
     trainer.prepare()
     return trainer
 

@@ -278,7 +278,7 @@ def test_evaluation_cameras_are_not_taken_for_training_ones(shared_tiny: Path, t
         seen.append(rays)
         return true_render(rays, background)
 
-    trainer.model.render = spy  # type: ignore[method-assign]
+    trainer.model.render, trainer.model.plain = spy, False
     assert trainer.eval_set is not None
     evaluate(trainer.model, trainer.eval_set)
     assert seen

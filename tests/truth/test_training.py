@@ -23,6 +23,8 @@ from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.losses.term import RenderedBatch
+from nerfloom.losses.terms import Distortion
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import shade, volume_render
 from nerfloom.samplers.choice import SamplingConfig, make_sampler
@@ -364,9 +366,10 @@ def test_light_is_gathered_in_normalised_distance(shared_tiny: Path, tmp_path: P
     apart = (middles[:, :, None] - middles[:, None]).abs()
     pairs = (weights[:, :, None] * weights[:, None] * apart).sum((1, 2))
     expected = 0.5 * (pairs + (weights.square() * edges.diff(dim=-1)).sum(-1) / 3).mean()
-    assert float(model.regularizers(rendered, batch, 0)["distortion"].detach()) == pytest.approx(
-        float(expected), rel=1e-3
-    )
+    term = Distortion()
+    found = term.factor(model.config, 0) * term(RenderedBatch(batch, rendered, model, 0))
+    assert float(found.detach()) == pytest.approx(float(expected), rel=1e-3)
+    assert any(isinstance(each, Distortion) for each in model.losses)
 
 
 @pytest.mark.parametrize(("has_alpha", "opacity"), [(False, 1.0), (True, 0.0)])

@@ -230,15 +230,15 @@ BUGS = (
     Bug(
         "coarse-not-taught",
         "losses",
-        "framework/ray_model.py",
-        "self.color_error(coarse.rgb, batch)",
-        "self.color_error(coarse.rgb.detach(), batch)",
+        "framework/losses/terms.py",
+        "self.error(coarse.to_pixels(shown.batch.rays_per_pixel).rgb, shown)",
+        "self.error(coarse.to_pixels(shown.batch.rays_per_pixel).rgb.detach(), shown)",
         "the coarse network learns nothing, and the fine one is sampled at random",
     ),
     Bug(
         "depth-loss-unknown",
         "losses",
-        "framework/rendering/losses.py",
+        "framework/losses/functions.py",
         "return (ray_sum(weights * apart, samples) * has_depth).sum() / has_depth.sum().clamp(min=1)",
         "return ray_sum(weights * apart, samples).mean()",
         "pixels without a depth are pulled to distance 1",
@@ -262,7 +262,7 @@ BUGS = (
     Bug(
         "distortion-in-distance",
         "losses",
-        "framework/rendering/losses.py",
+        "framework/losses/functions.py",
         "distortion(weights, Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])).mean()",
         "distortion(weights, samples).mean()",
         "far away light is punished a thousand times more than near light",

@@ -1,0 +1,227 @@
+"""Terms that methods share. Each says in one place what it is called, which setting weighs it, and what it needs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from nerfloom.cameras.unseen import unseen_patches
+from nerfloom.data.pixels import PixelBatch
+from nerfloom.losses.functions import (
+    density_before,
+    depth_error,
+    depth_roughness,
+    distance_likelihood,
+    matter_before,
+    mean_squared_error,
+    normalised_distortion,
+    opacity_of_transparent,
+)
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.samplers.proposal import half_edge
+from nerfloom.scene.few_images import unseen_weight
+
+if TYPE_CHECKING:
+    from nerfloom.ray_model import RayModel
+
+PATCH = 8
+"""Rays along the edge of a patch of an unseen view, as in RegNeRF (Niemeyer et al. 2022)."""
+PATCH_IMAGE = 500
+"""Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
+relation to the image."""
+
+
+class ColorError(LossTerm):
+    """Mean squared error of colours: NeRF (Mildenhall et al. 2020), equation 6.
+
+    Subclasses can override `error`.
+
+    Args:
+        name: name of the term in logs.
+        weight: factor of the term, or the name of the setting that holds it.
+    """
+
+    def __init__(self, name: str = "rgb", weight: float | str = 1.0) -> None:
+        super().__init__(name, weight)
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        return self.error(shown.pixels.rgb, shown)
+
+    def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
+        """Return the error () of the colours of P pixels.
+
+        Args:
+            rgb: (P, 3) rendered colours.
+            shown: the batch as the model renders it, with the true colours and the weights of the pixels.
+        """
+        return mean_squared_error(rgb, shown.batch.rgb, shown.batch.weights)
+
+
+class CoarseColorError(ColorError):
+    """Error of the colours of a coarse level, where the sampler has one.
+
+    Args:
+        weight: factor of the term, or the name of the setting that holds it.
+    """
+
+    def __init__(self, weight: float | str = 1.0) -> None:
+        super().__init__("rgb_coarse", weight)
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return model.sampler.has_coarse_level
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        coarse = shown.rendered.coarse
+        return None if coarse is None else self.error(coarse.to_pixels(shown.batch.rays_per_pixel).rgb, shown)
+
+
+COLOR_ERROR = ColorError()
+"""The term that compiled steps know. An objective of this term alone can be learnt from in one native call."""
+
+
+class SamplerLoss(LossTerm):
+    """Loss that trains the sampler itself (`Sampler.loss`), such as the interlevel loss of proposals.
+
+    Args:
+        name: name of the term in logs.
+    """
+
+    def __init__(self, name: str = "interlevel") -> None:
+        super().__init__(name)
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return model.sampler.learns_from_weights
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        samples, weights = shown.rendered.samples, shown.rendered.weights
+        return None if samples is None or weights is None else shown.model.sampler.loss(samples, weights)
+
+
+class Distortion(LossTerm):
+    """Spread of the weights along rays, in normalised distance: mip-NeRF 360 (Barron et al. 2022), equation 15.
+
+    Args:
+        of_marched: whether samples that an occupancy grid chose have a distortion where space is contracted, in
+            disparity beyond half of the box's edge.
+    """
+
+    def __init__(self, of_marched: bool = True) -> None:
+        super().__init__("distortion", "distortion_loss_mult")
+        self.of_marched = of_marched
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        samples, weights, model = shown.rendered.samples, shown.rendered.weights, shown.model
+        if samples is None or weights is None or not samples.num_rays:
+            return None
+        if samples.edges is not None:
+            return normalised_distortion(weights, samples)
+        if not self.of_marched or not model.config.contraction:
+            return None
+        return normalised_distortion(weights, samples, half_edge(model.scene.box))
+
+
+class DepthError(LossTerm):
+    """Error of distances that depth images or points of a reconstruction tell.
+
+    Args:
+        coarse: whether the coarse level is compared, where the sampler has one.
+    """
+
+    def __init__(self, coarse: bool = False) -> None:
+        super().__init__("depth_coarse" if coarse else "depth", "depth_loss_mult")
+        self.coarse = coarse
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.distances is not None and (model.sampler.has_coarse_level or not self.coarse)
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        batch, level = shown.batch, shown.rendered.coarse if self.coarse else shown.rendered
+        if level is None or level.weights is None or level.samples is None or not level.samples.num_rays:
+            return None
+        assert batch.distances is not None
+        known = batch.distances.repeat_interleave(batch.rays_per_pixel)
+        if batch.deviations is None:
+            return depth_error(level.weights, level.samples, known)
+        deviations = batch.deviations.repeat_interleave(batch.rays_per_pixel)
+        return distance_likelihood(level.weights, level.samples, known, deviations)
+
+
+class FreeSpace(LossTerm):
+    """Matter in space through which other images see points (`--free-space`)."""
+
+    def __init__(self) -> None:
+        super().__init__("free_space", "free_space_loss_mult")
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.clear is not None
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        batch, rendered = shown.batch, shown.rendered
+        if rendered.samples is None or rendered.weights is None:
+            return None
+        assert batch.clear is not None
+        clear = batch.clear.repeat_interleave(batch.rays_per_pixel)
+        return matter_before(rendered.weights, rendered.samples, clear)
+
+
+KNOWN_DISTANCES = DepthError(), DepthError(coarse=True), FreeSpace()
+"""Terms of methods that learn from distances."""
+
+
+class MatterNearCameras(LossTerm):
+    """Optical depth right before cameras: FreeNeRF (Yang et al. 2023), equation 6."""
+
+    def __init__(self) -> None:
+        super().__init__("occlusion", "occlusion_loss_mult")
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        near = shown.model.config.occlusion_range * shown.model.scene.near
+        levels = [level.samples for level in (shown.rendered, shown.rendered.coarse) if level is not None]
+        before = [density_before(s, near) for s in levels if s is not None and s.sigma is not None]
+        return torch.stack(before).sum() if before else None
+
+
+class UnseenRoughness(LossTerm):
+    """Roughness of depth in views between the training cameras: RegNeRF (Niemeyer et al. 2022), equation 8."""
+
+    def __init__(self) -> None:
+        super().__init__("unseen", "unseen_loss_mult")
+
+    def factor(self, config: Any, step: int) -> float:
+        return unseen_weight(config, step)
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        batch, model = shown.batch, shown.model
+        poses = model.scene.camera_to_worlds
+        if not len(batch) or poses is None:
+            return None
+        rays = batch.rays[:: batch.rays_per_pixel][: model.config.unseen_patches]
+        stride = max(model.scene.image_size / PATCH_IMAGE, 1.0)
+        unseen = model.render(unseen_patches(rays, poses, PATCH, stride), batch.background[0])
+        if unseen.weights is None or unseen.samples is None:
+            return None
+        return depth_roughness(unseen.weights, unseen.samples, PATCH)
+
+    def varies(self, config: Any) -> str | None:
+        return "the weight of unseen views changes from step to step" if config.unseen_loss_mult else None
+
+
+FEW_IMAGES = MatterNearCameras(), UnseenRoughness()
+"""Terms of methods with the settings `FewImagesConfig`."""
+
+
+class TransparentOpacity(LossTerm):
+    """Opacity of pixels whose alpha says that they are empty at the time of their image."""
+
+    def __init__(self) -> None:
+        super().__init__("empty", "empty_loss_mult")
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return model.scene.moving and batch.alpha is not None
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        batch = shown.batch
+        assert batch.alpha is not None
+        return opacity_of_transparent(shown.pixels.accumulation, batch.alpha, batch.weights)

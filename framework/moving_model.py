@@ -1,0 +1,37 @@
+"""The model of methods that cast rays into a scene that moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Generic, TypeVar
+
+from nerfloom.base.step_kind import StepKind
+from nerfloom.data.pixels import PixelBatch, thinned
+from nerfloom.model import LearnsMotion, Loss
+from nerfloom.ray_model import RayModel
+from nerfloom.scene.motion import MotionConfig
+
+MotionConfigT = TypeVar("MotionConfigT", bound=MotionConfig)
+
+
+class MovingModel(RayModel[MotionConfigT], LearnsMotion, Generic[MotionConfigT], plain=True):
+    """A model that uses the times of the images."""
+
+    def loss(self, batch: PixelBatch, step: int) -> Loss:
+        """Return the terms of `losses` on a batch, with a share of its transparent pixels (`transparent_share`).
+
+        Args:
+            batch: pixels with their true colours.
+            step: number of training steps done.
+        """
+        if not self.scene.moving or batch.alpha is None or self.config.transparent_share == 1:
+            return super().loss(batch, step)
+        part, kept = thinned(batch, self.config.transparent_share)
+        loss = super().loss(part, step)
+        # Nothing is before the background of the pixels that are left out.
+        return replace(loss, rgb=batch.rgb.index_copy(0, kept, loss.rgb.to(batch.rgb)))
+
+    def step_kind(self, step: int) -> StepKind:
+        if self.steps_repeat and self.scene.moving and self.config.transparent_share < 1:
+            return StepKind(varies="transparent pixels are left out at random")
+        return super().step_kind(step)

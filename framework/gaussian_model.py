@@ -18,6 +18,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.splat_project import SplatCamera
 from nerfloom.model import Model
+from nerfloom.rendering.outputs import NORMALS, Output
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.density_control import RESET, GradientMean, grown
 from nerfloom.splats.drawing import DRAWN, draw_view, on_image, splat_camera
@@ -204,6 +205,11 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
             camera: one camera.
         """
         return splat_camera(camera, self.near, self.look())
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Return the normals, the shortest axes of Gaussians (`Picture.extras`)."""
+        return (NORMALS,)
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         return self.render_gaussians(self.gaussians(), view, background)

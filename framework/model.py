@@ -23,6 +23,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
 from nerfloom.geometry.points import Points
+from nerfloom.rendering.outputs import Output
 from nerfloom.rendering.rendered import Picture
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
@@ -139,6 +140,11 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
     def groups(self) -> list[ParameterGroup]:
         """Return the parameters, grouped by the `Optimised` settings of the modules that hold them."""
         return parameter_groups(self)
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Further outputs of its pictures, beside colours, depths and opacity (`Picture.extras`)."""
+        return ()
 
     @property
     def samples_per_step(self) -> int | None:

@@ -20,12 +20,12 @@ from nerfloom.encodings.opening import Opening
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.math import safe_normalize
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.kernels.traced_error import PixelTargets, TracedError
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model, evaluating, parts
+from nerfloom.rendering.outputs import Output, empty
 from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.traced import error_of_traced, traced_rays
@@ -105,13 +105,13 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
 
         Pixels that are known to show the background alone (`pixels_in_view`) are not rendered.
         """
-        per_pixel = view.rays_per_pixel or self.rays_per_pixel
+        per_pixel, outputs = view.rays_per_pixel or self.rays_per_pixel, self.outputs
         offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
         chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
         pixels, seen = grid.reshape(-1), self._seen(view)
         places = None if seen is None else seen.reshape(-1).nonzero().squeeze(-1)
         # Written into as they come: small results kept between a chunk's large ones would break up the heap.
-        rgb, normals = background.to(self.device, torch.float32).repeat(count, 1), None
+        rgb, extras = background.to(self.device, torch.float32).repeat(count, 1), empty(outputs, count, self.device)
         depth, median, accumulation = torch.full((3, count), self.scene.far, device=self.device)
         accumulation.zero_()
         with (
@@ -124,19 +124,19 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
                 part = part if places is None else places[part]
                 rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
                 # Index 0 of the view's one camera must not be taken for the index of a training camera.
-                rendered = self.shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel)
+                rendered = self.shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel, outputs)
                 rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
                 accumulation[part] = rendered.accumulation
-                if rendered.normals is not None:
-                    normals = torch.zeros_like(rgb) if normals is None else normals
-                    normals[part] = safe_normalize(rendered.normals.float())
+                for output in outputs:
+                    extras[output.name][part] = output.finished(rendered.extras[output.name])
         size = tuple(grid.shape)
         return Picture(
             rgb.view(*size, 3),
             depth.view(size),
             median.view(size),
             accumulation.view(size),
-            None if normals is None else normals.view(*size, 3),
+            {output.name: extras[output.name].view(*size, *output.shape) for output in outputs},
+            outputs,
             num_rays=count * per_pixel,
         )
 
@@ -191,6 +191,11 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def runs_on_kernels(self) -> bool:
         """Return whether the field runs on compiled kernels; torch's own operations then use one CPU thread."""
         return self.field.runs_on_kernels
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Further outputs of its renderer (`Renderer.outputs`)."""
+        return self.renderer.outputs
 
     @property
     def samples_per_step(self) -> int | None:

@@ -142,21 +142,21 @@ def _text(path: Path | None) -> str | None:
     return None if path is None else str(path)
 
 
-def image(picture: Picture, what: Literal["rgb", "depth", "accumulation", "normals"] = "rgb") -> Image:
+def image(picture: Picture, what: str = "rgb") -> Image:
     """Return a component of a rendered image as a PIL image, which notebooks display.
 
     Args:
         picture: the rendered image, from `TrainedRun.render`.
         what: rgb for colour; depth for median depth, from dark (near) to light (far) over the depths of opaque pixels;
-            accumulation for opacity; normals for x, y and z from -1 to 1 as red, green and blue.
+            accumulation for opacity; or the name of another output (`Picture.outputs`), such as normals.
 
     Raises:
-        ValueError: if normals are requested and the method has none.
+        ValueError: if the picture has no such output.
     """
     from PIL import Image as images
 
     from nerfloom.evaluation.images import to_uint8
-    from nerfloom.evaluation.panels import depth_range, viridis
+    from nerfloom.evaluation.panels import as_colors, depth_range, viridis
 
     if what == "rgb":
         shown = picture.rgb.clamp(0, 1)
@@ -165,8 +165,10 @@ def image(picture: Picture, what: Literal["rgb", "depth", "accumulation", "norma
         shown = viridis(((picture.median_depth - near) / max(far - near, 1e-9)).clamp(0, 1))
     elif what == "accumulation":
         shown = picture.accumulation.clamp(0, 1)[..., None].expand(-1, -1, 3)
-    elif picture.normals is not None:
-        shown = (picture.normals + 1) / 2
     else:
-        raise ValueError("this method has no normals; train nerfacto with predict_normals=True")
+        output = next((output for output in picture.outputs if output.name == what), None)
+        if output is None:
+            hint = "; train nerfacto with predict_normals=True" if what == "normals" else ""
+            raise ValueError(f"this picture has no {what}{hint}")
+        shown = as_colors(picture, output)[0]
     return images.fromarray(to_uint8(shown.cpu()))

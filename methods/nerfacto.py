@@ -36,6 +36,7 @@ from nerfloom.kernels.compositing import ray_sum
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, RefinedModel, decide_capture
+from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
 from nerfloom.samplers.choice import batch_choice, make_sampler
 from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
@@ -93,6 +94,8 @@ class NormalRenderer(VolumeRenderer):
         thin: share of the mean gradient below which samples are thinned; 0 for none.
     """
 
+    outputs = (NORMALS,)
+
     def __init__(self, normals: NormalHead, unit_length: float | None, thin: float = 0.0) -> None:
         super().__init__(unit_length, thin)
         self.normals = normals
@@ -104,13 +107,13 @@ class NormalRenderer(VolumeRenderer):
         assert rendered.weights is not None
         points, weights = Points(samples.positions(rays).detach(), samples.times(rays)), rendered.weights
         predicted = self.normals(samples.features.detach(), 2 * field.unit(points.positions) - 1)
-        facing = ray_sum(weights.detach()[:, None] * predicted, samples)
+        facing = {NORMALS.name: ray_sum(weights.detach()[:, None] * predicted, samples)}
         if not self.training:
-            return replace(rendered, normals=facing)
+            return replace(rendered, extras={**rendered.extras, **facing})
         target = density_normals(field, points)
         directions = rays.directions.detach().index_select(0, samples.ray_indices)
         penalties = normal_penalties(predicted, target, directions, weights, samples)
-        return replace(rendered, normals=facing, penalties=penalties)
+        return replace(rendered, extras={**rendered.extras, **facing, **penalties})
 
 
 class NormalPenalty(LossTerm):
@@ -120,7 +123,7 @@ class NormalPenalty(LossTerm):
         return model.config.predict_normals
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        penalty = shown.rendered.penalties[self.name]
+        penalty = shown.rendered.extras[f"{self.name}_penalty"]
         return penalty.mean() if len(penalty) else None
 
 

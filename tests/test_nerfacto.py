@@ -205,9 +205,9 @@ def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None
     trainer.train()
     assert {"normals", "orientation"} <= trainer.train_step().losses.keys()
     image = trainer.model.render_view(trainer.train_set.view(0), torch.ones(3))
-    assert image.normals is not None
+    assert [output.name for output in image.outputs] == ["normals"]
     middle = image.accumulation > 0.95
-    agreement = (image.normals * (2 * image.rgb - 1)).sum(-1)[middle]
+    agreement = (image.extras["normals"] * (2 * image.rgb - 1)).sum(-1)[middle]
     assert agreement.mean() > 0.7
 
 

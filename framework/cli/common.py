@@ -52,14 +52,14 @@ def chosen_kind(
     return name, kinds[name], arguments[1:]
 
 
-def with_run(arguments: list[str], several: Mapping[str, Collection[str]] | None = None) -> list[str]:
+def with_run(arguments: list[str], several: Collection[str] = ()) -> list[str]:
     """Return the arguments of a command that takes a run, with --load-config before a run without it.
 
     So `ns-eval RUN_FOLDER` is `ns-eval --load-config RUN_FOLDER`.
 
     Args:
         arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
-        several: flags that take several of certain words, as further arguments.
+        several: flags that take several words, none of which is a path.
     """
     if any(word.partition("=")[0] == "--load-config" for word in arguments):
         return arguments
@@ -68,11 +68,15 @@ def with_run(arguments: list[str], several: Mapping[str, Collection[str]] | None
         word = arguments[index]
         if not word.startswith("-"):
             return [*arguments[:index], "--load-config", *arguments[index:]]
-        words = (several or {}).get(word.replace("_", "-"), ())
         index += 1 if "=" in word or word in ("-h", "--help") else 2
-        while index < len(arguments) and arguments[index] in words:
+        while word.replace("_", "-") in several and index < len(arguments) and _is_word(arguments[index]):
             index += 1
     return arguments
+
+
+def _is_word(argument: str) -> bool:
+    """Return whether an argument is neither a flag nor a path."""
+    return not argument.startswith("-") and not set("/\\.") & set(argument) and not Path(argument).exists()
 
 
 def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[str, DataParser] | None]:

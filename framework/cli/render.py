@@ -7,11 +7,10 @@ import json
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.from_nerfstudio import render_answer
-from nerfloom.base.rendered_names import OutputName
 from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.render_flags import (
@@ -31,8 +30,12 @@ if TYPE_CHECKING:
 
     from nerfloom.cli.render_paths import Views
     from nerfloom.evaluation.frames import Frames
+    from nerfloom.rendering.outputs import Output
     from nerfloom.training.splat_files import DataFormat
     from nerfloom.training.trained import Trained
+
+NUMBERS = ("distance", "scalar")
+"""Kinds of outputs that are shown in the colours of a range."""
 
 
 def main() -> None:
@@ -48,7 +51,7 @@ def _command(arguments: list[str]) -> None:
     name, path, rest = chosen
     if answer := next(filter(None, map(render_answer, rest)), None):
         raise FlagError(answer)
-    words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names": get_args(OutputName)}))
+    words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names"}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
     flags: Any = read_flags(path, f"ns-render {name}", words, "RUN_FOLDER", config=options)
     _render(name, flags, named)
@@ -71,13 +74,14 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     from nerfloom.evaluation.error_bound import limited_error, parse_error
     from nerfloom.evaluation.evaluator import evaluation_background
     from nerfloom.evaluation.frames import open_frames
-    from nerfloom.evaluation.outputs import rendered_outputs
+    from nerfloom.evaluation.outputs import chosen_outputs, rendered_outputs
     from nerfloom.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
     rays = flags.outputs.rays_per_pixel
     trained = load_run_or_splats(found, run.load_checkpoint, run.device_type, run.data, rays, data_format=named)
-    model, names = trained.model, flags.outputs.rendered_output_names
+    model = trained.model
+    outputs = chosen_outputs(model, flags.outputs.rendered_output_names)
     views, background = _views(flags, trained), evaluation_background(trained.model)
     facts = _facts(name, flags, trained, views)
     if is_folder:
@@ -87,14 +91,14 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     def render(index: int) -> Any:
         view = View.of(views.cameras, index, views.times)
         truth = None if views.truth is None else views.truth(index)
-        return rendered_outputs(model, view, background, names, unit, truth)
+        return rendered_outputs(model, view, background, outputs, unit, truth)
 
     with nullcontext() if bound is None else limited_error(model, bound):
         frames = open_frames(output, len(views.cameras), facts)
         frames.render(render)
     if bound is not None:
         say(f"--max-error: rays ended where the rest could change a colour by at most {bound:.2g}")
-    _write(flags, frames, output, views, facts)
+    _write(flags, frames, output, views, facts, outputs)
     frames.remove()
 
 
@@ -160,21 +164,24 @@ def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
 # -- files --------------------------------------------------------------------------------------------------------
 
 
-def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict[str, Any]) -> None:
+def _write(
+    flags: Flags, frames: Frames, output: Path, views: Views, facts: dict[str, Any], outputs: Sequence[Output]
+) -> None:
     """Write the files that were asked for, and say where they are."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.frames import FACTS, write_file
-    from nerfloom.evaluation.outputs import DEPTHS, shown_output, side_by_side
+    from nerfloom.evaluation.outputs import shown_output, side_by_side
     from nerfloom.evaluation.videos import write_images, write_strip, write_video
 
     is_folder = not output.suffix
-    names: list[str] = list(flags.outputs.rendered_output_names)
+    names = [each.name for each in outputs]
+    kinds = {each.name: each.kind for each in outputs}
     stems = views.names or tuple(f"{index:05d}" for index in range(frames.count))
     if flags.files.depth_format != "color":
-        for name in [name for name in names if name in DEPTHS]:
+        for name in [name for name in names if kinds[name] == "distance"]:
             _write_depths(flags, frames, output / name, stems, name)
             names.remove(name)
-    ranges = {name: _colored_range(flags, frames, name) for name in names if name in DEPTHS}
+    ranges = {name: _colored_range(flags, frames, name, kinds[name]) for name in names if kinds[name] in NUMBERS}
     apart = flags.files.apart
     if apart is None:
         apart = isinstance(flags, DatasetFlags) and is_folder
@@ -197,16 +204,17 @@ def _write(flags: Flags, frames: Frames, output: Path, views: Views, facts: dict
         write_file(output / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
 
 
-def _colored_range(flags: Flags, frames: Frames, name: str) -> tuple[float, float]:
-    """Return the distances at the ends of the colours of depth, and say them."""
+def _colored_range(flags: Flags, frames: Frames, name: str, kind: str) -> tuple[float, float]:
+    """Return the numbers at the ends of the colours of an output, and say them; flags set those of distances."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.outputs import distance_range
 
-    near, far = flags.outputs.depth_near_plane, flags.outputs.depth_far_plane
+    given = flags.outputs.depth_near_plane, flags.outputs.depth_far_plane
+    near, far = given if kind == "distance" else (None, None)
     if near is None or far is None:
-        found = distance_range(track(frames, "Measuring distances", total=frames.count), name)
+        found = distance_range(track(frames, "Measuring ranges", total=frames.count), name)
         near, far = found[0] if near is None else near, found[1] if far is None else far
-    say(f"{name}: {near:.4g} (dark) to {far:.4g} (light), in units of the input")
+    say(f"{name}: {near:.4g} (dark) to {far:.4g} (light){', in units of the input' if kind == 'distance' else ''}")
     return near, far
 
 

@@ -8,7 +8,6 @@ from typing import Literal
 
 from nerfloom.base.config import RaysPerPixel
 from nerfloom.base.errors import FlagError
-from nerfloom.base.rendered_names import OutputName
 
 USAGE = """\
 usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
@@ -48,10 +47,10 @@ class RunFlags:
 class ViewFlags:
     """Outputs of a view, and their colours."""
 
-    rendered_output_names: tuple[OutputName, ...] = ("rgb",)
+    rendered_output_names: tuple[str, ...] = ("rgb",)
     """What is shown, from left to right. rgb: colours; depth: mean distance; median_depth: distance at which half of
-    the light is stopped; accumulation: opacity; normals: directions of surfaces; with 'dataset' also gt-rgb, the
-    photograph, and error, the difference from it."""
+    the light is stopped; accumulation: opacity; what the method has besides, such as normals: directions of surfaces;
+    with 'dataset' also gt-rgb, the photograph, and error, the difference from it."""
     depth_near_plane: float | None = None
     """Distance at the dark end of the colours of depth, units of the input; found in all frames if not given."""
     depth_far_plane: float | None = None

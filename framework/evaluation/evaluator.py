@@ -243,7 +243,7 @@ def evaluate(
         dataset: views with images, on the model's device.
         max_images: maximum number of views, evenly spaced; all if None.
         seconds: time that the views may take by the time of the first, which is always evaluated; no limit if None.
-        pictures: folder for renders, true images, `view_panels` and normals (x, y, z as RGB); no files if None.
+        pictures: folder for renders, true images, `view_panels` and further outputs; no files if None.
         max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If that is some of
             them, files of the view with the lowest PSNR are written besides, as worst.png and so on. Views with files
             are evaluated before the others.

@@ -3,37 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.rendered_names import OutputName
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
 from nerfloom.evaluation.panels import depth_range, viridis
 from nerfloom.model import Model
+from nerfloom.rendering.outputs import ACCUMULATION, FIXED, RGB, Output
 from nerfloom.rendering.rendered import Picture
 
-NAMES: tuple[str, ...] = get_args(OutputName)
-"""Names of the outputs."""
-DEPTHS = ("depth", "median_depth")
-"""Outputs that are distances."""
-NEED_TRUTH = ("error", "gt-rgb")
-"""Outputs that need the true image."""
-OF_COLORS = ("rgb", *NEED_TRUTH)
-"""Outputs for which the colours of a picture are enough."""
+ERROR, PHOTOGRAPH = Output("error", "color"), Output("gt-rgb", "color", "photograph")
+"""Outputs that need the true image: the difference from it, and the image."""
 OPAQUE = 128
 """Opacity of 255 from which a pixel has a depth."""
 
 Arrays = Mapping[str, np.ndarray]
-"""What is kept of a frame: colours (H, W, 3) uint8, opacity (H, W) uint8, and distances (H, W) float32."""
+"""What is kept of a frame, by name: uint8 (H, W) or (H, W, 3) of what is shown as it is, and numbers (H, W) float32."""
+
+
+def chosen_outputs(model: Model[Any], names: Sequence[str]) -> list[Output]:
+    """Return the outputs of these names.
+
+    Args:
+        model: the model, which declares its own outputs.
+        names: names of the outputs.
+
+    Raises:
+        ConfigError: if the model has no such output.
+    """
+    known = {output.name: output for output in (*FIXED, *model.outputs, ERROR, PHOTOGRAPH)}
+    for name in names:
+        if name not in known:
+            hint = "; nerfacto has them with --predict-normals True" if name == "normals" else ""
+            raise ConfigError(
+                f"--rendered-output-names {name}: this run has no such output, but {', '.join(known)}{hint}"
+            )
+    return [known[name] for name in names]
 
 
 def rendered_outputs(
-    model: Model, view: View, background: Tensor, names: Sequence[str], unit: float, truth: Tensor | None = None
+    model: Model[Any],
+    view: View,
+    background: Tensor,
+    outputs: Sequence[Output],
+    unit: float,
+    truth: Tensor | None = None,
 ) -> Arrays:
     """Render a view, as far as its outputs need it, and return what is kept of it.
 
@@ -41,57 +60,52 @@ def rendered_outputs(
         model: the model in evaluation mode.
         view: the view, on the model's device.
         background: (3,) colour behind the scene.
-        names, unit, truth: as in `kept_outputs`.
+        outputs, unit, truth: as in `kept_outputs`.
 
     Raises:
         ConfigError: as `kept_outputs` does.
     """
-    if set(names) <= set(OF_COLORS):
-        return _kept_colors(model.render_rgb(view, background), names, truth)
-    return kept_outputs(model.render_view(view, background), names, unit, truth)
+    if all(output in (RGB, ERROR, PHOTOGRAPH) for output in outputs):
+        return {output.name: _colors(output, model.render_rgb(view, background), truth) for output in outputs}
+    return kept_outputs(model.render_view(view, background), outputs, unit, truth)
 
 
-def kept_outputs(picture: Picture, names: Sequence[str], unit: float, truth: Tensor | None = None) -> Arrays:
+def kept_outputs(picture: Picture, outputs: Sequence[Output], unit: float, truth: Tensor | None = None) -> Arrays:
     """Return what is kept of a rendered view for its outputs.
 
     Args:
         picture: the rendered view.
-        names: names of the outputs.
+        outputs: what is shown of it.
         unit: units of the input per scene unit, by which distances are multiplied.
         truth: (H, W, 3) true image in [0, 1]; None if it is unknown.
 
     Raises:
-        ConfigError: if the method has no normals, or an output needs an unknown true image.
+        ConfigError: if an output needs an unknown true image.
     """
-    kept = _kept_colors(picture.rgb, names, truth)
-    for name in names:
-        if name in DEPTHS:
-            kept[name] = (getattr(picture, name) * unit).float().cpu().numpy()
-        elif name == "normals":
-            if picture.normals is None:
-                raise ConfigError(
-                    "--rendered-output-names normals: this method has none; gaussian-splatting has, and nerfacto"
-                    " trained with --predict-normals True"
-                )
-            kept[name] = to_uint8((picture.normals + 1) / 2)
-    if set(names) & {"accumulation", "normals", *DEPTHS}:
-        kept["accumulation"] = to_uint8(picture.accumulation)
-    return kept
-
-
-def _kept_colors(rgb: Tensor, names: Sequence[str], truth: Tensor | None) -> dict[str, np.ndarray]:
-    """Return what is kept of colours (H, W, 3) for those of the outputs that need no more."""
     kept: dict[str, np.ndarray] = {}
-    for name in names:
-        if name in NEED_TRUTH and truth is None:
-            raise ConfigError(f"--rendered-output-names {name}: only 'ns-render dataset' knows the true images")
-        if name == "rgb":
-            kept[name] = to_uint8(rgb)
-        elif name == "error" and truth is not None:
-            kept[name] = to_uint8(heat((rgb.clamp(0, 1) - truth).abs().mean(-1) / ERROR_AT_WHITE))
-        elif name == "gt-rgb" and truth is not None:
-            kept[name] = to_uint8(truth)
+    for output in outputs:
+        if output in (RGB, ERROR, PHOTOGRAPH):
+            kept[output.name] = _colors(output, picture.rgb, truth)
+            continue
+        values = output.pictured(picture.of(output.name))
+        if output.kind in ("distance", "scalar"):
+            factor = unit if output.kind == "distance" else 1.0
+            kept[output.name] = (values * factor).float().cpu().numpy()
+        else:
+            opacity = picture.accumulation[..., None]  # directions of nothing are not shown
+            kept[output.name] = to_uint8(values * opacity + (1 - opacity) if output.kind == "direction" else values)
+    if any(values.dtype == np.float32 for values in kept.values()):
+        kept[ACCUMULATION.name] = to_uint8(picture.accumulation)
     return kept
+
+
+def _colors(output: Output, rgb: Tensor, truth: Tensor | None) -> np.ndarray:
+    """Return the picture (H, W, 3) or (H, W) uint8 of an output for which colours (H, W, 3) are enough."""
+    if output == RGB:
+        return to_uint8(rgb)
+    if truth is None:
+        raise ConfigError(f"--rendered-output-names {output.name}: only 'ns-render dataset' knows the true images")
+    return to_uint8(heat((rgb.clamp(0, 1) - truth).abs().mean(-1) / ERROR_AT_WHITE) if output == ERROR else truth)
 
 
 def distance_range(frames: Iterable[Arrays], name: str) -> tuple[float, float]:
@@ -102,7 +116,7 @@ def distance_range(frames: Iterable[Arrays], name: str) -> tuple[float, float]:
 
     Args:
         frames: what is kept of the frames.
-        name: name of the output, one of `DEPTHS`.
+        name: name of the output, a distance or another number.
     """
     ends = [
         depth_range(torch.from_numpy(kept[name]), torch.from_numpy(kept["accumulation"] >= OPAQUE))
@@ -117,7 +131,7 @@ def largest_distance(frames: Iterable[Arrays], name: str) -> float:
 
     Args:
         frames: what is kept of the frames.
-        name: name of the output, one of `DEPTHS`.
+        name: name of the output, a distance or another number.
     """
     return max((float(opaque_distance(kept, name).max(initial=0)) for kept in frames), default=0.0)
 
@@ -127,33 +141,33 @@ def opaque_distance(kept: Arrays, name: str) -> np.ndarray:
 
     Args:
         kept: what is kept of the frame.
-        name: name of the output, one of `DEPTHS`.
+        name: name of the output, a distance or another number.
     """
     seen = (kept["accumulation"] >= OPAQUE) & np.isfinite(kept[name])
     return np.where(seen, kept[name], 0).astype(np.float32)
 
 
+def is_number(values: np.ndarray) -> bool:
+    """Return whether `values` are numbers, which are shown in the colours of a range."""
+    return values.dtype == np.float32
+
+
 def shown_output(kept: Arrays, name: str, ranges: Mapping[str, tuple[float, float]]) -> np.ndarray:
     """Return the picture (H, W, 3) uint8 of an output.
 
-    Distances are in the colours of viridis, and like normals they fade to white where nothing is seen.
+    Numbers are in the colours of viridis, and fade to white where nothing is seen.
 
     Args:
         kept: what is kept of the frame.
         name: name of the output.
-        ranges: distances at the two ends of the colour map, by the output's name.
+        ranges: numbers at the two ends of the colour map, by the output's name.
     """
     values: Any = kept[name]
-    if name == "accumulation":
-        return np.repeat(values[..., None], 3, axis=-1)
-    if name not in ("normals", *DEPTHS):
-        return values
-    if name in DEPTHS:
-        near, far = ranges[name]
-        colors = viridis((torch.from_numpy(values) - near) / max(far - near, 1e-9))
-    else:
-        colors = torch.from_numpy(values).float() / 255
-    opacity = torch.from_numpy(kept["accumulation"]).float()[..., None] / 255
+    if not is_number(values):
+        return values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=-1)
+    near, far = ranges[name]
+    colors = viridis((torch.from_numpy(values) - near) / max(far - near, 1e-9))
+    opacity = torch.from_numpy(kept[ACCUMULATION.name]).float()[..., None] / 255
     return to_uint8(colors * opacity + (1 - opacity))
 
 

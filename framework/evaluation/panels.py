@@ -11,6 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from nerfloom.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
+from nerfloom.rendering.outputs import ACCUMULATION, MEDIAN_DEPTH, Output
+from nerfloom.rendering.rendered import Picture
 
 SMALLEST_WIDTH = 160
 """Minimum width of a panel, pixels; smaller images are enlarged by a whole number."""
@@ -34,30 +36,45 @@ class Panel:
     """(N, 3) colours of the bar from left to right; None for no bar."""
 
 
-def view_panels(prediction: Tensor, target: Tensor, depth: Tensor, accumulation: Tensor) -> list[Panel]:
-    """Return panels of the true image, render, error, depth and opacity of a view.
-
-    Depth is shown where opacity is above one half, from its 2nd to its 98th percentile there.
+def view_panels(prediction: Tensor, target: Tensor, picture: Picture) -> list[Panel]:
+    """Return panels of the true image, render, error, depth, opacity and further outputs of a view.
 
     Args:
         prediction, target: (H, W, 3) rendered and true image in [0, 1].
-        depth: (H, W) distance along the ray, scene units.
-        accumulation: (H, W) opacity, 0 to 1.
+        picture: what was rendered.
     """
     ramp = torch.linspace(0, 1, 256)
     error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
-    solid = accumulation > 0.5
-    near, far = depth_range(depth, solid)
-    shade = viridis(((depth - near) / max(far - near, 1e-9)).clamp(0, 1))
-    shade = torch.where(solid[..., None], shade, torch.ones_like(shade))
-    opacity = accumulation.clamp(0, 1)
-    return [
+    panels = [
         Panel("photograph", target),
         Panel("render", prediction),
         Panel("error", heat(error), ("0", f"{ERROR_AT_WHITE:g} or more"), heat(ramp[None])[0]),
-        Panel("depth, scene units", shade, (f"{near:.3g}", f"{far:.3g}"), viridis(ramp)),
-        Panel("opacity", opacity[..., None].expand(-1, -1, 3), ("0", "1"), ramp[:, None].expand(-1, 3)),
     ]
+    for output in (MEDIAN_DEPTH, ACCUMULATION, *picture.outputs):
+        image, ends = as_colors(picture, output)
+        bar = None if ends is None else viridis(ramp)
+        if output.kind == "opacity":
+            ends, bar = ("0", "1"), ramp[:, None].expand(-1, 3)
+        panels.append(Panel(output.label or output.name, image, ends, bar))
+    return panels
+
+
+def as_colors(picture: Picture, output: Output) -> tuple[Tensor, tuple[str, str] | None]:
+    """Return an output of a picture as colours (H, W, 3), and the texts at the ends of its range, if it is a number.
+
+    Numbers are shown where opacity is above one half, from their 2nd to their 98th percentile there.
+
+    Args:
+        picture: the rendered view.
+        output: one of its outputs.
+    """
+    values = output.pictured(picture.of(output.name)).float()
+    if output.kind not in ("distance", "scalar"):
+        return (values if values.dim() == 3 else values[..., None].expand(-1, -1, 3)).clamp(0, 1), None
+    solid = picture.accumulation > 0.5
+    near, far = depth_range(values, solid)
+    shade = viridis(((values - near) / max(far - near, 1e-9)).clamp(0, 1))
+    return torch.where(solid[..., None], shade, torch.ones_like(shade)), (f"{near:.3g}", f"{far:.3g}")
 
 
 def depth_range(depth: Tensor, solid: Tensor) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from nerfloom.evaluation.images import write_image
-from nerfloom.evaluation.panels import composed, view_panels
+from nerfloom.evaluation.panels import as_colors, composed, view_panels
 from nerfloom.rendering.rendered import Picture
 
 WORST = "worst"
@@ -67,14 +67,12 @@ class ViewFiles:
             self._write(WORST, self._worst)
 
     def _write(self, stem: str, judged: Judged) -> None:
-        """Write a view's rendered image, true image, comparison and normals, unless a file before could not be."""
+        """Write the files of a view (render, photograph, comparison, further outputs), unless writing failed before."""
         if self._folder is None or self.note is not None:
             return
         rgb, target, picture = judged
-        panels = view_panels(rgb, target, picture.median_depth, picture.accumulation)
-        files = {"": rgb, "_photograph": target, "_comparison": composed(panels)}
-        if picture.normals is not None:
-            files["_normals"] = (picture.normals + 1) / 2
+        files = {"": rgb, "_photograph": target, "_comparison": composed(view_panels(rgb, target, picture))}
+        files |= {f"_{output.name}": as_colors(picture, output)[0] for output in picture.outputs}
         try:
             for suffix, image in files.items():
                 write_image(self._folder / f"{stem}{suffix}.png", image)

@@ -12,9 +12,9 @@ from torch import Tensor
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels import draw_pixels
 from nerfloom.evaluation.evaluator import evaluation_background
-from nerfloom.kernels.math import safe_normalize
 from nerfloom.model import Model
 from nerfloom.ray_model import RayModel
+from nerfloom.rendering.outputs import NORMALS
 
 OPAQUE = 0.5
 """Minimum opacity of a ray that ends on a surface."""
@@ -66,7 +66,8 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
         depth = out.median_depth.float()
         positions = rays.origins + depth[:, None] * rays.directions
         selected = (out.accumulation >= OPAQUE) & (depth < rays.fars) & _within(model, positions, reach)
-        normals = None if out.normals is None else safe_normalize(out.normals.float())[selected].cpu()
+        normals = out.extras.get(NORMALS.name)
+        normals = None if normals is None else NORMALS.finished(normals)[selected].cpu()
         yield SurfacePoints(
             positions[selected].cpu(),
             out.rgb.float().clamp(0, 1)[selected].cpu(),
@@ -102,7 +103,8 @@ def picture_points(model: Model[Any], dataset: Dataset, count: int, reach: float
         selected = opaque & (depth < rays.fars) & _within(model, places, reach)
         if (kept := dataset.kept_of(index)) is not None:
             selected &= kept.to(model.device).reshape(-1)[pixels]
-        normals = None if picture.normals is None else picture.normals.reshape(-1, 3)[pixels][selected].cpu()
+        normals = picture.extras.get(NORMALS.name)
+        normals = None if normals is None else normals.reshape(-1, 3)[pixels][selected].cpu()
         yield SurfacePoints(
             places[selected].cpu(),
             picture.rgb.clamp(0, 1).reshape(-1, 3)[pixels][selected].cpu(),

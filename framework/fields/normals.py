@@ -79,11 +79,11 @@ def normal_penalties(
         samples: N samples of R rays.
 
     Returns:
-        "normals" (R,), the weighted difference from the normals of the density, and "orientation" (R,), the weighted
-        squared cosine of predicted normals that face away from the camera.
+        "normals_penalty" (R,), the weighted difference from the normals of the density, and "orientation_penalty" (R,),
+        the weighted squared cosine of predicted normals that face away from the camera.
     """
     weights = weights.detach()
     is_defined = normals.square().sum(-1)  # 0 where the density's gradient is 0, else 1
     apart = weights * is_defined * (1 - (predicted * normals).sum(-1))
     away = weights * (predicted * directions).sum(-1).clamp(min=0).square()
-    return {"normals": ray_sum(apart, samples), "orientation": ray_sum(away, samples)}
+    return {"normals_penalty": ray_sum(apart, samples), "orientation_penalty": ray_sum(away, samples)}

@@ -43,6 +43,7 @@ class SphereRenderer(Renderer):
     def __init__(self, renderer: Renderer, sphere: Tensor, field: Field, sampler: Sampler, endless: bool) -> None:
         super().__init__()
         self.renderer, self.field, self.sampler, self.endless = renderer, field, sampler, endless
+        self.outputs = renderer.outputs
         self.behind = VolumeRenderer()
         self.register_buffer("sphere", sphere.clone())
 
@@ -64,7 +65,7 @@ class SphereRenderer(Renderer):
 def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Tensor], Tensor]) -> Rendered:
     """Return what is seen of R rays: the inside, and behind it the outside.
 
-    Samples, weights, normals and penalties are those of the inside.
+    Samples, weights and further values are those of the inside.
 
     Args:
         inside: the inside before a black background.
@@ -77,10 +78,10 @@ def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Te
         share = torch.where(accumulation > 1e-6, inside.accumulation / accumulation, 1.0)  # of what is seen
         depth = torch.lerp(distances(outside.depth), inside.depth, share)
         median = torch.where(inside.accumulation >= 0.5, inside.median_depth, distances(_median(outside, left)))
-    coarse = None
+    extras = dict(inside.extras)
     if inside.coarse is not None or outside.coarse is not None:
-        levels = [replace(level.coarse or level, coarse=None) for level in (inside, outside)]
-        coarse = over_background(levels[0], levels[1], distances)
+        levels = [level.coarse or replace(level, extras={}) for level in (inside, outside)]
+        extras["coarse"] = over_background(levels[0], levels[1], distances)
     return replace(
         inside,
         rgb=inside.rgb + left[:, None] * outside.rgb,
@@ -88,7 +89,7 @@ def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Te
         median_depth=median,
         accumulation=accumulation,
         num_samples=inside.num_samples + outside.num_samples,
-        coarse=coarse,
+        extras=extras,
     )
 
 

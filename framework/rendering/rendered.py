@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
+from nerfloom.rendering.outputs import Output
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,8 @@ class Pixels:
     """(P,) distance at which the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
     accumulation: Tensor
     """(P,) opacity."""
-    normals: Tensor | None = None
-    """(P, 3) mean normal, not of unit length; None if the method has no normals."""
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+    """Further outputs (P, ...) by name."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +48,16 @@ class Rendered:
     """(N,) weight of each sample."""
     samples: Samples | None = None
     """The samples."""
-    coarse: Rendered | None = None
-    """Rendered values of the coarse level, if it is supervised too."""
-    normals: Tensor | None = None
-    """(R, 3) weighted sum of the samples' normals; None if the method has no normals."""
-    penalties: dict[str, Tensor] = field(default_factory=dict)
-    """Terms (R,) of the loss by name that depend on values of single samples."""
+    extras: Mapping[str, Any] = field(default_factory=dict)
+    """Further values by name, tensors (R, ...): outputs that the renderer declares, and what losses look at. `coarse`
+    is the coarse level, if it is supervised too."""
     error_bound: float = 0.0
     """Maximum error of a colour channel that the early stop of rays causes."""
+
+    @property
+    def coarse(self) -> Rendered | None:
+        """Rendered values of the coarse level; None if there is none."""
+        return self.extras.get("coarse")
 
     def over(self, coarse: Rendered) -> Rendered:
         """Return these values with those of the coarse level attached, and the evaluations of both levels added up.
@@ -60,22 +65,26 @@ class Rendered:
         Args:
             coarse: the coarse level, rendered on the same rays.
         """
-        return replace(self, coarse=coarse, num_samples=self.num_samples + coarse.num_samples)
+        extras = {**self.extras, "coarse": coarse}
+        return replace(self, extras=extras, num_samples=self.num_samples + coarse.num_samples)
 
-    def to_pixels(self, rays_per_pixel: int = 1) -> Pixels:
+    def to_pixels(self, rays_per_pixel: int = 1, outputs: Sequence[Output] = ()) -> Pixels:
         """Average the rays of each pixel.
 
-        Colour, opacity and normal are means over the rays. The depth is a mean weighted by the opacity of the rays,
-        and the median depth is the median of the rays' own.
+        Colour and opacity are means over the rays. The depth is a mean weighted by the opacity of the rays, and the
+        median depth is the median of the rays' own.
 
         Args:
             rays_per_pixel: number of consecutive rays that form a pixel.
+            outputs: further outputs that the pixels get, as far as the rays have them.
 
         Returns:
             R / rays_per_pixel pixels.
         """
+        found = [output for output in outputs if output.name in self.extras]
+        extras = {output.name: output.averaged(self.extras[output.name], rays_per_pixel) for output in found}
         if rays_per_pixel == 1:
-            return Pixels(self.rgb, self.depth, self.median_depth, self.accumulation, self.normals)
+            return Pixels(self.rgb, self.depth, self.median_depth, self.accumulation, extras)
         shape = (-1, rays_per_pixel)
         share, depth = self.accumulation.detach().view(shape), self.depth.view(shape)
         visible = share.sum(1) > 1e-6
@@ -85,7 +94,7 @@ class Rendered:
             depth=(depth * share).sum(1) / share.sum(1),
             median_depth=self.median_depth.view(shape).median(1).values,
             accumulation=self.accumulation.view(shape).mean(1),
-            normals=None if self.normals is None else self.normals.view(*shape, 3).mean(1),
+            extras=extras,
         )
 
 
@@ -101,10 +110,20 @@ class Picture:
     """(H, W) distance along the ray at which the transmittance falls to 0.5, scene units."""
     accumulation: Tensor
     """(H, W) opacity."""
-    normals: Tensor | None = None
-    """(H, W, 3) unit normals, scene coordinates, pointing away from surfaces; None if the method has no normals."""
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+    """Further outputs (H, W, ...) by name."""
+    outputs: tuple[Output, ...] = ()
+    """What `extras` are, as the model declares them (`Model.outputs`)."""
     num_rays: int = 0
     """Number of rays that were cast for the image; 0 if the method casts none."""
+
+    def of(self, name: str) -> Tensor:
+        """Return the values (H, W, ...) of an output.
+
+        Args:
+            name: name of the output.
+        """
+        return self.extras[name] if name in self.extras else getattr(self, name)
 
     @property
     def size(self) -> tuple[int, int]:

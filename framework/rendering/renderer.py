@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from nerfloom.base.optimised import Optimised
 from nerfloom.fields.base import Field
 from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.rendering.outputs import Output
 from nerfloom.rendering.rendered import Rendered
 
 
@@ -20,6 +21,8 @@ class Renderer(nn.Module, ABC):
 
     optimised: Optimised | None = None
     """Optimiser settings of its parameters; those of the model if None."""
+    outputs: tuple[Output, ...] = ()
+    """What it computes beside colours, depths and opacity, and pictures show (`Rendered.extras`)."""
 
     @abstractmethod
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:

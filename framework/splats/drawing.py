@@ -14,6 +14,7 @@ from nerfloom.geometry.lenses import LENSES, Distortion
 from nerfloom.kernels.splat_blend import CHANNELS, Blended, blend
 from nerfloom.kernels.splat_project import SplatCamera, project_gaussians, sort_keys
 from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.look import OURS, Look
@@ -153,4 +154,4 @@ def draw_view(gaussians: Gaussians, camera: SplatCamera, stride: int, background
     normals = torch.nn.functional.normalize(image[..., 4:7], dim=-1)
     parts = (image[..., :3], depth, torch.where(median > 0, median, far), opacity, normals)
     rgb, depth, median, opacity, normals = (every(part, stride) for part in parts)
-    return Picture(rgb, depth, median, opacity, normals)
+    return Picture(rgb, depth, median, opacity, {NORMALS.name: normals}, (NORMALS,))

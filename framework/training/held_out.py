@@ -94,7 +94,7 @@ class HeldOut:
         background = evaluation_background(self.model)
         picture, seconds = timed_view(self.model, dataset.view(index), background)
         target = composite(dataset.image(index).float() / 255, background)
-        panels = view_panels(picture.rgb.clamp(0, 1), target, picture.median_depth, picture.accumulation)
+        panels = view_panels(picture.rgb.clamp(0, 1), target, picture)
         self._picture_seconds += seconds
         board.image("eval/comparison", composed(panels), step)
 

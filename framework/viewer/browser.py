@@ -10,7 +10,7 @@ import numpy as np
 
 from nerfloom.evaluation.outputs import Arrays, distance_range
 from nerfloom.viewer.canvas import enlarged, paste
-from nerfloom.viewer.drawing import colored
+from nerfloom.viewer.drawing import colored, number_kept
 from nerfloom.viewer.pace import Piece, Rays, Speed, Waiting, refinement
 from nerfloom.viewer.request import Request
 
@@ -75,7 +75,7 @@ class Browser:
         """
         self.drawn, self.stride, self.step, self.pieces = request, stride, step, left
         self._canvas = dict(kept)
-        self._range = distance_range([kept], "median_depth") if "median_depth" in kept else None
+        self._range = None if (name := number_kept(kept)) is None else distance_range([kept], name)
         self.show(colored(kept, self._range), ROUGH_QUALITY if left else FINE_QUALITY)
 
     def renew(self, speed: Speed, rays: Rays, step: int, seconds: float) -> None:
@@ -107,6 +107,6 @@ class Browser:
         if next(iter(self._canvas.values())).shape[:2] != (height, width):
             self._canvas = enlarged(self._canvas, width, height)
         paste(self._canvas, kept, piece)
-        if not self.pieces and self._range is not None:
-            self._range = distance_range([self._canvas], "median_depth")
+        if not self.pieces and (name := number_kept(self._canvas)) is not None:
+            self._range = distance_range([self._canvas], name)
         self.show(colored(self._canvas, self._range), ROUGH_QUALITY if self.pieces else FINE_QUALITY)

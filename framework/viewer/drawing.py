@@ -14,15 +14,24 @@ from nerfloom.cameras.ndc import Ndc
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.appearance import appearance_of, shown_appearance
 from nerfloom.evaluation.evaluator import evaluation_background
-from nerfloom.evaluation.outputs import Arrays, distance_range, kept_outputs, rendered_outputs, shown_output
+from nerfloom.evaluation.outputs import (
+    ERROR,
+    Arrays,
+    distance_range,
+    is_number,
+    kept_outputs,
+    rendered_outputs,
+    shown_output,
+)
+from nerfloom.rendering.outputs import FIXED, MEDIAN_DEPTH, RGB
 from nerfloom.rendering.rendered import Picture
 from nerfloom.viewer.crop import picture_within
 from nerfloom.viewer.pace import Piece
 from nerfloom.viewer.request import Request
 from nerfloom.viewer.subject import Subject
 
-NAMES = {"rgb": "rgb", "depth": "median_depth", "accumulation": "accumulation", "normals": "normals", "error": "error"}
-"""Output of a request -> what is kept of a picture for it."""
+DEPTH, FLAWS = "depth", "error"
+"""Outputs with a meaning of their own here: the median depth, and the difference from a photograph."""
 Truth = Callable[[View, Tensor, Tensor], "Tensor | None"]
 """Function from a view, its picture (H, W, 3) and the background (3,) to the true image; None where it is unknown."""
 
@@ -46,7 +55,7 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
         background = background.new_tensor(request.background)
     with _appearance(subject, request.appearance), torch.no_grad():
         if request.output == "rgb" and crop is None:
-            kept = rendered_outputs(model, view, background, ["rgb"], subject.unit)
+            kept = rendered_outputs(model, view, background, [RGB], subject.unit)
         else:
             if crop is None:
                 picture = model.render_view(view, background)
@@ -60,13 +69,11 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
 def _kept(
     subject: Subject, request: Request, view: View, picture: Picture, background: Tensor, truth: Truth | None
 ) -> Arrays:
-    name = NAMES[request.output]
-    if name == "normals" and picture.normals is None:
-        name = "rgb"
-    if name != "error":
-        return kept_outputs(picture, [name], subject.unit)
-    found = None if truth is None else truth(view, picture.rgb, background)
-    return kept_outputs(picture, ["rgb" if found is None else "error"], subject.unit, found)
+    if request.output == FLAWS:
+        found = None if truth is None else truth(view, picture.rgb, background)
+        return kept_outputs(picture, [RGB if found is None else ERROR], subject.unit, found)
+    known = {output.name: output for output in (*FIXED, *subject.model.outputs)} | {DEPTH: MEDIAN_DEPTH}
+    return kept_outputs(picture, [known.get(request.output, RGB)], subject.unit)
 
 
 def _appearance(subject: Subject, image: int | None) -> AbstractContextManager[None]:
@@ -76,15 +83,19 @@ def _appearance(subject: Subject, image: int | None) -> AbstractContextManager[N
     return shown_appearance(subject.model, appearance.vectors[image].detach())
 
 
-def colored(kept: Arrays, range_of_depth: tuple[float, float] | None = None) -> np.ndarray:
+def number_kept(kept: Arrays) -> str | None:
+    """Return the name of the number in `kept`, what was kept for an output; None if the output is no number."""
+    return next((name for name, values in kept.items() if is_number(values)), None)
+
+
+def colored(kept: Arrays, ends: tuple[float, float] | None = None) -> np.ndarray:
     """Return the picture (H, W, 3) uint8 of what was kept for one output.
 
     Args:
         kept: what was kept.
-        range_of_depth: distances at the ends of the colours of depth, units of the input; found in `kept` if None.
+        ends: numbers at the ends of the colours, if the output is a number; found in `kept` if None.
     """
-    name = next((name for name in kept if name != "accumulation"), "accumulation")
-    ranges = {}
-    if name == "median_depth":
-        ranges[name] = distance_range([kept], name) if range_of_depth is None else range_of_depth
-    return shown_output(kept, name, ranges)
+    name = number_kept(kept)
+    if name is None:
+        return shown_output(kept, next(iter(kept)), {})
+    return shown_output(kept, name, {name: distance_range([kept], name) if ends is None else ends})

@@ -13,21 +13,15 @@ from nerfloom.base.console import say
 from nerfloom.cameras.poses import looked_at
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
-from nerfloom.viewer.drawing import draw
-from nerfloom.viewer.pace import Piece
 from nerfloom.viewer.panel import Panel
 from nerfloom.viewer.path_panel import PathPanel
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.reports import curve, heading
-from nerfloom.viewer.request import Pose, Request
 from nerfloom.viewer.studio import Studio
-from nerfloom.viewer.subject import Subject
 
 if TYPE_CHECKING:
     import viser
 
-PROBE = 8
-"""Side of the picture by which it is found out whether a method has normals, pixels."""
 
 
 class Page:
@@ -45,7 +39,6 @@ class Page:
         self._renders: list[subprocess.Popen[bytes]] | None = [] if may_render else None
         self._panels: dict[int, list[Any]] = {}
         self._curve: Any = None
-        self._has_normals = has_normals(studio.subject)
         self._heading = server.gui.add_markdown("")
         with server.gui.add_folder("Learning curve", expand_by_default=False):
             self._place_of_curve = server.gui.add_folder(None)
@@ -64,7 +57,7 @@ class Page:
         number, studio = client.client_id, self._studio
         tabs = client.gui.add_tab_group()
         with tabs.add_tab("View"):
-            panel = Panel(client, studio, self._has_normals)
+            panel = Panel(client, studio)
         studio.enter(number, Browser(show))
         studio.ask(number, panel.request)
         parts: list[Any] = []
@@ -139,15 +132,3 @@ class Page:
             if process.poll() is None:
                 process.terminate()
                 say("viewer: the render was stopped; the same ns-render command goes on with it")
-
-
-def has_normals(subject: Subject) -> bool:
-    """Return whether a method's pictures have normals, as a small one shows.
-
-    Args:
-        subject: what is looked at.
-    """
-    pose = Pose((1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0), 1.0)
-    time = 0.0 if subject.model.scene.moving else None
-    request = Request(pose, PROBE, PROBE, output="normals", time=time)
-    return "normals" in draw(subject, request, Piece(1, 1, 0, PROBE), None)

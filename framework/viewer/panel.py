@@ -38,15 +38,15 @@ class Panel:
     Args:
         client: the browser.
         studio: draws its pictures.
-        has_normals: whether the method has normals.
     """
 
-    def __init__(self, client: viser.ClientHandle, studio: Studio, has_normals: bool) -> None:
+    def __init__(self, client: viser.ClientHandle, studio: Studio) -> None:
         self._client, self._studio = client, studio
         scene = studio.subject.model.scene
-        outputs = [name for name in OUTPUTS if (name != "normals" or has_normals) and not self._is_useless(name)]
+        declared = [output.name for output in studio.subject.model.outputs]
+        self._outputs = [*OUTPUTS[:-1], *declared, *(() if scene.warped else OUTPUTS[-1:])]
         gui = client.gui
-        self._output = gui.add_dropdown("Output", outputs, initial_value="rgb")
+        self._output = gui.add_dropdown("Output", self._outputs, initial_value="rgb")
         self._size = gui.add_dropdown(
             "Resolution", SIZES, initial_value=SIZES[0], hint="Longest side of the finished picture, pixels."
         )
@@ -66,9 +66,6 @@ class Panel:
             if handle is not None:
                 handle.on_update(self._changed)
         client.camera.on_update(self._moved)
-
-    def _is_useless(self, output: str) -> bool:
-        return output == "error" and self._studio.subject.model.scene.warped
 
     def _add_appearance(self) -> Any:
         appearance = appearance_of(self._studio.subject.model)
@@ -112,7 +109,7 @@ class Panel:
             pose,
             width,
             height,
-            output=one_of(self._output.value, OUTPUTS),
+            output=one_of(self._output.value, self._outputs),
             time=None if self._time is None else number_in(self._time.value, 0, 1, 0),
             appearance=self._image(),
             background=color_of(self._background.value) if self._own_background.value is True else None,

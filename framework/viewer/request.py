@@ -19,8 +19,8 @@ ANGLES = (0.5, 170.0)
 """Range of the vertical field of view, degrees."""
 LARGEST_SIDE, SMALLEST_SIDE = 4096, 8
 """Range of the width and the height of a picture, pixels."""
-OUTPUTS = ("rgb", "depth", "accumulation", "normals", "error")
-"""Outputs that a browser can ask for."""
+OUTPUTS = ("rgb", "depth", "accumulation", "error")
+"""Outputs that a browser can ask for of every method; a method may declare others."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Request:
     height: int
     """Height of the finished picture, pixels."""
     output: str = "rgb"
-    """Output, one of `OUTPUTS`."""
+    """Name of the output: one of `OUTPUTS`, or of those that the method declares."""
     time: float | None = None
     """Time in [0, 1]; None for a static scene."""
     appearance: int | None = None

@@ -68,7 +68,7 @@ def shows_a_ball(monkeypatch: pytest.MonkeyPatch, capture_run: Path) -> float:
         hit = ~depth.isnan()
         depth = torch.where(hit, depth, 1000.0)
         rgb = torch.where(hit[..., None], torch.tensor(0.25), background)
-        return Picture(rgb, depth, 2 * depth, hit.float(), None)
+        return Picture(rgb, depth, 2 * depth, hit.float())
 
     monkeypatch.setattr(RayModel, "render_view", render_view)
     return scale
@@ -316,7 +316,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     assert "--radius is -1; it must be above zero" in said("spiral", nowhere, "--radius", -1)
     avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi", status=2)
     assert avi.endswith("the extension must be .mp4, .gif, .webp, .png, or none for a folder of images")
-    assert "this method has none" in said("orbit", ball_run, names, "normals", "--num-frames", 1, status=1)
+    assert "no such output" in said("orbit", ball_run, names, "normals", "--num-frames", 1, status=1)
     assert not list(tmp_path.iterdir())
     path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
     assert said(*path, status=1).endswith("none: No such file or directory")

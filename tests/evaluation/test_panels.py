@@ -8,15 +8,19 @@ from torch import Tensor
 
 from nerfloom.evaluation.images import ERROR_AT_WHITE
 from nerfloom.evaluation.panels import VIRIDIS, composed, depth_range, view_panels, viridis
+from nerfloom.rendering.outputs import NORMALS
+from nerfloom.rendering.rendered import Picture
 
 
-def view(height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Render, photograph, depth and opacity: solid on the left, and nothing, infinitely far away, on the right."""
+def view(height: int, width: int) -> tuple[Tensor, Tensor, Picture]:
+    """Render, photograph and picture: solid on the left, and nothing, infinitely far away, on the right."""
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(height, width, 3, generator=generator)
     solid = (torch.arange(width) < width // 2).float().expand(height, width)
     depth = torch.where(solid > 0, torch.linspace(2, 4, height)[:, None], torch.inf)
-    return (target + ERROR_AT_WHITE).clamp(0, 1), target, depth, solid
+    rendered = (target + ERROR_AT_WHITE).clamp(0, 1)
+    facing = torch.tensor([0.0, 0.0, 1.0]).expand(height, width, 3)
+    return rendered, target, Picture(rendered, depth, depth, solid, {"normals": facing}, (NORMALS,))
 
 
 def boxes(picture: Tensor, height: int, width: int, count: int) -> list[Tensor]:
@@ -34,8 +38,9 @@ def boxes(picture: Tensor, height: int, width: int, count: int) -> list[Tensor]:
 @pytest.mark.parametrize(("height", "width", "factor"), [(24, 24, 7), (3, 5, 32), (200, 160, 1), (90, 400, 1)])
 def test_every_part_is_there_whole_between_gaps(height: int, width: int, factor: int) -> None:
     panels = view_panels(*view(height, width))
-    assert [panel.label for panel in panels] == ["photograph", "render", "error", "depth, scene units", "opacity"]
-    found = boxes(composed(panels), height * factor, width * factor, 5)
+    labels = ["photograph", "render", "error", "depth, scene units", "opacity", "normals"]
+    assert [panel.label for panel in panels] == labels
+    found = boxes(composed(panels), height * factor, width * factor, 6)
     for panel, part in zip(panels, found, strict=True):
         expected = panel.image.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
         torch.testing.assert_close(part, expected, atol=0.6 / 255, rtol=0)
@@ -55,9 +60,10 @@ def test_labels_and_ranges_are_written_in_the_margins() -> None:
 
 
 def test_the_error_reaches_white_and_depth_its_ends() -> None:
-    _, target, depth, solid = view(50, 20)
+    _, target, picture = view(50, 20)
+    depth, solid = picture.median_depth, picture.accumulation
     flat = torch.full_like(target, 0.5)
-    error, depths = view_panels(flat + ERROR_AT_WHITE, flat, depth, solid)[2:4]
+    error, depths = view_panels(flat + ERROR_AT_WHITE, flat, picture)[2:4]
     assert bool((error.image == 1).all())
     assert error.ends == ("0", "0.25 or more")
     near, far = depth_range(depth, solid > 0.5)
@@ -70,7 +76,8 @@ def test_the_error_reaches_white_and_depth_its_ends() -> None:
 
 def test_a_view_of_nothing_has_no_depth() -> None:
     nothing = torch.zeros(8, 8)
-    picture = composed(view_panels(torch.ones(8, 8, 3), torch.ones(8, 8, 3), nothing + torch.nan, nothing))
+    white, unknown = torch.ones(8, 8, 3), nothing + torch.nan
+    picture = composed(view_panels(white, white, Picture(white, unknown, unknown, nothing)))
     assert bool(torch.isfinite(picture).all())
     assert depth_range(nothing + torch.inf, nothing > 1) == (0.0, 0.0)
 

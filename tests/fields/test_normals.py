@@ -57,8 +57,8 @@ def test_penalties_in_closed_form() -> None:
     predicted = normals * torch.tensor([[1.0], [-1.0]])
     directions = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]])
     found = normal_penalties(predicted, normals, directions, torch.tensor([0.5, 0.5]), samples)
-    assert found["normals"].tolist() == [0.0, 1.0]
-    assert found["orientation"].tolist() == [0.0, 0.5]
+    assert found["normals_penalty"].tolist() == [0.0, 1.0]
+    assert found["orientation_penalty"].tolist() == [0.0, 0.5]
 
 
 def test_the_head_learns_a_balls_normals() -> None:
@@ -70,7 +70,7 @@ def test_the_head_learns_a_balls_normals() -> None:
         positions = torch.rand(256, 3) * 2 - 1
         found = density_normals(ball, Points(positions))
         predicted = head(positions, positions)
-        loss = normal_penalties(predicted, found, -positions, torch.ones(256), samples)["normals"].mean()
+        loss = normal_penalties(predicted, found, -positions, torch.ones(256), samples)["normals_penalty"].mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -76,8 +76,7 @@ def test_a_picture_tells_depth_opacity_and_normals() -> None:
     assert float(picture.depth[16, 16]) == pytest.approx(3.0, abs=1e-4)
     assert float(picture.median_depth[16, 16]) == pytest.approx(3.0, abs=1e-4)
     assert float(picture.accumulation[16, 16]) == pytest.approx(0.999, abs=1e-5)
-    assert picture.normals is not None
-    torch.testing.assert_close(picture.normals[16, 16], torch.tensor([0.0, 0.0, 1.0]))
+    torch.testing.assert_close(picture.extras["normals"][16, 16], torch.tensor([0.0, 0.0, 1.0]))
     assert float(picture.depth[0, 0]) == float(picture.median_depth[0, 0]) == 9.0
     assert float(picture.accumulation[0, 0]) == 0
     coarse = draw_view(ball(), seen, 4, torch.zeros(3), 9.0)

@@ -109,7 +109,8 @@ def test_points_are_where_half_of_the_light_is_gone_and_within_reach_of_the_box(
         depth = 3.0 + 2 * (count % 7) / 7
         places = rays.origins + depth[:, None] * rays.directions
         accumulation = torch.where(count % 5 == 0, 0.4, 1.0)
-        return Rendered(places.sin().abs(), torch.full_like(depth, 0.5), depth, accumulation, 0, normals=places)
+        half, normals = torch.full_like(depth, 0.5), {"normals": places}
+        return Rendered(places.sin().abs(), half, depth, accumulation, 0, extras=normals)
 
     monkeypatch.setattr(model, "render", render)
     found: Any = joined(surface_points(model, trainer.train_set, 3000, reach))

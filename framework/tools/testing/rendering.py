@@ -67,10 +67,9 @@ def require_rendered(rendered: Rendered, count: int, when: str) -> None:
     shapes: dict[str, tuple[int, ...]] = {"rgb": (count, 3)}
     shapes |= {name: (count,) for name in ("depth", "median_depth", "accumulation")}
     values = {name: getattr(rendered, name) for name in shapes}
-    if rendered.normals is not None:
-        shapes["normals"], values["normals"] = (count, 3), rendered.normals
-    for name, value in rendered.penalties.items():
-        shapes[f"penalties['{name}']"], values[f"penalties['{name}']"] = (count,), value
+    for name, value in rendered.extras.items():
+        if isinstance(value, Tensor):
+            shapes[f"extras['{name}']"], values[f"extras['{name}']"] = (count, *value.shape[1:]), value
     if rendered.samples is not None and rendered.weights is not None:
         shapes["weights"], values["weights"] = (len(rendered.samples),), rendered.weights
         if rendered.samples.num_rays != count:
@@ -107,8 +106,10 @@ def check_view(subject: Subject) -> str:
         shapes = {"rgb": (*size, 3), "depth": size, "median_depth": size, "accumulation": size}
         for name, shape in shapes.items():
             _require(getattr(picture, name), shape, f"{name} of a picture")
-        if picture.normals is not None:
-            _require(picture.normals, (*size, 3), "normals of a picture")
+        for output in learner.model.outputs:
+            if output.name not in picture.extras:
+                raise Fault(f"a picture lacks {output.name}, which the model declares as an output")
+            _require(picture.extras[output.name], (*size, *output.shape), f"{output.name} of a picture")
         colors = learner.colors()
         _require(colors, (*size, 3), "the result of render_rgb")
         if not torch.allclose(colors, picture.rgb, atol=1e-4):

@@ -403,8 +403,8 @@ BUGS = (
         "ply-normals-after-kept",
         "export",
         "framework/export/points.py",
-        "safe_normalize(out.normals.float())[selected].cpu()",
-        "safe_normalize(out.normals.float())[: int(selected.sum())].cpu()",
+        "NORMALS.finished(normals)[selected].cpu()",
+        "NORMALS.finished(normals)[: int(selected.sum())].cpu()",
         "points have the normals of others",
     ),
     Bug(

@@ -32,7 +32,7 @@ class RenderedBatch:
     @cached_property
     def pixels(self) -> Pixels:
         """The P pixels as rendered."""
-        return self.rendered.to_pixels(self.batch.rays_per_pixel)
+        return self.rendered.to_pixels(self.batch.rays_per_pixel, self.model.outputs)
 
 
 class LossTerm(ABC):

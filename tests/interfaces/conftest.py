@@ -14,6 +14,7 @@ METHODS = {
     "discs": "methods.discs",
     "cones": "methods.cones",
     "surface": "methods.surface",
+    "doubtful": "methods.doubtful",
 }
 HERE = Path(__file__).parent
 

@@ -5,23 +5,27 @@ import json
 from pathlib import Path
 
 import imageio.v3 as imageio
+import numpy as np
 import pytest
 
+import nerfloom
 from nerfloom.base.registry import load_method
 from nerfloom.tools.testing import check_method
 from tests.cli.helpers import called
 from tests.interfaces.conftest import HERE
 
-METHODS = ("discs", "cones", "surface")
+METHODS = ("discs", "cones", "surface", "doubtful")
 FLAGS = {
     "discs": "--max-num-iterations 250 --learning-rate 0.05",
     "cones": "--max-num-iterations 150 --num-rays-per-batch 256",
     "surface": "--max-num-iterations 150 --samples-per-batch 4096 --grid-resolution 16 --num-steps 64",
+    "doubtful": "--max-num-iterations 150 --samples-per-batch 4096 --grid-resolution 16 --num-steps 64",
 }
 SMALL = {
     "discs": {},
     "cones": {"num_samples": 16},
     "surface": {"samples_per_batch": 2**12, "grid_resolution": 16, "num_steps": 64},
+    "doubtful": {"samples_per_batch": 2**12, "grid_resolution": 16, "num_steps": 64, "num_levels": 4},
 }
 SCENE = "procedural --size 24 --num-train 8"
 
@@ -41,7 +45,7 @@ def test_each_is_trained_evaluated_and_rendered_by_the_commands(name: str, tmp_p
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "e" / name / "t"
     results = json.loads((folder / "eval.json").read_text())["results"]
-    assert results["psnr"] > {"discs": 13, "cones": 14, "surface": 14}[name], results
+    assert results["psnr"] > {"discs": 13, "cones": 14, "surface": 14, "doubtful": 14}[name], results
     assert called("ns-eval", folder, "--output-path", tmp_path / "again.json").returncode == 0
     again = json.loads((tmp_path / "again.json").read_text())["results"]["psnr"]
     assert again == pytest.approx(results["psnr"], abs=1e-4)
@@ -60,3 +64,27 @@ def test_each_keeps_what_every_method_must(name: str) -> None:
     failed = [finding.line() for finding in findings if not finding.ok]
     assert failed == []
     assert ("chunks" in {finding.check for finding in findings}) == (name != "discs")
+
+
+@pytest.mark.medium
+def test_an_output_of_ones_own_is_shown_wherever_pictures_are(tmp_path: Path) -> None:
+    """In the files of an evaluation, in a video beside the colours, in the viewer's list, and in Python."""
+    done = called(
+        "ns-train", "doubtful", *FLAGS["doubtful"].split(), "--vis", "none", "--output-dir", tmp_path,
+        "--timestamp", "t", "--experiment-name", "e", *SCENE.split(),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    folder = tmp_path / "e" / "doubtful" / "t"
+    (shown, *_) = sorted((folder / "pictures").glob("*_uncertainty.png"))
+    assert np.ptp(imageio.imread(shown)) > 50  # it differs between matter and nothing
+    flags = ["--num-frames", "2", "--rendered-output-names", "rgb", "uncertainty", str(folder)]
+    done = called("ns-render", "orbit", *flags, "--output-path", tmp_path / "orbit.gif")
+    assert done.returncode == 0, done.stderr
+    assert "uncertainty: " in done.stderr
+    assert imageio.imread(tmp_path / "orbit.gif").shape[1:3] == (24, 48)
+    run = nerfloom.load(folder)
+    picture = run.render(run.views("test")[0])
+    assert [output.name for output in picture.outputs] == ["uncertainty"]
+    assert float(picture.of("uncertainty").min()) >= 0.1
+    assert nerfloom.image(picture, "uncertainty").size == (24, 24)
+    assert called("ns-render", "orbit", folder, "--rendered-output-names", "doubt").returncode == 1

@@ -1,16 +1,16 @@
-"""Surface: a signed distance, whose intervals are as opaque as NeuS says (Wang et al. 2021, equation 13)."""
-
-from __future__ import annotations
+"""Surface: a signed distance, opaque as in NeuS (Wang et al. 2021, equation 13), whose gradient is to have length 1."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from nerfloom import Field, Method, Points, Scene
+from nerfloom import Field, Method, Points, RayModel, Scene
 from nerfloom.fields.base import MLP
+from nerfloom.kernels import dispatch
 from nerfloom.kernels.frequency import frequency_encoding
 from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.samplers.choice import SamplingConfig, decide_sampler, make_sampler
 
 
@@ -23,12 +23,7 @@ class SurfaceConfig(SamplingConfig, max_num_iterations=2_000, samples_per_batch=
 
 
 class SurfaceField(Field):
-    """A signed distance around a ball, and colour; opaque where the distance changes its sign.
-
-    Args:
-        radius: of the ball that it is at first, scene units.
-        sharpness: inverse of the width in which it turns opaque at first.
-    """
+    """A signed distance, at first of a ball of a `radius`, and colour; `sharpness` is as in the settings."""
 
     def __init__(self, radius: float, sharpness: float) -> None:
         super().__init__()
@@ -62,9 +57,24 @@ class SurfaceField(Field):
         return self.head(features, spherical_harmonics(directions)).float()
 
 
+class Eikonal(LossTerm):
+    """Mean squared difference of the length of the distance's gradient from 1 (Gropp et al. 2020), at some samples."""
+
+    def __call__(self, shown: RenderedBatch) -> Tensor:
+        positions = shown.rendered.samples.positions(shown.batch.rays)[::8].detach().requires_grad_()
+        with dispatch.derivatives(2):
+            distances, _ = shown.model.field.shape(positions)
+            (gradient,) = torch.autograd.grad(distances.sum(), positions, create_graph=True)
+            return (gradient.norm(dim=-1) - 1).square().sum() / max(len(positions), 1)
+
+
+class Surface(RayModel[SurfaceConfig]):
+    losses = (*RayModel.losses, Eikonal("eikonal", 0.01))
+
+
 def make_field(config: SurfaceConfig, scene: Scene) -> SurfaceField:
     """Return a ball of a quarter of the box's width."""
     return SurfaceField(float((scene.box[1] - scene.box[0]).min()) / 4, config.sharpness)
 
 
-METHOD = Method(SurfaceConfig(), paper="none", field=make_field, sampler=make_sampler, decide=decide_sampler)
+METHOD = Method(SurfaceConfig(), "none", make_field, make_sampler, model=Surface, decide=decide_sampler)

@@ -87,7 +87,11 @@ class Method:
         config, made = self.decide(config, scene)
         if isinstance(config, RayConfig):
             config, more = fill(config, depth_choice(scene))
-            config, _ = fill(config, Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""))
+            config, _ = fill(
+                config,
+                Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""),
+                Choice("samples_per_batch", None, "steps have a number of rays"),
+            )
             made = made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
         if isinstance(config, SamplingConfig):
             config, more = fill(config, sampler_choice(config, scene.unbounded))

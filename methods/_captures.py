@@ -16,7 +16,7 @@ from nerfloom import (
     Scene,
 )
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
-from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
@@ -39,7 +39,7 @@ class RefinedConfig(SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=
 
     RANGES: ClassVar[dict[str, Range]] = {"camera_learning_rate": AT_LEAST_0}
     """Allowed range of each numeric setting."""
-    camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
+    camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them and proposals choose the
     samples, else off."""
     camera_learning_rate: float = 1e-3
@@ -106,7 +106,7 @@ def decide_capture(
     Returns:
         The settings, and a record of each that was filled in.
     """
-    contracted = scene.unbounded if config.contraction is None else config.contraction
+    contracted = scene.unbounded if is_open(config.contraction) else config.contraction
     config, made = fill(config, refined_sampler_choice(config, contracted))
     around = "there may be something outside the box" if contracted else "the scene ends at its box"
     reason = f"contraction is {'on' if contracted else 'off'}"

@@ -62,7 +62,7 @@ class GaussianSplattingConfig(SplattingConfig):
     """Whether each training image has a transform of colours of its own. If not given: if light or exposure differ."""
     appearance_rate: float = 1e-3
     """Learning rate of these transforms."""
-    camera_optimizer: Literal["auto", "off", "SO3xR3", "SE3"] = "auto"
+    camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""

@@ -82,7 +82,7 @@ class MipNeRF360Config(
         "distortion_loss_mult": AT_LEAST_0,
     }
     """Allowed range of each numeric setting."""
-    encoding: Literal["auto", "integrated", "hash-grid"] = "auto"
+    encoding: Auto[Literal["integrated", "hash-grid"]] = AUTO
     """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
     distortion_loss_mult: Auto[float] = AUTO
     """Weight of the distortion loss. If not given: 0.01 in unbounded scenes, else 0."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Field, Method, Rays, Rendered, Renderer, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from nerfloom.base.decisions import Choice
+from nerfloom.base.decisions import Choice, is_open
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.multisampled import MultisampledHashGrid
@@ -91,7 +91,7 @@ class ZipNeRFConfig(
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        proposals = self.num_proposal_samples or PAPER_SAMPLES
+        proposals = PAPER_SAMPLES if is_open(self.num_proposal_samples) else self.num_proposal_samples
         if len({len(proposals), len(self.proposal_resolutions), len(self.interlevel_blurs)}) > 1:
             raise ConfigError(
                 "--num-proposal-samples, --proposal-resolutions and --interlevel-blurs need one number a proposal each"

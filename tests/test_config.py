@@ -164,7 +164,7 @@ class More(Settings, learning_rate=0.5, own=4):
 def test_class_keywords_change_defaults_and_nothing_else() -> None:
     assert (Settings().learning_rate, Settings().samples_per_batch, Settings().lr_schedule) == (0.25, 64, "cosine")
     assert (More().learning_rate, More().own, More().samples_per_batch) == (0.5, 4, 64)
-    assert (RayConfig().learning_rate, RayConfig().samples_per_batch) == (5e-4, None)
+    assert (RayConfig().learning_rate, RayConfig().samples_per_batch) == (5e-4, "auto")
     changed = {"learning_rate": 0.25, "samples_per_batch": 64, "lr_schedule": "cosine", "own": 3}
     assert to_plain(Settings()) == to_plain(RayConfig()) | changed
 

@@ -23,7 +23,7 @@ class OpenConfig(TrainConfig):
     """Cells."""
     fancy: Auto[bool] = AUTO
     """Whether fancy."""
-    shape: Literal["auto", "ball", "box"] = "auto"
+    shape: Auto[Literal["ball", "box"]] = AUTO
     """Of what it is."""
 
 
@@ -80,7 +80,7 @@ def test_every_method_decides_once(method: str, facts: dict) -> None:
 
 
 def test_what_nobody_decides_is_refused_by_name() -> None:
-    """A setting that one method leaves to the data may be None to the command line of all."""
+    """A setting that one method leaves to the data may be auto on the command line of all."""
     assert left_open(OpenConfig(fancy=True)) == ["num_cells", "shape"]
     assert left_open(OpenConfig(fancy=True, num_cells=3, shape="ball", experiment_name="auto")) == []
     for name, setting in {
@@ -89,8 +89,8 @@ def test_what_nobody_decides_is_refused_by_name() -> None:
         "gaussian-splatting": "lr_final",
     }.items():
         method = load_method(name)
-        config = dataclasses.replace(method.config, **{setting: None})
-        with pytest.raises(ConfigError, match=f"^--{setting.replace('_', '-')} is None, .* give a value$"):
+        config = dataclasses.replace(method.config, **{setting: AUTO})
+        with pytest.raises(ConfigError, match=f"^--{setting.replace('_', '-')} is auto, .* give a value$"):
             method.decided(config, SCENE)
 
 

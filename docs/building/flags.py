@@ -13,8 +13,11 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union
 
-from nerfloom.base.config import LEFT_TO_DATA, TrainConfig
+from nerfloom.base.config import AUTO, LEFT_TO_DATA, TrainConfig
 from nerfloom.cli.flag_groups import groups_of
+
+NO_VALUES = (type(None), Literal["auto"], LEFT_TO_DATA, ...)
+"""Arguments of a type that say nothing of its values."""
 
 
 def flag_tables(name: str, config: TrainConfig) -> str:
@@ -64,8 +67,10 @@ def row(member: str, shown: str, allowed: str, text: str) -> str:
 
 def default_of(value: Any, hint: Any) -> str:
     """Return a default as the command line takes it."""
+    if value == AUTO and LEFT_TO_DATA in getattr(hint, "__metadata__", ()):
+        return "*decided by the data*"
     if value is None:
-        return "*decided by the data*" if LEFT_TO_DATA in getattr(hint, "__metadata__", ()) else "*none*"
+        return "*none*"
     if isinstance(value, tuple):
         return f"`{' '.join(map(str, value))}`"
     return f"`{value}`"
@@ -84,13 +89,13 @@ def choices(hint: Any) -> tuple[Any, ...]:
     """Return the words that a setting may be; none if it is no choice between words."""
     if typing.get_origin(hint) is Literal:
         return typing.get_args(hint)
-    found = [choices(argument) for argument in typing.get_args(hint) if argument not in (type(None), LEFT_TO_DATA)]
+    found = [choices(argument) for argument in typing.get_args(hint) if argument not in NO_VALUES]
     return next(filter(None, found), ())
 
 
 def _kind(hint: Any) -> str:
     """Return the kind of a setting's values, in words."""
-    arguments = [argument for argument in typing.get_args(hint) if argument not in (type(None), LEFT_TO_DATA, ...)]
+    arguments = [argument for argument in typing.get_args(hint) if argument not in NO_VALUES]
     if typing.get_origin(hint) in (Union, UnionType) or hasattr(hint, "__metadata__"):
         return _kind(arguments[0])
     if typing.get_origin(hint) is tuple:

@@ -12,7 +12,7 @@ from typing import Any
 
 from flags import flag_tables, help_texts
 
-from nerfloom.base.config import LEFT_TO_DATA
+from nerfloom.base.config import AUTO, LEFT_TO_DATA
 from nerfloom.base.registry import Entry, load_method, registered
 from nerfloom.method import Method
 
@@ -78,7 +78,7 @@ def decided(method: Method) -> str:
     """Return the section on settings that are left to the data."""
     kind, config = type(method.config), method.config
     helps, hints = help_texts(kind), typing.get_type_hints(kind, include_extras=True)
-    open_ones = [name for name in hints if hasattr(config, name) and is_open(name, getattr(config, name), hints[name])]
+    open_ones = [name for name in hints if hasattr(config, name) and is_open(getattr(config, name), hints[name])]
     if not open_ones:
         return "## Left to the data\n\nNothing: every setting has a value by default."
     lead = "The run decides these when it has seen the data, and prints each with its reason."
@@ -86,11 +86,9 @@ def decided(method: Method) -> str:
     return f"## Left to the data\n\n{lead}\n\n" + "\n".join(lines)
 
 
-def is_open(name: str, value: Any, hint: Any) -> bool:
+def is_open(value: Any, hint: Any) -> bool:
     """Return whether the method's `decide` fills in a setting with this default."""
-    if value is None:
-        return LEFT_TO_DATA in getattr(hint, "__metadata__", ())
-    return value == "auto" and name not in ("background", "masks")  # which the trainer decides
+    return value == AUTO and LEFT_TO_DATA in getattr(hint, "__metadata__", ())
 
 
 def flags(name: str, method: Method) -> str:

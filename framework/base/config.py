@@ -29,17 +29,17 @@ if TYPE_CHECKING:
 else:
 
     class Auto:
-        """`Auto[T]`: a setting of type T that may be left to the data, by None, until `Method.decide` fills it in.
+        """`Auto[T]`: a setting of type T that may be left to the data, by `AUTO`, until `Method.decide` fills it in.
 
         Type checkers take it for T: what is built from settings is built after they were decided.
         """
 
         def __class_getitem__(cls, kind: Any) -> Any:
-            return Annotated[kind | None, LEFT_TO_DATA]
+            return Annotated[kind | Literal["auto"], LEFT_TO_DATA]
 
 
-AUTO: Any = None
-"""The default of an `Auto` setting."""
+AUTO: Any = "auto"
+"""Value of an `Auto` setting that is left to the data."""
 Range = tuple[float, float]
 """Minimum and maximum of a setting, both allowed."""
 AT_LEAST_0: Range = (0, math.inf)
@@ -169,8 +169,8 @@ class TrainConfig:
             raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {SMALLEST_EPS}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
-        rates = [rate for rate in (self.learning_rate, self.lr_final) if rate is not None]
-        if not all(rate > 0 for rate in rates) or (self.lr_final or 0) > 1:
+        rates = [rate for rate in (self.learning_rate, self.lr_final) if rate != AUTO]
+        if not all(rate > 0 for rate in rates) or (self.lr_final != AUTO and self.lr_final > 1):
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
 
 
@@ -199,7 +199,7 @@ class RayConfig(TrainConfig):
     """Rays averaged for a pixel, which covers an area, not a point. More rays are more accurate and slower."""
     train_rays_per_pixel_from: Auto[float] = 1.0
     """Share of the budget after which training averages as many rays per pixel; before, it uses one."""
-    samples_per_batch: int | None = None
+    samples_per_batch: Auto[int | None] = AUTO
     """Samples per training step; the number of rays is adjusted to reach about this many."""
     draw_by_error: bool = False
     """Draw half of the pixels in proportion to their recent error, with weights that keep the mean loss unbiased."""
@@ -251,7 +251,7 @@ class AppearanceConfig(TrainConfig):
 def _check_range(name: str, value: Any, least: float, most: float) -> None:
     """Refuse a setting, or a tuple of settings, with a number that is NaN, below `least` or above `most`."""
     for number in value if isinstance(value, tuple) else (value,):
-        if number is not None and not least <= number <= most:
+        if number not in (None, AUTO) and not least <= number <= most:
             allowed = f"at least {least}" if most == math.inf else f"from {least} to {most}"
             raise ConfigError(f"{_flag(name)} is {shown(number)}; it must be {allowed}")
 
@@ -307,7 +307,9 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        return _convert(value, next(a for a in arguments if a is not type(None)), where)
+        if Literal["auto"] in arguments and (value == AUTO or value is None):  # null in files of older runs
+            return AUTO
+        return _convert(value, next(a for a in arguments if a not in (type(None), Literal["auto"])), where)
     if origin is Literal:
         if value in arguments:
             return value

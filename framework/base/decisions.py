@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
-from nerfloom.base.config import LEFT_TO_DATA, TrainConfig
+from nerfloom.base.config import AUTO, LEFT_TO_DATA, TrainConfig
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
-BY_IMAGES = ("masks", "background", "start")
-"""Settings whose "auto" stays after `Method.decide`: the images and their points decide it, which that does not see."""
-
-
 @dataclass(frozen=True)
 class Decision:
     """A record of a setting that was chosen by the data, for the user."""
@@ -53,20 +49,15 @@ class Choice:
 
 
 def is_open(value: Any) -> bool:
-    """Return whether `value` leaves a setting open: None or "auto"."""
-    return value is None or value == "auto"
+    """Return whether `value` leaves a setting to the data."""
+    return isinstance(value, str) and value == AUTO
 
 
 def left_open(config: TrainConfig) -> list[str]:
-    """Return the names of the settings that are still left to the data: None of an `Auto` setting, or "auto"."""
+    """Return the names of the `Auto` settings that are still left to the data."""
     kinds = get_type_hints(type(config), include_extras=True)
-    return [name for name, kind in kinds.items() if _may_be_open(name, kind) and is_open(getattr(config, name))]
-
-
-def _may_be_open(name: str, kind: Any) -> bool:
-    """Return whether a setting `name` of type `kind` may be left to the data, and `Method.decide` must decide it."""
-    chosen = get_origin(kind) is Literal and "auto" in get_args(kind) and name not in BY_IMAGES
-    return chosen or LEFT_TO_DATA in getattr(kind, "__metadata__", ())
+    may_be = [name for name, kind in kinds.items() if LEFT_TO_DATA in getattr(kind, "__metadata__", ())]
+    return [name for name in may_be if is_open(getattr(config, name))]
 
 
 def fill(config: ConfigT, *choices: Choice) -> tuple[ConfigT, list[Decision]]:

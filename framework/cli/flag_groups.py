@@ -20,7 +20,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from nerfloom.base.config import LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
+from nerfloom.base.config import AUTO, LEFT_TO_DATA, AppearanceConfig, RayConfig, TrainConfig
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.flag_text import hide_none, plain
 from nerfloom.data.dataset import DataParser
@@ -137,6 +137,6 @@ def _checked(make: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _flag(field: StructFieldSpec) -> StructFieldSpec:
-    """Return a field whose flag has no prefix, and whose default is not shown as None if it depends on the data."""
-    is_open = field.default is None and LEFT_TO_DATA in getattr(field.type, "__metadata__", ())
+    """Return a field whose flag has no prefix, and whose default is said to depend on the data if it does."""
+    is_open = field.default == AUTO and LEFT_TO_DATA in getattr(field.type, "__metadata__", ())
     return plain(field, prefix_name=False, **{"help_behavior_hint": DECIDED} if is_open else {})

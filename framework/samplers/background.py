@@ -11,7 +11,7 @@ from typing import ClassVar, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import Range
+from nerfloom.base.config import AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, Decision, fill
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.scene import Scene
@@ -29,7 +29,7 @@ class BackgroundConfig(SamplingConfig):
 
     RANGES: ClassVar[dict[str, Range]] = {"num_background_samples": (1, 2**14)}
     """Allowed ranges."""
-    background_model: Literal["auto", "none", "sphere", "contraction"] = "auto"
+    background_model: Auto[Literal["none", "sphere", "contraction"]] = AUTO
     """What is outside of the scene's box. none: nothing. sphere: a second field in inverse distance (NeRF++), outside
     of a sphere around the box's centre and all cameras. contraction: the same field, contracted, not with --sampler
     hierarchical. auto: what suits the method if the scene may extend beyond the box, otherwise none."""

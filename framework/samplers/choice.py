@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, TypeVar
 
 from torch import Tensor
 
-from nerfloom.base.config import Auto, Range, RayConfig
+from nerfloom.base.config import AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice, Decision, fill
 from nerfloom.base.device import device_kind, relative_speed
 from nerfloom.base.errors import ConfigError
@@ -53,7 +53,7 @@ class SamplingConfig(RayConfig):
         "num_nerf_samples": (1, 2**14),
     }
     """Minimum and maximum of these settings."""
-    sampler: Literal["auto", "occupancy", "proposal"] = "auto"
+    sampler: Auto[Literal["occupancy", "proposal"]] = AUTO
     """occupancy: march through the occupied cells of the box, or, if the scene may extend beyond it, of nested boxes
     around it. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
     otherwise occupancy. Of a scene that may, both see all of space, contracted."""
@@ -102,7 +102,7 @@ class HierarchicalConfig(SamplingConfig):
         "num_fine_samples": (1, 2**14),
     }
     """Minimum and maximum of these settings."""
-    sampler: Literal["auto", "hierarchical", "occupancy", "proposal"] = "auto"  # type: ignore[assignment]
+    sampler: Auto[Literal["hierarchical", "occupancy", "proposal"]] = AUTO  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
     small density fields that choose the samples, in all of space, contracted. auto: proposal if the scene may extend
     beyond the box, otherwise hierarchical."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.config import RayConfig, TrainConfig
-from nerfloom.base.decisions import Decision
+from nerfloom.base.decisions import Decision, is_open
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import looked_at
@@ -48,7 +48,7 @@ def starts_checked(
     Returns:
         The settings and the decisions.
     """
-    if not isinstance(config, RayConfig) or config.rays_shared_by is not None or not isinstance(settings, RayConfig):
+    if not isinstance(config, RayConfig) or not is_open(config.rays_shared_by) or not isinstance(settings, RayConfig):
         return settings, made
     scene = dataset.scene
     in_boxes = isinstance(settings, SamplingConfig) and str(settings.sampler) == "occupancy"

@@ -10,7 +10,7 @@ import pytest
 import tyro
 
 from nerfloom.base import registry
-from nerfloom.base.config import AUTO, Auto, RayConfig, TrainConfig
+from nerfloom.base.config import AUTO, LEFT_TO_DATA, Auto, RayConfig, TrainConfig
 from nerfloom.base.registry import load_dataparser, load_method
 from nerfloom.cli.flag_groups import DECIDED, GROUPS, grouped_flags
 from nerfloom.cli.flag_text import plain_flags
@@ -182,7 +182,7 @@ def test_a_plugins_settings_stand_by_themselves(capsys: Capture) -> None:
         f"Of the water. {DECIDED}",
     ):
         assert text in said
-    flags = ("--tint", "1", "2", "--water.depth", "7", "--num-steps", "None", "--murk", "0")
+    flags = ("--tint", "1", "2", "--water.depth", "7", "--num-steps", "auto", "--murk", "0")
     expected = dataclasses.replace(Plugin(), tint=(1.0, 2.0), water=Water(7.0), murk=0.0)
     assert parsed(Plugin(), *flags) == parsed(Plugin(), *flags, grouped=False) == expected
 
@@ -191,9 +191,8 @@ def test_what_the_data_decide_is_not_called_none() -> None:
     said = " ".join(called("ns-train", "instant-ngp", "--help").stdout.replace("│", " ").split())
     config = load_method("instant-ngp").config
     hints = get_type_hints(type(config), include_extras=True)
-    is_open = [
-        name for name in hints if hints[name] in (Auto[int], Auto[float], Auto[bool]) and getattr(config, name) is None
-    ]
+    may_be = [name for name, hint in hints.items() if LEFT_TO_DATA in getattr(hint, "__metadata__", ())]
+    is_open = [name for name in may_be if getattr(config, name) == AUTO]
     assert {"max_resolution", "log2_table_size", "num_steps"} <= set(is_open)
     assert said.count(DECIDED) == len(is_open)
     assert "Stop after this many seconds of training; evaluation and saving are not counted. --" in said
@@ -213,7 +212,7 @@ def test_what_the_data_decide_is_not_called_none() -> None:
         ("--lr-schedule cosine --sampler occupancy", {"lr_schedule": "cosine", "sampler": "occupancy"}),
         ("--mixed-precision True --draw-by-error True", {"mixed_precision": True, "draw_by_error": True}),
         ("--contraction False --silhouette-cells False", {"contraction": False, "silhouette_cells": False}),
-        ("--contraction None --num-steps None --max-seconds None", {"contraction": None, "num_steps": None}),
+        ("--contraction auto --num-steps auto --max-seconds None", {"contraction": "auto", "num_steps": "auto"}),
         ("--output-dir a/b --max_seconds 3 --learning-rate=1e-3", {"output_dir": Path("a/b"), "max_seconds": 3.0}),
         ("--max-seconds 1 --adam-eps 1e-9 --max-seconds 2", {"max_seconds": 2.0, "adam_eps": 1e-9}),
         ("--eval-appearance half --camera-optimizer SE3", {"eval_appearance": "half", "camera_optimizer": "SE3"}),

@@ -381,7 +381,7 @@ def test_overrides_are_read_from_text() -> None:
         "camera_optimizer": "off",
         "num_proposal_samples": (24, 12),
         "predict_normals": True,
-        "appearance_embedding_dim": None,
+        "appearance_embedding_dim": "auto",
     }
     with pytest.raises(ConfigError, match=r"unknown key 'leraning_rate'\. Did you mean 'learning_rate'"):
         InstantNGP(train_dataset=handed(), config_overrides={"leraning_rate": "1"})

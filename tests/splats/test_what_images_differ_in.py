@@ -38,9 +38,9 @@ def scattered(count: int = 60) -> Gaussians:
 
 
 @pytest.mark.parametrize(
-    ("given", "varies", "expected"), [(None, True, True), (None, False, False), (False, True, False)]
+    ("given", "varies", "expected"), [("auto", True, True), ("auto", False, False), (False, True, False)]
 )
-def test_colours_are_transformed_where_light_differs(given: bool | None, varies: bool, expected: bool) -> None:
+def test_colours_are_transformed_where_light_differs(given: bool | str, varies: bool, expected: bool) -> None:
     scene = dataclasses.replace(SCENE, appearance_varies=varies)
     config, _ = decide(GaussianSplattingConfig(appearance=given), scene)  # type: ignore[arg-type]
     assert config.appearance is expected

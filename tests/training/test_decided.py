@@ -49,12 +49,12 @@ def test_a_recipe_leaves_open_what_it_does_not_say(shared_tiny: Path, tmp_path: 
     recipe = tmp_path / "recipe.yml"
     recipe.write_text(yaml.safe_dump({"method": "instant-ngp", "data": str(shared_tiny), "detail": 2}))
     config = read_run(recipe).config
-    assert (config.sampler, config.log2_table_size, config.detail) == ("auto", None, 2)
+    assert (config.sampler, config.log2_table_size, config.detail) == ("auto", "auto", 2)
 
 
 def test_the_trainers_run_is_of_what_was_decided(shared_tiny: Path, tmp_path: Path) -> None:
     asked = tiny_run("nerfacto", shared_tiny, tmp_path / "run")
-    assert asked.config.contraction is None
+    assert asked.config.contraction == "auto"
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run")
     assert trainer.run.config == trainer.config == trainer.model.config
     assert trainer.config.contraction is False

@@ -22,7 +22,7 @@ def decisions(trainer: Trainer) -> dict[str, tuple[str, str]]:
 
 
 def test_facts_and_decisions_of_photographs_with_alpha(shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_resolution=None)
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=1, max_resolution="auto")
     profile, data = trainer.profile, trainer.train_set
     assert profile.images == len(data)
     assert (profile.width, profile.height) == (int(data.cameras.widths[0]), int(data.cameras.heights[0]))

@@ -7,8 +7,8 @@ BUGS = (
         "auto-stays-auto",
         "decisions",
         "framework/base/decisions.py",
-        "return chosen or LEFT_TO_DATA in",
-        "return LEFT_TO_DATA in",
+        "return [name for name in may_be if is_open(getattr(config, name))]",
+        "return []",
         "a choice that nobody makes, such as --camera-optimizer auto of a plugin, is off without a word",
     ),
     Bug(

@@ -3,7 +3,7 @@
 import sys
 
 SAFE = ("-P",) if sys.version_info >= (3, 11) else ()
-"""Flag by which Python leaves the working folder out of its path, where files may have the names of any package."""
+"""Keeps the working folder off the path of Python: a file there may have the name of any package."""
 
 
 def python_command(module: str, *arguments: object) -> list[str]:

@@ -59,7 +59,7 @@ def with_run(arguments: list[str], several: Collection[str] = ()) -> list[str]:
 
     Args:
         arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
-        several: flags that take several words, none of which is a path.
+        several: flags that take several words; a path ends them.
     """
     if any(word.partition("=")[0] == "--load-config" for word in arguments):
         return arguments

@@ -56,7 +56,7 @@ class HashGrid(nn.Module):
         log2_table_size: maximum number of entries of one level, as a power of two.
         sparse: whether the optimiser updates only the entries that a step has used. The compiled kernels then keep the
             gradient of the table in `deferred` for the optimiser, and `table.grad` stays None.
-        opening: share of the training budget in which levels open one after the other (`Opening`); 0 if all are open.
+        opening: levels open one after the other (`Opening`) during this share of the training budget; 0: all are open.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.

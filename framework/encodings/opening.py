@@ -43,7 +43,7 @@ class Opening(nn.Module):
     Args:
         num_levels: number of levels.
         first: number of levels that are open at the start.
-        until: share of the training budget in which all levels open.
+        until: share of the training budget after which all levels are open.
     """
 
     opened: Tensor

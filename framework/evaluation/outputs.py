@@ -23,7 +23,7 @@ OPAQUE = 128
 """Opacity of 255 from which a pixel has a depth."""
 
 Arrays = Mapping[str, np.ndarray]
-"""What is kept of a frame, by name: uint8 (H, W) or (H, W, 3) of what is shown as it is, and numbers (H, W) float32."""
+"""What is kept of a frame, by name: uint8 (H, W) or (H, W, 3), shown as it is, or numbers (H, W) float32."""
 
 
 def chosen_outputs(model: Model[Any], names: Sequence[str]) -> list[Output]:

@@ -125,8 +125,8 @@ class EncodedField(BoxField):
             do not depend on it.
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: the images' appearance vectors, which the colour network reads; None for none.
-        opening: share of the training budget in which the bands of the viewing direction open one after the other
-            (`Opening`); 0 if all are open.
+        opening: bands of the viewing direction open one after the other (`Opening`) during this share of the training
+            budget; 0: all are open.
         ambient: number of coordinates beyond those of space (`Points.ambient`) that the density network reads.
     """
 

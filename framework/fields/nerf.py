@@ -27,8 +27,8 @@ class NeRFField(Field):
             al. 2021, section 4); None for a field that does not change with time.
         contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
             are made for; None to encode scene coordinates.
-        opening: share of the training budget in which the frequencies of positions and directions open one after the
-            other (`Opening`); 0 if all are open.
+        opening: frequencies of positions and directions open one after the other (`Opening`) during this share of the
+            training budget; 0: all are open.
         dims: numbers of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al. 2020).
     """
 

@@ -156,7 +156,7 @@ def test_depth_teaches_nerfacto_where_the_surface_is(shared_tiny: Path, tmp_path
     from nerfloom.training.trainer import Trainer
 
     errors = []
-    for mult in (0.0, None):
+    for mult in (0.0, "auto"):
         folder = tmp_path / f"run{mult}"
         folder.mkdir()
         run = tiny_run("nerfacto", shared_tiny, folder, max_num_iterations=120, max_eval_images=0, depth_loss_mult=mult)

@@ -29,8 +29,8 @@ class FeaturePlanes(nn.Module):
         axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
         sparse: whether the optimiser updates only the entries that a step has used, as for `HashGrid`.
         resizable: whether `resample` may be called, so that a checkpoint may have other resolutions.
-        opening: groups that are scales open from coarse to fine (`Opening`) during this share of the training budget;
-            0: all are open.
+        opening: groups that are scales open from coarse to fine (`Opening`) during this share of the training budget.
+            All are open if it is 0.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.

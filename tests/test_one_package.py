@@ -1,4 +1,4 @@
-"""Everything is imported as nerfloom, whatever lies in the folder in which Python is started."""
+"""Everything is imported as nerfloom, whatever lies in the working folder."""
 
 import subprocess
 import sys

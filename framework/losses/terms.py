@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 PATCH = 8
 """Rays along the edge of a patch of an unseen view, as in RegNeRF (Niemeyer et al. 2022)."""
 PATCH_IMAGE = 500
-"""Longer side of an image, pixels, in which neighbouring rays of a patch are a pixel apart; in larger ones, as far in
-relation to the image."""
+"""Longer side of an image, pixels, up to which neighbouring rays of a patch are a pixel apart. In a larger image they
+are as far apart in relation to it."""
 
 
 class ColorError(LossTerm):

@@ -60,7 +60,7 @@ class Sampler(nn.Module, ABC):
         """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
 
     def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
-        """Return the loss () that trains the sampler itself; None in steps in which it does not learn.
+        """Return the loss () that trains the sampler itself; None if it does not learn in this step.
 
         Args:
             samples: N samples that the sampler returned for a batch.

@@ -33,8 +33,8 @@ class BatchSize:
     def keep_pace(self, pace: Pace) -> None:
         """Limit the number of rays by the time, so that there are enough steps.
 
-        A time in which N rays can be drawn has N / R steps of R rays: there are S steps for each ray of a step if R is
-        the square root of N / S. The first steps are small, as it is not known how long they take.
+        If the time is enough for N rays, it is enough for N / R steps of R rays. There are S steps for each ray of a
+        step if R is the square root of N / S. The first steps are small, as it is not known how long they take.
 
         Args:
             pace: the run before a step.

@@ -20,7 +20,7 @@ ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 SAMPLES = 2**14
 """Samples of the step that is timed."""
 REFERENCE = 11.6e-3
-"""Seconds that it takes on two quiet cores of the machine on which settings were found by trials: an AMD EPYC (Zen 4)
+"""Seconds that it takes on the machine of the trials that settings come from: two quiet cores of an AMD EPYC (Zen 4)
 with AVX-512."""
 MEASURED_FOR = 0.25
 """Seconds for which steps are timed."""

@@ -49,7 +49,7 @@ test-versions: .venv/installed-release
 	$(PYTHON) -m venv .venv
 
 # For what follows at once: without the kernels of other processors, and without compiling modules that nobody imports.
-.venv/installed: .venv/bin/python pyproject.toml setup.py constraints.txt $(wildcard framework/kernels/csrc/*)
+.venv/installed: .venv/bin/python pyproject.toml setup.py constraints.txt $(wildcard framework/kernels/*/*.cpp framework/kernels/*/*.h)
 	@echo "installing nerfloom into .venv"
 	NERFLOOM_VARIANTS=native $(PIP) --no-compile -e .
 	@touch $@

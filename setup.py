@@ -23,11 +23,12 @@ try:
 except ImportError:  # setuptools before 70.1
     from wheel.bdist_wheel import bdist_wheel
 
-SOURCES = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.cpp"))
-FINGERPRINT = runpy.run_path("framework/kernels/sources.py")["fingerprint"](Path("framework/kernels/csrc"))
+KERNELS = Path("framework/kernels")
+SOURCES = sorted(str(path) for path in KERNELS.glob("*/*.cpp"))
+FINGERPRINT = runpy.run_path(str(KERNELS / "sources.py"))["fingerprint"](KERNELS)
 AVX2 = ["-mavx2", "-mfma"]
 AVX512 = ["-mavx512f", "-mavx512bw", "-mavx512dq", "-mavx512vl", "-mprefer-vector-width=512"]
-HEADERS = sorted(str(path) for path in Path("framework/kernels/csrc").glob("*.h"))
+HEADERS = sorted(str(path) for path in KERNELS.glob("*/*.h"))
 VARIANTS = {"baseline": []}
 if platform.machine().lower() in ("x86_64", "amd64"):
     VARIANTS |= {
@@ -53,7 +54,7 @@ def fitting(variants: dict[str, list[str]]) -> dict[str, list[str]] | None:
 
 
 def gives_tiles() -> bool:
-    """Return whether Linux gives this process the processor's tiles, as the library asks (csrc/tiles.cpp)."""
+    """Return whether Linux gives this process the processor's tiles, as the library asks (networks/tiles.cpp)."""
     system_call, request, tile_data = 158, 0x1023, 18  # arch_prctl, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
     return ctypes.CDLL(None).syscall(system_call, request, tile_data) == 0
 
@@ -98,6 +99,7 @@ class BuildKernels(build_ext):
         mingw = self.compiler.compiler_type == "mingw32"
         (path,) = self.compiler.compile(
             [source],
+            include_dirs=ext.include_dirs,
             output_dir=os.path.join(self.build_temp, ext.name),  # the variants share their sources
             extra_postargs=[
                 *ext.extra_compile_args,
@@ -149,6 +151,7 @@ setup(
         Extension(
             f"nerfloom.kernels.lib.{name}",
             SOURCES,
+            include_dirs=[str(KERNELS)],
             extra_compile_args=[*FLAGS, *flags],
             extra_link_args=["-pthread"] if sys.platform == "linux" else [],
             depends=[*HEADERS],

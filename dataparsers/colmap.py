@@ -11,10 +11,11 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.data.dataset import Split
 from nerfloom.data.names_on_disk import has_images, on_disk
 from nerfloom.data.tracks import Tracks, doubts_about
-from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
+from nerfloom.dataparsers.captured import captured_scene, has_transforms
 from nerfloom.dataparsers.colmap_lens import lenses_of
 from nerfloom.dataparsers.colmap_model import SparseModel, choose_model, find_models, read_model
 from nerfloom.dataparsers.masks import find_masks
+from nerfloom.dataparsers.posed_images import Captured, PosedImages
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,13 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.base.arrays import read_array
 from nerfloom.cameras.cameras import check_pose
 from nerfloom.cameras.ndc import NdcCameras, find_ndc, ndc_box
-from nerfloom.data.data_folder import IMAGE_SUFFIXES
 from nerfloom.data.dataset import Split, one_line
 from nerfloom.data.names_on_disk import REDUCED
-from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, checked_box, has_transforms
+from nerfloom.data.suffixes import IMAGE_SUFFIXES
+from nerfloom.dataparsers.captured import captured_scene, checked_box, has_transforms
 from nerfloom.dataparsers.colmap_model import find_models
 from nerfloom.dataparsers.masks import find_masks
+from nerfloom.dataparsers.posed_images import Captured, PosedImages
 
 POSES = "poses_bounds.npy"
 """File of poses and depth bounds."""

@@ -16,9 +16,10 @@ from torch import Tensor
 from nerfloom import DataError, ParsedScene
 from nerfloom.data.dataset import Split
 from nerfloom.data.names_on_disk import spelled
-from nerfloom.dataparsers.captured import Captured, captured_scene, has_transforms
+from nerfloom.dataparsers.captured import captured_scene, has_transforms
 from nerfloom.dataparsers.colmap import read_images
 from nerfloom.dataparsers.colmap_model import choose_model, find_models
+from nerfloom.dataparsers.posed_images import Captured
 
 SPARSE = "dense/sparse"
 """Folder of the reconstruction in the data folder."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -13,11 +12,8 @@ from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement, enlargement, place
 from nerfloom.data.dataset import Split
 from nerfloom.dataparsers.camera_spread import SMALL, camera_spread, warning
+from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.geometry.local_origin import local_origin, rounding
-
-if TYPE_CHECKING:
-    from nerfloom.dataparsers.captured import Captured, PosedImages
-
 
 Applied = tuple[Tensor, float]
 """Rigid transform (4, 4) from an earlier frame to that of a format's poses, and units of the later per unit of the

@@ -12,8 +12,9 @@ from nerfloom.data.dataset import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.data.scene import PoseSource
-from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms, image_sizes, sizes_of
+from nerfloom.dataparsers.captured import captured_scene, has_transforms, image_sizes, sizes_of
 from nerfloom.dataparsers.placing import from_original
+from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.reading import number, read_json, rigid, side_or_none
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))

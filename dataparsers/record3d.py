@@ -13,7 +13,8 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.data.dataset import Split, existing_files
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.data.scene import PoseSource
-from nerfloom.dataparsers.captured import Captured, PosedImages, captured_scene, has_transforms
+from nerfloom.dataparsers.captured import captured_scene, has_transforms
+from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.reading import numbers, read_json, side
 from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 

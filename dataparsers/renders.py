@@ -14,8 +14,8 @@ from nerfloom import DataError
 from nerfloom.base.console import say
 from nerfloom.data.dataset import Split, existing_files, image_size
 from nerfloom.data.names_on_disk import on_disk
-from nerfloom.dataparsers.captured import PosedImages
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
+from nerfloom.dataparsers.posed_images import PosedImages
 from nerfloom.dataparsers.reading import file_name, read_json, read_pose, read_times
 
 OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")

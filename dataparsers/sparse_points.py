@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,9 +12,7 @@ from nerfloom.base.console import say
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.tracks import DOUBTS, LARGEST_DEVIATION, Sightings, Tracks
-
-if TYPE_CHECKING:
-    from nerfloom.dataparsers.captured import PosedImages
+from nerfloom.dataparsers.posed_images import PosedImages
 
 
 @dataclass(frozen=True)

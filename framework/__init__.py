@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from nerfloom.data.dataset import Dataset as Dataset
     from nerfloom.data.parsed_scene import DataParser as DataParser
     from nerfloom.data.parsed_scene import ParsedScene as ParsedScene
-    from nerfloom.data.pixels import PixelBatch as PixelBatch
-    from nerfloom.data.pixels import ViewBatch as ViewBatch
+    from nerfloom.data.pixels.batch import PixelBatch as PixelBatch
+    from nerfloom.data.pixels.batch import ViewBatch as ViewBatch
     from nerfloom.data.scene import Scene as Scene
     from nerfloom.fields.base import Field as Field
     from nerfloom.gaussian_model import GaussianModel as GaussianModel
@@ -38,10 +38,11 @@ if TYPE_CHECKING:
     from nerfloom.geometry.points import Points as Points
     from nerfloom.geometry.rays import Rays as Rays
     from nerfloom.geometry.rays import Samples as Samples
-    from nerfloom.kernels.alpha import composite_alpha as composite_alpha
-    from nerfloom.kernels.compositing import composite as composite
-    from nerfloom.kernels.compositing import distortion as distortion
-    from nerfloom.kernels.contraction import contract_to_unit as contract_to_unit
+    from nerfloom.kernels.compositing.alpha import composite_alpha as composite_alpha
+    from nerfloom.kernels.compositing.density import composite as composite
+    from nerfloom.kernels.compositing.density import distortion as distortion
+    from nerfloom.kernels.encodings.contraction import contract_to_unit as contract_to_unit
+    from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf as inverse_cdf
     from nerfloom.method import Method as Method
     from nerfloom.model import LearnsMotion as LearnsMotion
     from nerfloom.model import Loss as Loss
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from nerfloom.runs import load as load
     from nerfloom.runs import train as train
     from nerfloom.samplers.base import Sampler as Sampler
-    from nerfloom.samplers.inverse_cdf import inverse_cdf as inverse_cdf
     from nerfloom.samplers.proposal import interlevel_loss as interlevel_loss
 
 _HOMES = {
@@ -87,7 +87,7 @@ _HOMES = {
     "Optimised": "base.optimised",
     "ParsedScene": "data.parsed_scene",
     "Picture": "rendering.rendered",
-    "PixelBatch": "data.pixels",
+    "PixelBatch": "data.pixels.batch",
     "Points": "geometry.points",
     "RayConfig": "base.config",
     "RayModel": "ray_model",
@@ -102,19 +102,19 @@ _HOMES = {
     "TrainConfig": "base.config",
     "TrainedRun": "runs",
     "View": "cameras.view",
-    "ViewBatch": "data.pixels",
+    "ViewBatch": "data.pixels.batch",
     "VolumeRenderer": "rendering.volume",
     "accumulate": "plug_and_play.rendering",
     "clip_to_box": "plug_and_play.sampling",
-    "composite": "kernels.compositing",
-    "composite_alpha": "kernels.alpha",
+    "composite": "kernels.compositing.density",
+    "composite_alpha": "kernels.compositing.alpha",
     "contract": "geometry.bounds",
-    "contract_to_unit": "kernels.contraction",
-    "distortion": "kernels.compositing",
+    "contract_to_unit": "kernels.encodings.contraction",
+    "distortion": "kernels.compositing.density",
     "image": "runs",
     "interlevel_loss": "samplers.proposal",
     "intersect_box": "geometry.bounds",
-    "inverse_cdf": "samplers.inverse_cdf",
+    "inverse_cdf": "kernels.histograms.inverse_cdf",
     "list_methods": "runs",
     "load": "runs",
     "render": "plug_and_play.rendering",

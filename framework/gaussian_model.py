@@ -16,10 +16,11 @@ from nerfloom.base.pace import Pace
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
-from nerfloom.kernels.splat_project import SplatCamera
+from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.model import Model
 from nerfloom.rendering.outputs import NORMALS, Output
 from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.capacity import Room
 from nerfloom.splats.density_control import RESET, GradientMean, grown
 from nerfloom.splats.drawing import DRAWN, draw_view, on_image, splat_camera
 from nerfloom.splats.gaussians import Gaussians
@@ -28,7 +29,6 @@ from nerfloom.splats.look import Look
 from nerfloom.splats.mcmc import moved, shaken
 from nerfloom.splats.redrawn import Redrawn
 from nerfloom.splats.resolution import ImageSizes, most_octaves
-from nerfloom.splats.room import Room
 from nerfloom.splats.settings import SplattingConfigT
 from nerfloom.splats.start import from_points, scene_size
 from nerfloom.splats.table import Table

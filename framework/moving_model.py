@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Generic, TypeVar
 
 from nerfloom.base.step_kind import StepKind
-from nerfloom.data.pixels import PixelBatch, thinned
+from nerfloom.data.pixels.batch import PixelBatch, thinned
 from nerfloom.model import LearnsMotion, Loss
 from nerfloom.ray_model import RayModel
 from nerfloom.scene.motion import MotionConfig

@@ -14,14 +14,14 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.view import View
-from nerfloom.data.pixels import PixelBatch
+from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.opening import Opening
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.kernels.traced_error import PixelTargets, TracedError
+from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model, evaluating, parts
@@ -35,6 +35,8 @@ from nerfloom.samplers.in_view import pixels_in_view
 from nerfloom.scene.shared_space import SharedSpace
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
+
+
 class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     """A model that evaluates a field at the positions of a sampler and composites the values with a renderer."""
 

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from nerfloom.base.config import from_plain, to_plain
-from nerfloom.base.registry import load_dataparser, load_method, registered, summary
 from nerfloom.base.splits import Split
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
-from nerfloom.data.data_folder import find_data
 from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.registry import load_dataparser, load_method, registered, summary
 from nerfloom.rendering.rendered import Picture
+from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, run_folder
 from nerfloom.training.run_path import config_file

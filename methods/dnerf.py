@@ -17,8 +17,8 @@ from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.deformed import DeformedField
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField
-from nerfloom.kernels.frequency import MAX_FREQUENCIES
-from nerfloom.kernels.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
+from nerfloom.kernels.grids.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss, TransparentOpacity
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 from nerfloom.moving_model import MovingModel

@@ -20,10 +20,11 @@ from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue
 from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.data.dataset import Dataset
+from nerfloom.export.surfaces import found_surfaces
 from nerfloom.fields.appearance import AFFINE, Appearance, affine_colors
-from nerfloom.kernels.splat_blend import CHANNELS
-from nerfloom.kernels.splat_project import SplatCamera, sort_keys
-from nerfloom.kernels.ssim import photometric_loss
+from nerfloom.kernels.images.ssim import photometric_loss
+from nerfloom.kernels.splats.blend import CHANNELS
+from nerfloom.kernels.splats.project import SplatCamera, sort_keys
 from nerfloom.losses.functions import mean_depth_error
 from nerfloom.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from nerfloom.splats.drawing import draw, splat_camera
@@ -32,7 +33,6 @@ from nerfloom.splats.learning import open_degree
 from nerfloom.splats.resolution import enlarged, reduced, reduced_distances
 from nerfloom.splats.settings import SplattingConfig, decide_splatting
 from nerfloom.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
-from nerfloom.tools.surfaces import found_surfaces
 from nerfloom.training.optim import learning_rate_factor
 
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01

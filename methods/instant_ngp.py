@@ -18,13 +18,13 @@ from nerfloom.base.device import relative_speed
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.inverted import InvertedField
+from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.ray_model import RayModel
 from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
 from nerfloom.samplers.choice import contracted_box
 from nerfloom.samplers.inside import make_foreground_sampler
-from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 
 FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
 """Seconds of training on two threads of a CPU, and pixels of the longer side of the images, from which `plan` counts.

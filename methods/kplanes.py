@@ -18,15 +18,15 @@ from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import MLP
 from nerfloom.fields.encoded import BoxField, EncodedField
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.grids.plane_bands import squared_steps
+from nerfloom.kernels.grids.planes_layout import MAX_VERTICES
 from nerfloom.kernels.math import truncated_exp
-from nerfloom.kernels.plane_bands import squared_steps
-from nerfloom.kernels.planes_layout import MAX_VERTICES
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss, TransparentOpacity
 from nerfloom.moving_model import MovingModel
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
-from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 from nerfloom.scene.motion import MotionConfig, slices_choice, vertices_in_time
 
 FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL = 2**14, 2**15, 75.0

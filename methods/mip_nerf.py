@@ -15,7 +15,7 @@ from nerfloom.base.config import Range
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.integrated import IntegratedEncoding
 from nerfloom.fields.integrated import IntegratedField
-from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge

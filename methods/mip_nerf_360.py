@@ -22,7 +22,7 @@ from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_direct
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
 from nerfloom.fields.sized import SizedDensity, SizedField
-from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.functions import charbonnier
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, ColorError, Distortion, SamplerLoss

@@ -16,6 +16,7 @@ from nerfloom import Decision, Field, Method, Sampler, Scene
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.inverted import InvertedField
+from nerfloom.losses.few_images import decide_few_images
 from nerfloom.methods import vanilla_nerf
 from nerfloom.methods._grids import GridsConfig, grid_optimiser
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_SAMPLES_PER_BATCH, OPEN_UNTIL, VanillaNeRFConfig
@@ -23,7 +24,6 @@ from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import decide_background, foreground
 from nerfloom.samplers.choice import contracted_box, decide_samples
 from nerfloom.samplers.inside import make_foreground_sampler
-from nerfloom.scene.few_images import decide_few_images
 
 GRID_SAMPLES_PER_BATCH = 2**16
 """Samples of a training step on hash grids, instant-ngp's."""

@@ -32,14 +32,14 @@ from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
-from nerfloom.kernels.compositing import ray_sum
+from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
 from nerfloom.samplers.choice import batch_choice, make_sampler
-from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 from nerfloom.scene.reasons import LIGHT_REASONS
 
 APPEARANCE_SIZE = 16

@@ -20,13 +20,13 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.tensor import CP, VM, TensorField
 from nerfloom.geometry.bounds import box_around_cells, cubic_vertices
-from nerfloom.kernels.memory import require
-from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.table_memory import require
+from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
-from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 
 BLIND_STEPS = 128
 """Steps before the occupancy grid is updated: the field starts nearly empty, and would mark every cell as empty."""

@@ -18,13 +18,13 @@ from nerfloom import Decision, Method, RayModel, Sampler, Scene
 from nerfloom.base.config import Range
 from nerfloom.base.optimised import Optimised
 from nerfloom.fields.nerf import NeRFField
-from nerfloom.kernels.frequency import MAX_FREQUENCIES
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
+from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples
 from nerfloom.samplers.inside import make_foreground_sampler
-from nerfloom.scene.few_images import FewImagesConfig, decide_few_images
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""

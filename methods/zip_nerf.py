@@ -24,7 +24,7 @@ from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.appearance import AFFINE, Appearance, exposed
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
-from nerfloom.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
-from nerfloom.tools.benchmarks.operations import _place, _waits
+from benchmarks.operations import _place, _waits
 
 OTHER = torch.device("meta", 1)
 """Not "meta" itself: what is kept for a device would reach tests on that, whose tensors have no values."""

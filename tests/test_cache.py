@@ -15,8 +15,8 @@ from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import machine_memory
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.data.dataset import Dataset, ParsedScene, load_dataset, read_image
-from nerfloom.data.pixel_cache import MAGIC, PixelMemory, unpack
-from nerfloom.data.pixel_store import FileStore
+from nerfloom.data.pixels.cache import MAGIC, PixelMemory, unpack
+from nerfloom.data.pixels.store import FileStore
 from tests.forked import Forks, Program
 from tests.images import noise, parsed, write_noise
 
@@ -142,8 +142,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from nerfloom.data.dataset import load_dataset
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_store import FileStore
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.store import FileStore
 from tests.images import parsed
 if sys.argv[3] == "killed":
     FileStore.finish = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
@@ -214,9 +214,9 @@ import sys, threading
 from pathlib import Path
 import torch
 from nerfloom.data.dataset import load_dataset
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_stream import PixelStream
-from nerfloom.data.pixels import draw_batch
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.stream import PixelStream
+from nerfloom.data.pixels.batch import draw_batch
 from nerfloom.base.device import seed_step
 from tests.images import parsed
 

@@ -39,12 +39,12 @@ from nerfloom import (
     VolumeRenderer,
 )
 from nerfloom.base.optimised import ParameterGroup
-from nerfloom.base.registry import load_method, registered
-from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.registry import load_method, registered
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.tools.testing import assert_method, check_method
-from nerfloom.tools.testing.check import CHECKS, Check
+from nerfloom.testing import assert_method, check_method
+from nerfloom.testing.check import CHECKS, Check
 from tests.interfaces.methods.discs import DiscConfig, Discs
 from tests.training.helpers import TINY
 
@@ -593,7 +593,7 @@ def test_each_fault_is_found_by_its_check(
     check: str, method: Method, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And by none that it needs; the others, which sound methods pass, take most of the time."""
-    monkeypatch.setattr("nerfloom.tools.testing.check.CHECKS", with_what_it_needs(check))
+    monkeypatch.setattr("nerfloom.testing.check.CHECKS", with_what_it_needs(check))
     assert_found(method, check, words)
 
 

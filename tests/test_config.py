@@ -13,7 +13,7 @@ import yaml
 
 from nerfloom.base.config import RayConfig, TrainConfig, from_plain, to_plain
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import load_method, registered
+from nerfloom.registry import load_method, registered
 from nerfloom.training.run import read_run
 
 

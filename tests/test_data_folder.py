@@ -8,7 +8,7 @@ import pytest
 
 from nerfloom.base.errors import DataError
 from nerfloom.cli.process_data import USAGE
-from nerfloom.data.data_folder import find_data, processed_folder
+from nerfloom.training.data_folder import find_data, processed_folder
 
 
 @pytest.mark.parametrize("part", ["transforms_train.json", "train", "."])

@@ -15,9 +15,9 @@ from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import assemble, existing_files, image_size, load_dataset, read_image
 from nerfloom.data.decoding import from_arrays
 from nerfloom.data.masks import read_mask
-from nerfloom.data.pixels import background_colors, composite
+from nerfloom.data.pixels.batch import background_colors, composite
 from nerfloom.dataparsers.blender import Blender
-from nerfloom.tools.processing.images import prepare
+from nerfloom.processing.images import prepare
 from tests.images import noise, parsed, write_mask
 
 

@@ -9,8 +9,8 @@ import pytest
 from nerfloom.base.config import AUTO, Auto, TrainConfig
 from nerfloom.base.decisions import Choice, Decision, fill, is_open, left_open
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import load_method, registered
 from nerfloom.method import nothing_to_decide
+from nerfloom.registry import load_method, registered
 from nerfloom.samplers.choice import SamplingConfig
 from tests.truth.test_training import SCENE
 

@@ -15,7 +15,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import ray_distances, read_depth, read_depths
-from nerfloom.data.pixels import gather_batch
+from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.geometry.rays import Samples
 from nerfloom.losses.functions import depth_error
 from tests.training.helpers import tiny_run, tiny_trainer

@@ -7,8 +7,8 @@ import torch
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.error_map import EVENLY, ErrorMap
-from nerfloom.data.pixels import draw_batch
+from nerfloom.data.pixels.batch import draw_batch
+from nerfloom.data.pixels.error_map import EVENLY, ErrorMap
 from nerfloom.data.scene import Scene
 from nerfloom.losses.functions import mean_squared_error
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from nerfloom.base import extras
-from nerfloom.tools.comparison.plots import MISSING
+from nerfloom.comparison.plots import MISSING
 
 ROOT = Path(__file__).parents[1]
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from nerfloom import ParsedScene
-from nerfloom.base.registry import load_method
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import load_dataset
@@ -22,6 +21,7 @@ from nerfloom.export.colmap_text import write_model
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import decimals, write_mesh
 from nerfloom.export.transforms import write_transforms as write_cameras
+from nerfloom.registry import load_method
 from nerfloom.training.run import TRANSFORMS, Run, write_transforms
 from tests.dataparsers.captures import moved, poses, write_capture
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import load_method
-from nerfloom.scene.few_images import (
+from nerfloom.losses.few_images import (
     FEW,
     FEW_WITH_ALPHA,
     UNSEEN_START,
@@ -18,6 +17,7 @@ from nerfloom.scene.few_images import (
     FewImagesConfig,
     unseen_weight,
 )
+from nerfloom.registry import load_method
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 from tests.truth.test_training import SCENE

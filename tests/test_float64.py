@@ -16,9 +16,9 @@ from torch.utils._pytree import tree_leaves
 
 from nerfloom.base.config import RayConfig
 from nerfloom.base.device import to_float64
-from nerfloom.base.registry import load_method
 from nerfloom.kernels import native
-from nerfloom.kernels.adam import sparse_adam_reference
+from nerfloom.kernels.adam.adam import sparse_adam_reference
+from nerfloom.registry import load_method
 from tests.training.helpers import TINY, tiny_trainer
 
 
@@ -47,7 +47,11 @@ def taken_away(values: Tensor) -> Tensor:
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
     monkeypatch.setattr(native, "available", lambda: False)
-    for name in ("nerfloom.data.error_map", "nerfloom.evaluation.metrics", "nerfloom.kernels.step_functions"):
+    for name in (
+        "nerfloom.data.pixels.error_map",
+        "nerfloom.evaluation.metrics",
+        "nerfloom.kernels.histograms.step_functions",
+    ):
         monkeypatch.setattr(importlib.import_module(name), "to_float64", taken_away)
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfloom.base.registry import load_dataparser
-from nerfloom.data.data_folder import find_data
-from nerfloom.data.folds import folds, in_order, thumbnail
 from nerfloom.data.image_files import read_image
+from nerfloom.registry import load_dataparser
+from nerfloom.scene.folds import folds, in_order, thumbnail
+from nerfloom.training.data_folder import find_data
 
 
 def walk(count: int = 60, turns: float = 1.49) -> tuple[list[str], np.ndarray, np.ndarray]:

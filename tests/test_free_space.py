@@ -13,7 +13,7 @@ from nerfloom.data.free_space import ALONE, CLEAR_SHARE, STEPS, before_points, c
 from nerfloom.data.sources import PixelSource, Request, make_source
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing import weights_and_transmittance
+from nerfloom.kernels.compositing.density import weights_and_transmittance
 from nerfloom.losses.functions import WRONG, matter_before
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run

@@ -18,11 +18,11 @@ from nerfloom.base.from_nerfstudio import (
     format_answer,
     taken,
 )
-from nerfloom.base.registry import load_dataparser, load_method, registered
 from nerfloom.cli.export import KINDS as EXPORTS
 from nerfloom.cli.process_data import KINDS as INPUTS
 from nerfloom.cli.render import PATHS
 from nerfloom.cli.train import _flag_names, main, run_of
+from nerfloom.registry import load_dataparser, load_method, registered
 from tests.conftest import Refused
 
 

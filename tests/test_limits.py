@@ -7,8 +7,8 @@ import torch
 
 from nerfloom.geometry.bounds import contract
 from nerfloom.geometry.limits import at_least, between
+from nerfloom.kernels.histograms.spacing import to_disparity
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.kernels.spacing import to_disparity
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])

@@ -11,9 +11,9 @@ import torch
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.masks import read_mask
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixels import composite, draw_batch
+from nerfloom.data.pixels.batch import composite, draw_batch
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.evaluation.evaluator import evaluate, evaluation_background
 from nerfloom.evaluation.metrics import psnr, ssim

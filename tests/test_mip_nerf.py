@@ -16,10 +16,10 @@ from nerfloom.ray_model import RayModel
 from nerfloom.samplers.hierarchical import HierarchicalSampler
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.proposal import ProposalSampler
-from nerfloom.tools.stress.scenes import ball_views
-from nerfloom.tools.testing import check_method
-from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
-from nerfloom.tools.testing.subject import Learner
+from nerfloom.stress.scenes import ball_views
+from nerfloom.testing import check_method
+from nerfloom.testing.scenes import ball_in_a_box, ball_under_a_sky
+from nerfloom.testing.trial_run import Learner
 from tests.training.helpers import TINY
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

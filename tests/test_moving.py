@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.base.registry import load_method
 from nerfloom.cameras.view import View
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.data.scene import Scene
 from nerfloom.fields.deformed import DeformedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
+from nerfloom.registry import load_method
 from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run, tiny_trainer

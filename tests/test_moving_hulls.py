@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfloom.base.registry import load_method
 from nerfloom.data.travel import Travel
 from nerfloom.geometry.points import Points
+from nerfloom.registry import load_method
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
 from nerfloom.scene.silhouettes import Silhouettes

@@ -11,8 +11,8 @@ import torch
 
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixels import gather_batch
+from nerfloom.data.pixels.batch import gather_batch
+from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.sources import PixelSource, Request
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.evaluation.evaluator import Evaluation, evaluate

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from nerfloom.base.machine_config import MachineConfig
-from nerfloom.base.registry import load_method
 from nerfloom.data.scene import Scene
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.fields.appearance import Appearance
+from nerfloom.registry import load_method
 from nerfloom.training.trainer import Trainer
 from tests.conftest import EditJson
 from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_trainer

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import nerfloom
-from nerfloom.base import registry
+from nerfloom import registry
 from tests.training.helpers import TINY
 
 DOCS = Path(__file__).parents[1] / "docs"

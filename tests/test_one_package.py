@@ -58,4 +58,3 @@ def test_a_child_imports_no_name_of_the_working_folder(shadowed: Path) -> None:
     said = output_of(python_command("nerfloom.cli.train", "instant-ngp", "--version"), shadowed)
     assert f"from {PACKAGE} " in said
     assert "--max-seconds" in output_of(python_command("nerfloom.cli.train", "instant-ngp", "--help"), shadowed)
-

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.data.source_views import images_of, nearest_in_direction, other_images
 from nerfloom.data.sources import Request, make_source
 from nerfloom.dataparsers.procedural import Procedural
@@ -21,8 +21,8 @@ from nerfloom.evaluation.evaluator import evaluate, views_to_judge
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.methods.pixel_nerf import METHOD, PixelNeRF, PixelNeRFConfig
 from nerfloom.model import RendersFromImages
-from nerfloom.tools.stress.faults import spoiled_pose
-from nerfloom.tools.testing.scenes import ball_in_a_box
+from nerfloom.stress.faults import spoiled_pose
+from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.run import Run, create_folder
 from nerfloom.training.trained import build_model, load_trained
 from nerfloom.training.trainer import Trainer
@@ -159,7 +159,7 @@ def test_what_cannot_be_rendered_says_why(many: dict[str, Dataset]) -> None:
 
 @pytest.mark.parametrize("method", ["vanilla-nerf", "instant-ngp", "gaussian-splatting"])
 def test_methods_that_learn_one_scene_refuse_several(method: str, many: dict[str, Dataset]) -> None:
-    from nerfloom.base.registry import load_method
+    from nerfloom.registry import load_method
 
     with pytest.raises(ConfigError, match=f"shows 3 scenes, and {method} learns one") as raised:
         build_model(method, load_method(method).config, many["train"].scene)
@@ -213,7 +213,7 @@ def trained_on_many(folder: Path, parser: Procedural, config: PixelNeRFConfig) -
 @pytest.fixture
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     """The method by its name, also where the package was installed before it had this one."""
-    from nerfloom.base import registry
+    from nerfloom import registry
 
     monkeypatch.setenv("NERFLOOM_METHODS", "pixel-nerf=nerfloom.methods.pixel_nerf:METHOD")
     registry.registered.cache_clear()

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels.pixel_set import PixelSet
 
 
 def random_mask(size: int, seed: int, smooth: int) -> torch.Tensor:

@@ -9,11 +9,11 @@ from scipy import stats
 
 from nerfloom.base.device import seed_step
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.error_map import ErrorMap
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixel_stream import PixelStream
-from nerfloom.data.pixels import PixelBatch, draw_batch, draw_pixels
+from nerfloom.data.pixels.batch import PixelBatch, draw_batch, draw_pixels
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.error_map import ErrorMap
+from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.training.checkpoint import load_checkpoint
 from tests.images import write_noise

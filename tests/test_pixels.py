@@ -9,8 +9,8 @@ from scipy import stats
 
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixels import composite, draw_batch, draw_from_images, gather_colors, gather_colors_reference
+from nerfloom.data.pixels.batch import composite, draw_batch, draw_from_images, gather_colors, gather_colors_reference
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.dataparsers.blender import Blender
 from tests.kernels.compiled import needs_kernels
 

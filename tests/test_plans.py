@@ -10,9 +10,9 @@ import torch
 from nerfloom.base.device import relative_speed
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.base.processes import Processes
-from nerfloom.base.registry import load_method
 from nerfloom.data.scene import Scene
 from nerfloom.methods.instant_ngp import Plan, plan
+from nerfloom.registry import load_method
 from nerfloom.samplers.choice import batch_choice, samples_choices
 
 SECONDS = [10 * 360 ** (step / 60) for step in range(61)]  # 10 s to 1 h

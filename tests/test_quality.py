@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.base.registry import load_method
 from nerfloom.data.dataset import DataParser
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.procedural import Procedural
 from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.registry import load_method
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder
 from nerfloom.training.trainer import Trainer

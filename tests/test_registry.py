@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.base import registry
-from nerfloom.base.elsewhere import ELSEWHERE
+from nerfloom import registry
 from nerfloom.base.errors import ConfigError, DataError
-from nerfloom.data.data_folder import find_data
+from nerfloom.base.other_projects import ELSEWHERE
+from nerfloom.training.data_folder import find_data
 
 BUILT_IN = {
     "dnerf",

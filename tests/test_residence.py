@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.data import residence
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.error_map import ErrorMap
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixels import PixelBatch, draw_batch, draw_pixels
-from nerfloom.data.residence import on_device
+from nerfloom.data.pixels import residence
+from nerfloom.data.pixels.batch import PixelBatch, draw_batch, draw_pixels
+from nerfloom.data.pixels.error_map import ErrorMap
+from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.data.pixels.residence import on_device
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.dataparsers.blender import Blender
 

@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.base.registry import load_dataparser
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.data_folder import find_data
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
+from nerfloom.kernels.march.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
+from nerfloom.registry import load_dataparser
 from nerfloom.scene.shared_space import SharedSpace, share_cut_off, times_seen
+from nerfloom.training.data_folder import find_data
 from nerfloom.training.preparation import decided
 from nerfloom.training.ray_starts import MOST_LATE, UNKNOWN, share_late
 from tests.test_free_space import row

@@ -13,15 +13,15 @@ import torch
 from nerfloom.base.config import TrainConfig, from_plain
 from nerfloom.base.errors import ConfigError, NerfloomError
 from nerfloom.base.machine_config import MachineConfig
-from nerfloom.base.registry import load_method, registered
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import MLP
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.hash_grid_layout import MAX_RESOLUTION, HashGridLayout
-from nerfloom.kernels.memory import table
-from nerfloom.kernels.planes import PlanesLayout
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.grids.hash_grid_layout import MAX_RESOLUTION, HashGridLayout
+from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.table_memory import table
+from nerfloom.registry import load_method, registered
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.training.trained import build_model
 from tests.training.helpers import TINY

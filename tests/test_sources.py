@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from nerfloom.base.device import seed_step
-from nerfloom.base.registry import load_method
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.sources import PixelSource, Request, ViewSource, make_source
 from nerfloom.data.sparse_depth import SparseDepth
+from nerfloom.registry import load_method
 from tests.images import write_noise
 
 SIZES = [(20, 10), (7, 30), (16, 16)]

@@ -10,13 +10,13 @@ import torch
 from nerfloom.base.device import seed_step
 from nerfloom.cameras.cameras import Cameras, subpixels
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixels import draw_batch, gather_batch
+from nerfloom.data.pixels.batch import draw_batch, gather_batch
 from nerfloom.data.sources import KEYPOINTS, PixelSource, Request, make_source
 from nerfloom.data.sparse_depth import sparse_depth
 from nerfloom.data.tracks import Sightings
 from nerfloom.evaluation.evaluator import floaters
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing import weights_and_transmittance
+from nerfloom.kernels.compositing.density import weights_and_transmittance
 from nerfloom.losses.functions import WRONG, distance_likelihood
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.trainer import Trainer

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfloom import ray_model
 from nerfloom.kernels.native import available
-from nerfloom.kernels.traced_error import TracedError
+from nerfloom.kernels.traced.squared_error import TracedError
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import ColorError
 from nerfloom.training.trainer import Trainer

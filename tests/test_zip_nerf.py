@@ -15,12 +15,12 @@ from nerfloom.fields.multisampled import MultisampledField
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points
 from nerfloom.kernels import native
-from nerfloom.kernels.kept import Waves
-from nerfloom.kernels.multisampled_grid import multisampled_grid_reference
-from nerfloom.kernels.multisamples import unit_multisamples_reference
+from nerfloom.kernels.grids.multisampled_grid import multisampled_grid_reference
+from nerfloom.kernels.grids.multisamples import unit_multisamples_reference
+from nerfloom.kernels.result_cache import Waves
 from nerfloom.methods.zip_nerf import METHOD, ZipNeRFConfig
 from nerfloom.rendering.volume import VolumeRenderer
-from nerfloom.tools.testing import check_method
+from nerfloom.testing import check_method
 from nerfloom.training.trainer import Trainer
 from tests.kernels.compiled import needs_kernels
 from tests.training.helpers import TINY, chosen, said_otherwise, tiny_run, tiny_trainer

@@ -13,8 +13,8 @@ from typing import Any
 from flags import flag_tables, help_texts
 
 from nerfloom.base.config import AUTO, LEFT_TO_DATA
-from nerfloom.base.registry import Entry, load_method, registered
 from nerfloom.method import Method
+from nerfloom.registry import Entry, load_method, registered
 
 PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
 """What `method_pictures.py` has made."""

@@ -9,6 +9,8 @@ from typing import Any, TypeVar, get_type_hints
 from nerfloom.base.config import AUTO, LEFT_TO_DATA, TrainConfig
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
+
+
 @dataclass(frozen=True)
 class Decision:
     """A record of a setting that was chosen by the data, for the user."""

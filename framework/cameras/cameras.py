@@ -21,8 +21,8 @@ from nerfloom.geometry.lenses import DISTORTED, Distortion, LensRays, iterations
 from nerfloom.geometry.lenses import LENSES as LENSES
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
+from nerfloom.kernels.argument_checks import check_indices, is_followed
 from nerfloom.kernels.dispatch import CPP, Operation
-from nerfloom.kernels.given import check_indices, is_followed
 
 ROTATION_TOLERANCE = 1e-3
 """Maximum deviation of a pose's rotation matrix from an orthonormal one."""

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.carried import carried_poses
+from nerfloom.cameras.rigid_motion import rigid_motions
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.rigid_motion import rigid_motions
 
 Group = Literal["SO3xR3", "SE3"]
 """Parameterisation of a small rigid motion."""

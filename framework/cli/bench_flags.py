@@ -1,12 +1,11 @@
-"""The flags of the benchmarks of `ns-bench`."""
+"""The flags of `ns-bench`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from nerfloom.cli.bench_results import PICTURES, RESULTS
+from nerfloom.cli.bench_results import RESULTS
 
 
 @dataclass(frozen=True)
@@ -23,34 +22,6 @@ class KernelFlags:
     """Folder of kernels-VARIANT.json."""
     plot_dir: Path | None = None
     """Folder of a plot of the times; no plot if not given."""
-
-
-@dataclass(frozen=True)
-class QuadratureFlags:
-    """Measure the error of colours against field evaluations per ray, for every sampler, with known true colours."""
-
-    quick: bool = False
-    """Use fewer rays and sample counts: one minute instead of ten."""
-    seed: int = 0
-    """Random seed of rays, jitter and proposals."""
-    output_dir: Path = RESULTS
-    """Folder of quadrature.json."""
-    plot_dir: Path | None = None
-    """Folder of plots of the curves; no plots if not given."""
-
-
-@dataclass(frozen=True)
-class ViewerBenchFlags:
-    """Measure the viewer's pictures of trained runs, from a request to the JPEG file, for one browser, on the CPU."""
-
-    runs: tuple[Path, ...] = ()
-    """Folders of trained runs."""
-    widths: tuple[int, ...] = (400, 800)
-    """Widths and heights of the finished pictures, pixels."""
-    pictures: int = 60
-    """Number of pictures of a moving camera."""
-    output_dir: Path = RESULTS
-    """Folder of viewer.json."""
 
 
 @dataclass(frozen=True)
@@ -87,64 +58,6 @@ class MethodFlags:
     """Folder of a plot of PSNR over time; no plot if not given."""
 
 
-@dataclass(frozen=True)
-class CurvesFlags:
-    """Train methods from the start for each of several budgets, with several seeds; report PSNR against seconds.
-
-    Results and picture are written after each budget. What is in --run-dir is kept: the same command goes on where it
-    was stopped, and one with further methods, budgets or seeds trains these alone."""
-
-    data: Path | None = None
-    """Folder of the data set; the embedded scene if not given."""
-    methods: tuple[str, ...] = ()
-    """Methods, in quotes if with flags of their own: instant-ngp "vanilla-nerf --sampler occupancy". All installed ones
-    if not given."""
-    budgets: tuple[float, ...] = (10.0, 20.0, 45.0, 150.0, 300.0, 600.0)
-    """Seconds of training, each for runs of its own."""
-    seeds: int = 3
-    """Number of runs of each method with each budget."""
-    views: int = 50
-    """Maximum number of held-out views on which PSNR is measured, evenly spaced."""
-    run_dir: Path | None = None
-    """Folder of the runs; outputs/curves-DATA if not given."""
-    output_dir: Path = RESULTS
-    """Folder of curves-DATA.json."""
-    plot_dir: Path = PICTURES
-    """Folder of the picture, curves-DATA.svg."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AblationFlags:
-    """Train instant-ngp with one part switched off, or on, in turn; report the time to a PSNR and the final PSNR."""
-
-    data: Path
-    """Folder of the data set."""
-    seconds: float = 45.0
-    """Seconds of training of each run."""
-    seeds: int = 2
-    """Number of runs of each variant."""
-    target: float = 30.0
-    """PSNR of the validation views, dB, to which the time is reported."""
-    output_dir: Path = RESULTS
-    """Folder of ablation-DATA.json."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StartsFlags:
-    """Train gaussian-splatting from each kind of start in turn; report the time to a PSNR and the final PSNR."""
-
-    data: Path
-    """Folder of the data set."""
-    seconds: float = 60.0
-    """Seconds of training of each run."""
-    seeds: int = 1
-    """Number of runs from each start."""
-    target: float = 30.0
-    """PSNR of the validation views, dB, to which the time is reported."""
-    output_dir: Path = RESULTS
-    """Folder of starts-DATA.json."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ProfileFlags:
     """Train for some steps, then measure 200: the time in each compiled kernel, and the rest."""
@@ -159,95 +72,3 @@ class ProfileFlags:
     """Time budget, seconds, for which the method chooses its settings; training does not stop after it."""
     output_dir: Path = RESULTS
     """Folder of profile-METHOD.json."""
-
-
-@dataclass(frozen=True)
-class OperationsFlags:
-    """Count operations of torch, and waits for the device, in a training step on torch alone, as on a GPU."""
-
-    methods: tuple[str, ...] = ()
-    """Names of methods; all built-in ones if not given."""
-    before: int = 16
-    """Training steps before those that are counted."""
-    steps: int = 8
-    """Training steps that are counted."""
-    output: Path = RESULTS / "operations.json"
-    """JSON file to write."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ContentionFlags:
-    """Run instant-ngp alone, beside busy loops and beside itself; report the remaining fraction of its speed."""
-
-    data: Path
-    """Folder of the data set."""
-    seconds: float = 20.0
-    """Seconds of each measurement."""
-    rows: tuple[str, ...] = ()
-    """Names of conditions, or parts of names; all if not given. The run alone is always measured."""
-    work: Literal["training", "rendering"] | None = None
-    """Work to measure; both if not given."""
-    output: Path = RESULTS / "contention.json"
-    """JSON file to write."""
-
-
-@dataclass(frozen=True)
-class CacheFlags:
-    """Train on large images with pixels in a file and on small ones in memory; report memory, speed and waiting."""
-
-    images: int = 250
-    """Number of images."""
-    width: int = 1920
-    """Width of the large images, pixels."""
-    height: int = 1080
-    """Height of the large images, pixels."""
-    seconds: float = 60.0
-    """Seconds of training on each set."""
-    limit: float = 500.0
-    """Maximum memory of decoded pixels, MB."""
-    folder: Path | None = None
-    """Folder of images and cache during the run; the system's temporary folder if not given."""
-    output: Path = RESULTS / "cache.json"
-    """JSON file to write."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PosesFlags:
-    """Compare poses from ns-process-data with those of a COLMAP model of the same images, by name."""
-
-    processed: Path
-    """Folder with transforms.json."""
-    model: Path
-    """Folder with cameras.bin, images.bin and points3D.bin."""
-
-
-@dataclass(frozen=True)
-class PoseRefinementFlags:
-    """Train on the embedded scene with exact, disturbed and refined poses; report pose errors and PSNR."""
-
-    seconds: float = 120.0
-    """Seconds of training of each run."""
-    degrees: float = 1.0
-    """Angle by which each training camera is rotated, degrees."""
-    percent: float = 1.0
-    """Distance by which each training camera is moved, per cent of its distance from the centre of the scene."""
-    method: str = "nerfacto"
-    """Name of the method."""
-    output_dir: Path = RESULTS
-    """Folder of pose-refinement.json."""
-
-
-@dataclass(frozen=True)
-class MeshFlags:
-    """Export meshes of a run; report their distance from what is known of the surface, their time and memory."""
-
-    load_config: Path | None = None
-    """Folder of a run; if not given, instant-ngp is trained on the embedded scene."""
-    seconds: float = 60.0
-    """Seconds of that training."""
-    exports: tuple[Literal["marching-cubes", "tsdf"], ...] = ("marching-cubes", "tsdf")
-    """Exports that are measured."""
-    resolutions: tuple[int, ...] = (256, 512)
-    """Cells along the longest edge of the box."""
-    output: Path = RESULTS / "meshes-procedural.json"
-    """JSON file to write."""

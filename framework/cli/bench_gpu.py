@@ -61,8 +61,8 @@ def measure_gpu(flags: GpuFlags) -> None:
 
     if not torch.cuda.is_available():
         raise ConfigError("ns-bench gpu: this machine or this PyTorch has no GPU; --interpreter needs none")
+    from nerfloom.benchmarks.gpu import METHODS, Part, gpu_plan, in_time, measured_kernels, reached, timed_steps
     from nerfloom.cli.compare import compare
-    from nerfloom.tools.benchmarks.gpu import METHODS, Part, gpu_plan, in_time, measured_kernels, reached, timed_steps
 
     name = "procedural" if flags.data is None else flags.data.resolve().name
     path = flags.output_dir / f"gpu-{name}.json"
@@ -86,7 +86,7 @@ def _interpret(path: Path) -> None:
     if find_spec("triton") is None:
         raise ConfigError("ns-bench gpu --interpreter: Triton is not installed: pip install triton")
     from nerfloom.base.console import console
-    from nerfloom.tools.benchmarks.kernel_errors import as_table, interpreted
+    from nerfloom.benchmarks.kernel_errors import as_table, interpreted
     from nerfloom.training.machine import machine
 
     make_room(path)

@@ -14,8 +14,8 @@ import nerfloom
 from nerfloom.base.console import console, say
 from nerfloom.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
 from nerfloom.base.from_nerfstudio import KINDS
-from nerfloom.base.registry import registered
 from nerfloom.cli.flags import read_flags
+from nerfloom.registry import registered
 from nerfloom.training.signals import exit_status, orderly_end
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
             break
     else:
         return arguments, None
-    from nerfloom.base.registry import load_dataparser
+    from nerfloom.registry import load_dataparser
 
     found: Any = read_flags(
         load_dataparser(word), f"{command} {word}", arguments[index + 1 :], return_unknown_args=True
@@ -188,7 +188,7 @@ def version() -> str:
 
 
 def _environment() -> str:
-    from nerfloom.tools.environment import environment  # it loads torch, for which --version alone need not wait
+    from nerfloom.cli.environment import environment  # it loads torch, for which --version alone need not wait
 
     return environment()
 

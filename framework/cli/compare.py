@@ -13,8 +13,8 @@ from nerfloom.cli.flags import read_flags
 from nerfloom.training.run_path import check_data, check_writable
 
 if TYPE_CHECKING:
-    from nerfloom.tools.comparison.measures import Row
-    from nerfloom.tools.comparison.plan import Plan
+    from nerfloom.comparison.measures import Row
+    from nerfloom.comparison.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ def plan_of(flags: CompareFlags) -> Plan:
     Raises:
         ConfigError: if a flag's value is invalid, or flags contradict each other.
     """
-    from nerfloom.data.data_folder import find_data
-    from nerfloom.tools.comparison.plan import Conditions, Contender, Plan, split_words, views_for
+    from nerfloom.comparison.plan import Conditions, Contender, Plan, split_words, views_for
+    from nerfloom.training.data_folder import find_data
 
     if flags.data is not None and not os.path.isdir(flags.data):
         flags = replace(flags, data=find_data(flags.data)[0])
@@ -128,10 +128,10 @@ def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
         A row of the table for each method.
     """
     from nerfloom.base.console import console, say
-    from nerfloom.tools.comparison import plots
-    from nerfloom.tools.comparison.measures import measure, rows_of
-    from nerfloom.tools.comparison.report import console_table, write_report
-    from nerfloom.tools.comparison.runner import run_jobs
+    from nerfloom.comparison import plots
+    from nerfloom.comparison.measures import measure, rows_of
+    from nerfloom.comparison.report import console_table, write_report
+    from nerfloom.comparison.runner import run_jobs
 
     if not plots.available():
         say(f"the report will be {plots.MISSING}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from nerfloom.base.errors import FlagError
 from nerfloom.cli.common import chosen_kind, run_command
 from nerfloom.cli.flags import read_flags
-from nerfloom.tools.downloads.catalogue import DATASETS
+from nerfloom.downloads.catalogue import DATASETS
 from nerfloom.training.signals import Stopped, signal_of
 
 USAGE = """\
@@ -50,7 +50,7 @@ def _command(arguments: list[str]) -> None:
         raise FlagError("--capture-name is nerfstudio's; here it is --scenes")
     description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"
     flags = read_flags(DownloadFlags, f"ns-download-data {name}", rest, description=description)
-    from nerfloom.tools.downloads.install import announce, install
+    from nerfloom.downloads.install import announce, install
 
     announce(name, dataset, flags.save_dir, flags.scenes)
     try:

@@ -24,9 +24,9 @@ from nerfloom.base.config import AUTO, LEFT_TO_DATA, AppearanceConfig, RayConfig
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.flag_text import hide_none, plain
 from nerfloom.data.dataset import DataParser
+from nerfloom.losses.few_images import FewImagesConfig
 from nerfloom.samplers.background import BackgroundConfig
 from nerfloom.samplers.choice import HierarchicalConfig, SamplingConfig
-from nerfloom.scene.few_images import FewImagesConfig
 from nerfloom.scene.motion import MotionConfig
 
 OWN = "METHOD"

@@ -10,9 +10,9 @@ from pathlib import Path
 from string import Template
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import registered
 from nerfloom.cli.common import run_command
 from nerfloom.cli.flags import read_flags
+from nerfloom.registry import registered
 
 TEMPLATES = Path(__file__).parents[1] / "templates" / "method"
 SUFFIX = ".template"

@@ -12,7 +12,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.cli.common import chosen_kind, run_command
 from nerfloom.cli.flags import read_flags
-from nerfloom.tools.processing.settings import ColmapFlags, OutputFlags
+from nerfloom.processing.settings import ColmapFlags, OutputFlags
 from nerfloom.training.signals import Stopped, signal_of
 
 USAGE = """\
@@ -135,7 +135,7 @@ def _what_it_is(name: str, words: list[str]) -> tuple[str, list[str]] | None:
     given = [index for index, word in enumerate(words[:-1]) if word == "--data"]
     if name not in ("images", "video") or not given:
         return None
-    from nerfloom.tools.processing.listing import kind_of
+    from nerfloom.processing.listing import kind_of
 
     kind, data = kind_of(name, Path(words[given[-1] + 1]))
     return None if kind == name else (kind, [*words[: given[-1] + 1], str(data), *words[given[-1] + 2 :]])
@@ -155,7 +155,7 @@ def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
 
 
 def _process(flags: OutputFlags) -> None:
-    from nerfloom.tools.processing.output import check_apart
+    from nerfloom.processing.output import check_apart
 
     if not flags.data.exists():
         raise DataError(f"--data {flags.data}: there is no such file or folder")
@@ -167,14 +167,14 @@ def _process(flags: OutputFlags) -> None:
 
 
 def _find_poses(flags: ColmapFlags) -> None:
-    from nerfloom.tools.processing import colmap
-    from nerfloom.tools.processing.ffmpeg import frame_count
-    from nerfloom.tools.processing.job import Job
-    from nerfloom.tools.processing.listing import find_images
-    from nerfloom.tools.processing.output import FINISHED, begin, ready
-    from nerfloom.tools.processing.pipeline import process
-    from nerfloom.tools.processing.sequence import is_sequence
-    from nerfloom.tools.processing.unfinished import frames_of
+    from nerfloom.processing import colmap
+    from nerfloom.processing.ffmpeg import frame_count
+    from nerfloom.processing.job import Job
+    from nerfloom.processing.listing import find_images
+    from nerfloom.processing.output import FINISHED, begin, ready
+    from nerfloom.processing.pipeline import process
+    from nerfloom.processing.sequence import is_sequence
+    from nerfloom.processing.unfinished import frames_of
 
     colmap.require()
     if flags.resume and (flags.output_dir / FINISHED).exists():
@@ -195,8 +195,8 @@ def _find_poses(flags: ColmapFlags) -> None:
 
 
 def _convert(flags: OutputFlags) -> None:
-    from nerfloom.tools.processing import polycam, record3d
-    from nerfloom.tools.processing.output import claim
+    from nerfloom.processing import polycam, record3d
+    from nerfloom.processing.output import claim
 
     if isinstance(flags, PolycamFlags):
         polycam.check(flags.data)

@@ -26,9 +26,8 @@ from nerfloom.cli.render_flags import (
     TimeFlags,
 )
 from nerfloom.data.dataset import Dataset, ParsedScene
-from nerfloom.data.folds import in_order
 from nerfloom.data.image_files import reduce_image
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.evaluation.paths import (
     arc_of,
@@ -40,6 +39,7 @@ from nerfloom.evaluation.paths import (
     spiral,
     stretches,
 )
+from nerfloom.scene.folds import in_order
 from nerfloom.training.datasets import load_split
 from nerfloom.training.trained import Trained
 

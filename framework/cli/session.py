@@ -18,7 +18,7 @@ from nerfloom.base.processes import from_first, joined_processes, processes
 from nerfloom.cli.common import check_weights
 from nerfloom.cli.next_steps import after_training
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.residence import on_device
+from nerfloom.data.pixels.residence import on_device
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.model import StartsFromImages
 from nerfloom.splats.gaussians import HasGaussians

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
-from nerfloom.base.registry import registered
 from nerfloom.cli.common import make_room, run_command
 from nerfloom.cli.flags import read_flags
+from nerfloom.registry import registered
 from nerfloom.training.run_path import check_data
 
 if TYPE_CHECKING:
-    from nerfloom.tools.stress.conditions import Condition
-    from nerfloom.tools.stress.report import Result
-    from nerfloom.tools.stress.trial import Budget
+    from nerfloom.stress.conditions import Condition
+    from nerfloom.stress.report import Result
+    from nerfloom.stress.trial import Budget
     from nerfloom.training.run import Run
 
 USAGE = """\
@@ -98,9 +98,9 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
         check_data(flags.data)
     from nerfloom.base.console import say
     from nerfloom.base.device import choose_device
-    from nerfloom.tools.stress.report import Result, markdown, settings_of
-    from nerfloom.tools.stress.scenes import ball_views, data_views
-    from nerfloom.tools.stress.verdict import verdicts
+    from nerfloom.stress.report import Result, markdown, settings_of
+    from nerfloom.stress.scenes import ball_views, data_views
+    from nerfloom.stress.verdict import verdicts
     from nerfloom.training.machine import machine
 
     runs, conditions = [_run(method, flags) for method in methods], _conditions(flags)
@@ -127,7 +127,7 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 def _run(method: str, flags: StressFlags) -> Run:
     """Return the run that `ns-train` would start with the method and its flags."""
     from nerfloom.cli.train import run_of
-    from nerfloom.tools.comparison.plan import split_words
+    from nerfloom.comparison.plan import split_words
 
     words, data_flags = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
     if not words:
@@ -142,7 +142,7 @@ def _run(method: str, flags: StressFlags) -> Run:
 def _conditions(flags: StressFlags) -> list[Condition]:
     """Return the selected conditions, without those that cannot be applied to --data."""
     from nerfloom.base.console import say
-    from nerfloom.tools.stress.conditions import select
+    from nerfloom.stress.conditions import select
 
     selected = select(flags.only)
     if flags.data is None:
@@ -154,7 +154,7 @@ def _conditions(flags: StressFlags) -> list[Condition]:
 
 
 def _budget(flags: StressFlags) -> Budget:
-    from nerfloom.tools.stress.trial import Budget
+    from nerfloom.stress.trial import Budget
 
     if flags.max_num_iterations < 1 or (flags.max_seconds is not None and not flags.max_seconds > 0):
         raise FlagError("--max-num-iterations must be at least 1, and --max-seconds more than 0")
@@ -196,7 +196,7 @@ def _print(results: Sequence[Result]) -> None:
     from rich.text import Text
 
     from nerfloom.base.console import console, say
-    from nerfloom.tools.stress.report import notes, table
+    from nerfloom.stress.report import notes, table
 
     head, *rows = table(results)
     grid = Table()

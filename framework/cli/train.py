@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.from_nerfstudio import flag_answer, taken, vis_answer
-from nerfloom.base.registry import entry_of, registered, summary
 from nerfloom.cli.common import run_command
 from nerfloom.cli.flags import read_flags
+from nerfloom.registry import entry_of, registered, summary
 
 if TYPE_CHECKING:
     from nerfloom.training.run import Run
@@ -105,7 +105,7 @@ def _check_method(method: str) -> None:
 
 def _default_run(method: str) -> Run:
     """Return a run of a method with its default settings, without data."""
-    from nerfloom.base.registry import load_dataparser, load_method
+    from nerfloom.registry import load_dataparser, load_method
     from nerfloom.training.run import Run
 
     return Run(method, load_method(method).config, "", load_dataparser("procedural")(), Path())
@@ -132,9 +132,9 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     Flags are parsed with those of the data format, so that --data and the format's name must be found before.
     """
-    from nerfloom.base.registry import load_dataparser
     from nerfloom.base.step_limit import limited_as_given
-    from nerfloom.data.data_folder import find_data
+    from nerfloom.registry import load_dataparser
+    from nerfloom.training.data_folder import find_data
     from nerfloom.training.run import run_folder
 
     flags, notes = taken(flags, set(_flag_names(run.config)))

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels.pixel_set import PixelSet
 
 BLOCK = 1 << 20
 """Number of pixels tested at once."""

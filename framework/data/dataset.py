@@ -28,12 +28,12 @@ from nerfloom.data.image_files import one_line as one_line
 from nerfloom.data.image_files import read_image as read_image
 from nerfloom.data.image_files import reduce_image as reduce_image
 from nerfloom.data.light import APPEARANCE_STOPS, light_spread
-from nerfloom.data.mapped_pixels import MappedPixels
 from nerfloom.data.names_on_disk import nearest_on_disk
 from nerfloom.data.parsed_scene import DataParser as DataParser
 from nerfloom.data.parsed_scene import ParsedScene as ParsedScene
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
 from nerfloom.data.sparse_depth import SparseDepth, sparse_depth
 from nerfloom.data.travel import Travel

@@ -21,11 +21,11 @@ from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import may_be_transparent, read_image, reduce_image
 from nerfloom.data.light import light_of
-from nerfloom.data.mapped_pixels import MappedPixels
 from nerfloom.data.masks import read_mask
-from nerfloom.data.pixel_cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixel_store import MemoryStore, PixelStore, drop_fourth, move
+from nerfloom.data.pixels.cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
+from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.data.pixels.store import MemoryStore, PixelStore, drop_fourth, move
 
 WORKERS = min(os.cpu_count() or 1, 8)
 """Images decoded at once; each takes several times the memory of its pixels meanwhile."""

@@ -14,9 +14,9 @@ from torch import Tensor
 from nerfloom.base.arrays import read_array
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.data_folder import IMAGE_SUFFIXES
 from nerfloom.data.exr import depth_channel, read_channel, read_header
 from nerfloom.data.image_files import Content, unreadable
+from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.data_folder import UNREAD_SUFFIXES
+from nerfloom.data.suffixes import UNREAD_SUFFIXES
 
 # Pillow detects the format from the content, whatever the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False

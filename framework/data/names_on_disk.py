@@ -19,7 +19,7 @@ from pathlib import Path, PurePath
 from urllib.parse import unquote
 
 from nerfloom.base.console import say
-from nerfloom.data.data_folder import IMAGE_SUFFIXES
+from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
 LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 """Endings that are tried, in this order, for a name without one."""

@@ -15,10 +15,8 @@ from nerfloom.base.processes import processes
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.error_map import ErrorMap
 from nerfloom.data.free_space import clear_distances
-from nerfloom.data.pixel_stream import PixelStream
-from nerfloom.data.pixels import (
+from nerfloom.data.pixels.batch import (
     Background,
     LookUp,
     PixelBatch,
@@ -29,6 +27,8 @@ from nerfloom.data.pixels import (
     known_distances,
     training_background,
 )
+from nerfloom.data.pixels.error_map import ErrorMap
+from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.data.sparse_depth import SparseDepth
 
 

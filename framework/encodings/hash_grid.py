@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from nerfloom.base.config import Range, TrainConfig
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.opening import Opening
-from nerfloom.kernels.hash_grid import LOOK_UP, HashGridLayout, hash_grid
-from nerfloom.kernels.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from nerfloom.kernels.hash_grid_lookup import TableGradient
-from nerfloom.kernels.memory import table
+from nerfloom.kernels.grids.hash_grid import LOOK_UP, HashGridLayout, hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
+from nerfloom.kernels.table_memory import table
 
 FIRST_LEVELS = 4
 """Number of levels that are open at the start if they open one after the other, as in Neuralangelo (Li et al. 2023)."""

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from nerfloom.geometry.bounds import contract_gaussians
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.integrated import integrated_encoding
+from nerfloom.kernels.encodings.integrated import integrated_encoding
 
 
 class IntegratedEncoding(nn.Module):

@@ -9,15 +9,15 @@ from torch import Tensor
 
 from nerfloom.base import device as devices
 from nerfloom.encodings.hash_grid import HashGrid
-from nerfloom.kernels.hash_grid_lookup import TableGradient
-from nerfloom.kernels.multisampled_grid import LOOK_UP, multisampled_grid
+from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
+from nerfloom.kernels.grids.multisampled_grid import LOOK_UP, multisampled_grid
 
 DECAYED = 8
 """On a CPU, one in this many frustums decays in a step, at a random place, and as many times as much."""
 
 
 class MultisampledHashGrid(HashGrid):
-    """A multiresolution hash grid over [0, 1]^3 that is looked up at multisamples (`nerfloom.kernels.multisamples`).
+    """A multiresolution hash grid over [0, 1]^3 that is looked up at multisamples (`kernels.grids.multisamples`).
 
     Decay: the paper adds the mean of squares of each level's entries to the loss, so that the few entries of coarse
     levels decay as fast as the many of fine ones. Its gradient touches the whole table in each step. Here it is the

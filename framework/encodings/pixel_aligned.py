@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, relu
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.kernels.memory import require
+from nerfloom.kernels.table_memory import require
 
 MOST_LEVELS = 8
 """Maximum number of levels of an image encoder; a pixel of the eighth is 128 pixels wide."""

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from nerfloom.base import device as devices
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.opening import Opening
-from nerfloom.kernels.drawn_bands import drawn_bands
-from nerfloom.kernels.memory import table
-from nerfloom.kernels.plane_bands import Band, band_variation, plane_bands, variation
-from nerfloom.kernels.planes import PlanesGradient, PlanesLayout, planes
+from nerfloom.kernels.grids.drawn_bands import drawn_bands
+from nerfloom.kernels.grids.plane_bands import Band, band_variation, plane_bands, variation
+from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout, planes
+from nerfloom.kernels.table_memory import table
 
 BANDS = 16
 """Number of bands into which `FeaturePlanes.bands` divides the rows of a factor."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels import gather_batch
+from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.fields.appearance import Appearance
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.model import HasAppearance, Model, evaluating

@@ -22,13 +22,13 @@ from nerfloom.base.errors import DataError
 from nerfloom.base.meter import time_text
 from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.appearance import appearance_of, fitted_appearance, right_half
 from nerfloom.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
 from nerfloom.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
 from nerfloom.evaluation.statistics import statistics
 from nerfloom.evaluation.view_files import Judged, ViewFiles
-from nerfloom.kernels.ssim import WINDOW
+from nerfloom.kernels.images.ssim import WINDOW
 from nerfloom.model import Model, RendersFromImages
 from nerfloom.rendering.rendered import Picture
 

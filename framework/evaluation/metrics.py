@@ -11,8 +11,8 @@ from torch.nn import functional
 
 from nerfloom.base.device import to_float64
 from nerfloom.kernels.dispatch import Operation
-from nerfloom.kernels.ssim import PHOTOMETRIC, SIMILARITY, WINDOW, structure, windows_inside
-from nerfloom.kernels.ssim import ssim as similarity
+from nerfloom.kernels.images.ssim import PHOTOMETRIC, SIMILARITY, WINDOW, structure, windows_inside
+from nerfloom.kernels.images.ssim import ssim as similarity
 from nerfloom.splats.resolution import halved
 
 MAX_PSNR = 100.0

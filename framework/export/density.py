@@ -15,8 +15,8 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.export.lattice import Lattice
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.points import Points
+from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.kernels.occupancy import Occupancy
 from nerfloom.model import HasDensity, Model, parts
 from nerfloom.samplers.base import SkipsCells
 
@@ -32,7 +32,7 @@ COARSE_SHARE = 0.01
 """A block is searched if the coarse pass finds this fraction of the level in it."""
 LEVEL_SHARE = 1 / 32
 """Length, as a fraction of the longest edge of the scene's box, of which matter at the default level is half opaque. On
-the embedded scene (`ns-bench meshes`) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses what is
+the embedded scene (benchmarks/meshes.py) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses what is
 translucent."""
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels import draw_pixels
+from nerfloom.data.pixels.batch import draw_pixels
 from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.model import Model
 from nerfloom.ray_model import RayModel

@@ -12,8 +12,7 @@ from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError, FlagError, printable
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.folds import in_order
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import evaluation_background, measure, spread, views_to_judge
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.export.cameras import refined_cameras
@@ -29,6 +28,7 @@ from nerfloom.export.web import (
     upright,
 )
 from nerfloom.ray_model import RayModel
+from nerfloom.scene.folds import in_order
 from nerfloom.splats.drawing import DRAWN, draw_colors, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look

@@ -29,9 +29,9 @@ from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.points import joined, surface_points
 from nerfloom.geometry.alignment import nearest_rotations
+from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.kernels.splat_project import SplatCamera
-from nerfloom.kernels.ssim import photometric_loss
+from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.ray_model import RayModel
 from nerfloom.splats.drawing import DRAWN, draw, on_image, splat_camera
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians

@@ -1,6 +1,6 @@
 """A web page of Gaussians: one HTML file that opens from disk, offline, in any browser with WebGL 2.
 
-The page (`page/`) is our own: it draws as `framework/kernels/splat_project.py` does, asks no host for anything, and
+The page (`page/`) is our own: it draws as `framework/kernels/splats/project.py` does, asks no host for anything, and
 holds the Gaussians as an SPZ file (`framework/splats/spz.py`) in base64, and facts about them as JSON.
 """
 
@@ -25,7 +25,7 @@ import nerfloom
 from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import looked_at, rotation_between
-from nerfloom.splats.budget import fitted_spz
+from nerfloom.splats.gaussian_limit import fitted_spz
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
 from nerfloom.splats.spz import encoded, out_of_range, read_spz

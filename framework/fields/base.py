@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from nerfloom.base.errors import ConfigError, shown
 from nerfloom.base.optimised import Optimised
 from nerfloom.geometry.points import Footprint, Points
-from nerfloom.kernels.memory import require
-from nerfloom.kernels.mlp import Activation, density_mlp, mlp
-from nerfloom.kernels.trace import GridDensity
-from nerfloom.kernels.traced_colors import GridColor
+from nerfloom.kernels.networks.mlp import Activation, density_mlp, mlp
+from nerfloom.kernels.table_memory import require
+from nerfloom.kernels.traced.colors import GridColor
+from nerfloom.kernels.traced.trace import GridDensity
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
 """Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""
@@ -76,7 +76,7 @@ class HasGridDensity(Protocol):
     """A field whose density may be a small network on a hash grid, which is traced in one call."""
 
     def grid_density(self) -> GridDensity | None:
-        """Return the density as `nerfloom.kernels.trace` computes it; None to evaluate `Field.density` instead."""
+        """Return the density as `kernels.traced.trace` computes it; None to evaluate `Field.density` instead."""
 
 
 @runtime_checkable
@@ -84,7 +84,7 @@ class HasGridColor(HasGridDensity, Protocol):
     """A field of such a density whose colour may be a small network too, so that it is shown and learnt in one call."""
 
     def grid_color(self) -> GridColor | None:
-        """Return the colour as `nerfloom.kernels.traced_colors` computes it; None for `Field.color`."""
+        """Return the colour as `nerfloom.kernels.traced.colors` computes it; None for `Field.color`."""
 
 
 @runtime_checkable

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from nerfloom.fields.base import MLP, Field
 from nerfloom.fields.nerf import encoded_times
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.contraction import contract_to_unit
-from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.encodings.frequency import frequency_encoding
 
 
 class DeformedField(Field):

@@ -11,10 +11,10 @@ from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.contraction import contract_to_unit
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
-from nerfloom.kernels.trace import GridDensity
-from nerfloom.kernels.traced_colors import GridColor
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.traced.colors import GridColor
+from nerfloom.kernels.traced.trace import GridDensity
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""

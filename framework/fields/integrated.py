@@ -10,8 +10,8 @@ from torch.nn.functional import softplus
 from nerfloom.encodings.integrated import IntegratedEncoding
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.points import Footprint, Points
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.mlp import MAX_WIDTH
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.networks.mlp import MAX_WIDTH
 
 DENSITY_BIAS = -1.0
 """Added to the density before softplus, which starts the scene half transparent (Mip-NeRF, supplement)."""

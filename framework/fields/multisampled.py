@@ -9,7 +9,7 @@ from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.encoded import BoxField, DensityField, EncodedField
 from nerfloom.geometry.multisamples import fixed_pattern, hashed_pattern
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.multisamples import unit_multisamples
+from nerfloom.kernels.grids.multisamples import unit_multisamples
 
 
 class MultisampledDensity(DensityField):

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing import ray_sum
-from nerfloom.kernels.frequency import frequency_encoding
+from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.math import safe_normalize
 
 FREQUENCIES = 2

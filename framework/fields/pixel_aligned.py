@@ -9,8 +9,8 @@ from torch.nn.functional import relu, softplus
 from nerfloom.encodings.pixel_aligned import SourceViews
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.memory import require
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.table_memory import require
 
 
 class ResidualBlock(nn.Module):

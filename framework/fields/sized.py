@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.encoded import BoxField, DensityField, EncodedField
 from nerfloom.geometry.points import Footprint, Points
-from nerfloom.kernels.multisamples import ball_deviations, frustum_balls, unit_balls
+from nerfloom.kernels.grids.multisamples import ball_deviations, frustum_balls, unit_balls
 
 
 class SizedGrid(BoxField):

@@ -15,9 +15,9 @@ from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.bounds import to_unit_box
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.contraction import contract_to_unit
-from nerfloom.kernels.mlp import mlp
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.networks.mlp import mlp
 
 VM = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
 """Three groups: a plane, and the line across it (equation 4)."""

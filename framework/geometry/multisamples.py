@@ -41,7 +41,7 @@ def hashed_pattern(frustums: Frustums) -> Pattern:
     """Return rotations that look random, half of them mirrored; for training.
 
     They are a hash of both ends of a frustum, which are random themselves, so that those of the same frustum are the
-    same again: what a march has evaluated in waves need not be evaluated another time (`nerfloom.kernels.kept`).
+    same again: what a march has evaluated in waves need not be evaluated another time (`kernels.result_cache`).
 
     Args:
         frustums: N frustums.

@@ -16,7 +16,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from nerfloom.kernels import native, triton_kernels
+from nerfloom.kernels import native, triton_backend
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,7 +42,7 @@ FEW_OPERATIONS = Backend("few operations", lambda tensor: not (tensor.is_cpu and
 compiled kernels. Beside these the CPU takes the reference, so that runs on it stay the same to the bit."""
 CPP = Backend("c++", attrgetter("is_cpu"), lambda: native.available())
 TRITON = Backend(
-    "triton", attrgetter("is_cpu" if triton_kernels.INTERPRETED else "is_cuda"), lambda: triton_kernels.available()
+    "triton", attrgetter("is_cpu" if triton_backend.INTERPRETED else "is_cuda"), lambda: triton_backend.available()
 )
 """Kernels for NVIDIA's and AMD's GPUs. PyTorch names both "cuda"."""
 FLOAT32, INT64, BOOL = (frozenset({kind}) for kind in (torch.float32, torch.int64, torch.bool))

@@ -2,7 +2,7 @@
 
 Each kernel's Python file declares its C functions as `Function`, and passes tensors through `pointer`, which checks
 them. A C function returns a status, which is raised as an exception here. The library has its own threads
-(`csrc/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
+(`kernels/runtime/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
 
 The environment variable `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16,
 amx_bf16), "triton" for Triton's kernels only, or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder of
@@ -31,8 +31,8 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.base.extras import reinstall_command
 from nerfloom.kernels.sources import fingerprint
 
-SOURCES = Path(__file__).parent / "csrc"
-FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or Path(__file__).parent / "lib")
+SOURCES = Path(__file__).parent
+FOLDER = Path(os.environ.get("NERFLOOM_KERNEL_FOLDER") or SOURCES / "lib")
 _AVX512 = ("avx512f", "avx512bw", "avx512dq", "avx512vl", "fma")
 NEEDS: dict[str, tuple[str, ...]] = {
     "amx_bf16": (*_AVX512, "avx512_bf16", "amx_tile", "amx_bf16"),
@@ -138,7 +138,7 @@ class Function:
     """A C function of the library, which is looked up at its first call.
 
     A call raises MemoryError, IndexError, ValueError or RuntimeError according to the status that the C function
-    returns (csrc/status.h).
+    returns (kernels/runtime/status.h).
 
     Args:
         name: name of the C function.

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
+from nerfloom.kernels.argument_checks import check_indices
 from nerfloom.kernels.dispatch import CPP, INT64, Operation
-from nerfloom.kernels.given import check_indices
 
 _gather = native.Function("gather_rows", "ppipipqpi")
 

@@ -10,14 +10,15 @@ from pathlib import Path
 
 
 def fingerprint(folder: Path) -> int:
-    """Return a number of 63 bits for the names and contents of the C++ files in a folder.
+    """Return a number of 63 bits for the names and contents of the C++ files in the folders of a folder.
 
     Args:
-        folder: the folder, of which only .cpp and .h files count.
+        folder: the folder `kernels`, with a folder for each family.
     """
     digest = hashlib.sha256()
-    for path in sorted((*folder.glob("*.cpp"), *folder.glob("*.h")), key=lambda path: path.name):
+    paths = {path.relative_to(folder).as_posix(): path for path in (*folder.glob("*/*.cpp"), *folder.glob("*/*.h"))}
+    for name, path in sorted(paths.items()):
         content = path.read_bytes()
-        digest.update(f"{path.name} {len(content)}\n".encode())
+        digest.update(f"{name} {len(content)}\n".encode())
         digest.update(content)
     return int.from_bytes(digest.digest()[:8], "big") >> 1

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing import distortion, ray_sum
-from nerfloom.kernels.spacing import to_disparity
+from nerfloom.kernels.compositing.density import distortion, ray_sum
+from nerfloom.kernels.histograms.spacing import to_disparity
 
 WIDTH = 3.0
 """Standard deviations from a known distance within which a ray is to end."""

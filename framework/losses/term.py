@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from nerfloom.data.pixels import PixelBatch
+from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.rendering.rendered import Pixels, Rendered
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.cameras.unseen import unseen_patches
-from nerfloom.data.pixels import PixelBatch
+from nerfloom.data.pixels.batch import PixelBatch
+from nerfloom.losses.few_images import unseen_weight
 from nerfloom.losses.functions import (
     density_before,
     depth_error,
@@ -21,7 +22,6 @@ from nerfloom.losses.functions import (
 )
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.samplers.proposal import half_edge
-from nerfloom.scene.few_images import unseen_weight
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel

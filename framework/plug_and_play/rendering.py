@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.alpha import unit_intervals
-from nerfloom.kernels.compositing import ray_sum
+from nerfloom.kernels.compositing.alpha import unit_intervals
+from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.plug_and_play.functions import RgbFunction, at_least_float32, check_rays, evaluate
 from nerfloom.rendering.volume import volume_render
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf, uniform_variates
 from nerfloom.plug_and_play.functions import DensityOnly, SigmaFunction, as_density, check_rays
-from nerfloom.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from nerfloom.samplers.proposal import propose
 from nerfloom.samplers.uniform import UniformSampler
 

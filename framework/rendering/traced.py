@@ -7,9 +7,9 @@ from torch import Tensor
 
 from nerfloom.fields.base import Field, HasGridColor
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.trace import GridDensity
-from nerfloom.kernels.traced_colors import GridColor, traced_colors
-from nerfloom.kernels.traced_error import PixelTargets, TracedError, traced_error
+from nerfloom.kernels.traced.colors import GridColor, traced_colors
+from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError, traced_error
+from nerfloom.kernels.traced.trace import GridDensity
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, mean_distance

@@ -14,10 +14,10 @@ from nerfloom.data.scene import Scene
 from nerfloom.fields.base import Field, HasAlpha
 from nerfloom.geometry.points import sample_points
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.alpha import composite_alpha
-from nerfloom.kernels.compositing import Composited, composite
+from nerfloom.kernels.compositing.alpha import composite_alpha
+from nerfloom.kernels.compositing.density import Composited, composite
+from nerfloom.kernels.compositing.thinning import thinned
 from nerfloom.kernels.math import scale_gradient
-from nerfloom.kernels.thinning import thinned
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.samplers.proposal import half_edge

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from nerfloom.fields.base import HasAlpha
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.alpha import alpha_depth
-from nerfloom.kernels.fixed_march import Placed, fill, longest_ray, reach
-from nerfloom.kernels.march import Occupancy, Wave
-from nerfloom.samplers.room import Room
+from nerfloom.kernels.compositing.alpha import alpha_depth
+from nerfloom.kernels.march.fixed_slots import Placed, fill, longest_ray, reach
+from nerfloom.kernels.march.waves import Occupancy, Wave
+from nerfloom.samplers.sample_capacity import Room
 
 SHORTEST = 1e-10
 """Length by which the optical depth of an empty slot is divided, scene units."""
 
 
 class Steps(NamedTuple):
-    """Steps of rays through a grid, as `nerfloom.kernels.fixed_march.fill` takes them."""
+    """Steps of rays through a grid, as `nerfloom.kernels.march.fixed_slots.fill` takes them."""
 
     occupancy: Occupancy
     """The grid, of one box."""

@@ -11,9 +11,9 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import sample_points
 from nerfloom.geometry.rays import CoarseLevel, Rays, Samples
-from nerfloom.kernels.intervals import interval_weights, resample
+from nerfloom.kernels.histograms.intervals import interval_weights, resample
+from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf, uniform_variates
 from nerfloom.samplers.base import Sampler
-from nerfloom.samplers.inverse_cdf import inverse_cdf, uniform_variates
 from nerfloom.samplers.uniform import samples_from_points, stratified_points
 
 LEAST_COARSE = 3

@@ -8,7 +8,7 @@ from torch import Tensor
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View, every
 from nerfloom.geometry.bounds import cell_corners
-from nerfloom.kernels.silhouettes import Photograph, pixels_under_balls
+from nerfloom.kernels.images.silhouettes import Photograph, pixels_under_balls
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 

@@ -23,18 +23,18 @@ from nerfloom.fields.base import DensityFunction, Field, HasAlpha, HasGridDensit
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.points import interval_points
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.alpha import alpha_depth
-from nerfloom.kernels.fixed_march import most_steps
-from nerfloom.kernels.given import is_followed
-from nerfloom.kernels.kept import Waves
-from nerfloom.kernels.march import RUN, March, Occupancy, Wave, march, refresh_occupancy
-from nerfloom.kernels.occupancy import own_cells
+from nerfloom.kernels.argument_checks import is_followed
+from nerfloom.kernels.compositing.alpha import alpha_depth
+from nerfloom.kernels.march.fixed_slots import most_steps
+from nerfloom.kernels.march.occupancy import own_cells
+from nerfloom.kernels.march.waves import RUN, March, Occupancy, Wave, march, refresh_occupancy
+from nerfloom.kernels.result_cache import Waves
 from nerfloom.kernels.rows import gather_rows
-from nerfloom.kernels.trace import trace
+from nerfloom.kernels.traced.trace import trace
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.cells import beside, densities_over_time, places
 from nerfloom.samplers.fixed import Steps, attached, sample_into_slots
-from nerfloom.samplers.room import Room
+from nerfloom.samplers.sample_capacity import Room
 
 MAX_CELLS = 512
 """Maximum number of cells along an axis; the state of 512^3 cells takes 0.8 GB."""
@@ -374,7 +374,7 @@ class OccupancySampler(Sampler):
         """Return random cells of all that are not carved, of the occupied ones, and of their neighbours.
 
         Matter that reaches only a little into a neighbour may be missed by one evaluation: for a thin shell the error
-        is 30 times smaller with the neighbours than without (`ns-bench quadrature`). A cell that is drawn twice is
+        is 30 times smaller with the neighbours than without (benchmarks/quadrature.py). A cell that is drawn twice is
         evaluated twice, which does no harm.
         """
         device, share = self.occupied.device, SHARE if self.slices == 1 else SHARE_OF_SLICES

@@ -27,11 +27,11 @@ from nerfloom.fields.encoded import DensityField
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.points import Footprint, Points, sample_points
 from nerfloom.geometry.rays import Histogram, Rays, Samples
-from nerfloom.kernels.intervals import interval_weights, proposal_excess, resample
-from nerfloom.kernels.proposals import proposal_weights
-from nerfloom.kernels.spacing import spacing
-from nerfloom.kernels.step_functions import blurred_excess
-from nerfloom.kernels.trace import GridDensity
+from nerfloom.kernels.histograms.intervals import interval_weights, proposal_excess, resample
+from nerfloom.kernels.histograms.proposals import proposal_weights
+from nerfloom.kernels.histograms.spacing import spacing
+from nerfloom.kernels.histograms.step_functions import blurred_excess
+from nerfloom.kernels.traced.trace import GridDensity
 from nerfloom.samplers.base import Sampler
 
 ANNEALING_SLOPE = 10.0

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.first_shared import CELLS, LEVELS, first_shared
+from nerfloom.kernels.march.first_shared import CELLS, LEVELS, first_shared
 from nerfloom.kernels.native import torch_on_one_thread
 
 BLOCK = 4

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.geometry.bounds import cell_corners
-from nerfloom.kernels.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
+from nerfloom.kernels.images.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
 
 COARSEST = 8
 """Maximum side of the first cubes tested, cells."""

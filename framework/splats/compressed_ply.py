@@ -25,7 +25,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import DataError
 from nerfloom.data.ply import PlyElement, PlyHeader, read_columns
-from nerfloom.kernels.splat_project import DC, DEGREES
+from nerfloom.kernels.splats.project import DC, DEGREES
 from nerfloom.splats.gaussians import Gaussians
 
 CHUNK = 256

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from nerfloom.base.processes import add_up
-from nerfloom.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
-from nerfloom.kernels.splat_project import OPACITY, rotation_matrices
+from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y
+from nerfloom.kernels.splats.project import OPACITY, rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
 
 GRADIENT = 8e-4

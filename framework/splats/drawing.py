@@ -11,14 +11,14 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import every
 from nerfloom.geometry.lenses import LENSES, Distortion
-from nerfloom.kernels.splat_blend import CHANNELS, Blended, blend
-from nerfloom.kernels.splat_project import SplatCamera, project_gaussians, sort_keys
-from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.kernels.splats.blend import CHANNELS, Blended, blend
+from nerfloom.kernels.splats.project import SplatCamera, project_gaussians, sort_keys
+from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.capacity import Room
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.look import OURS, Look
-from nerfloom.splats.room import Room
 
 DRAWN = ("pinhole", "opencv", "fisheye")
 """Camera models that Gaussians can be drawn for."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import ConfigError, DataError
-from nerfloom.splats.budget import fitted_ply, fitted_spz
+from nerfloom.splats.gaussian_limit import fitted_ply, fitted_spz
 from nerfloom.splats.gaussians import Gaussians, Splats
 from nerfloom.splats.look import ELSEWHERE, OURS, Look
 from nerfloom.splats.ply import read_ply, write_ply

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.cameras.view import View
-from nerfloom.kernels.splat_project import DEGREES
+from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.look import Look
 

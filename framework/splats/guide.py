@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nerfloom.data.pixels import ViewBatch
+from nerfloom.data.pixels.batch import ViewBatch
 
 GUIDED_UNTIL = 0.5
 """Share of the budget after which distances guide no longer; until then their weight falls evenly."""

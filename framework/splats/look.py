@@ -17,7 +17,7 @@ from typing import Literal
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError, printable
-from nerfloom.kernels.splat_project import BLUR
+from nerfloom.kernels.splats.project import BLUR
 
 Sort = Literal["distance", "depth"]
 """What Gaussians are sorted by: distance from the camera, or depth along its optical axis."""

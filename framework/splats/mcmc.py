@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base import device as devices
-from nerfloom.kernels.splat_project import rotation_matrices
+from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
 
 DEAD = 0.005

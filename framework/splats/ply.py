@@ -12,7 +12,7 @@ with the blur of that method, 0.1 pixels^2 (section 4.2, and kernel_size of its 
 
 How the Gaussians are drawn stands in comments (`nerfloom.splats.look`).
 
-Harmonics have the order and the signs of `nerfloom.kernels.spherical_harmonics`, and are evaluated at the direction
+Harmonics have the order and the signs of `kernels.encodings.spherical_harmonics`, and are evaluated at the direction
 from the camera to the Gaussian: in utils/sh_utils.py of https://github.com/graphdeco-inria/gaussian-splatting degree 1
 is -C1 y, C1 z, -C1 x with C1 = 0.4886025119029199, and degrees 2 and 3 are equal too for unit directions, constant by
 constant (Sloan 2008, with the Condon-Shortley phase). So coefficients are stored as they are.

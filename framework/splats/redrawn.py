@@ -7,8 +7,8 @@ from torch import Tensor
 
 from nerfloom.cameras.view import every
 from nerfloom.kernels import native
-from nerfloom.kernels.splat_packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
-from nerfloom.kernels.splat_project import MIN_ALPHA, SplatCamera
+from nerfloom.kernels.splats.packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
+from nerfloom.kernels.splats.project import MIN_ALPHA, SplatCamera
 from nerfloom.splats.drawing import draw, draw_colors
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.start import morton

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import DataError
-from nerfloom.kernels.splat_project import DC
+from nerfloom.kernels.splats.project import DC
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.ply import usable
 

@@ -14,7 +14,7 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.bounds import cell_corners
-from nerfloom.kernels.splat_project import DC
+from nerfloom.kernels.splats.project import DC
 from nerfloom.scene.silhouettes import Silhouettes, visual_hull
 from nerfloom.splats.gaussians import Gaussians
 

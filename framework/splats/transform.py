@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics_reference
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
 from nerfloom.splats.gaussians import Gaussians
 
 DIRECTIONS = 64

@@ -10,7 +10,7 @@ from typing import Any
 
 from nerfloom.base.console import say
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import evaluate, evaluation_background, timed_view
 from nerfloom.evaluation.panels import composed, view_panels
 from nerfloom.model import Model

@@ -12,7 +12,7 @@ import torch
 
 import nerfloom
 from nerfloom.base.device import machine_memory
-from nerfloom.kernels import native, triton_kernels
+from nerfloom.kernels import native, triton_backend
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def kernels(device: torch.device | None = None) -> str:
     """
     if device is None or device.type == "cpu":
         return native.variant()
-    return "triton" if device.type == "cuda" and triton_kernels.available() else "reference"
+    return "triton" if device.type == "cuda" and triton_backend.available() else "reference"
 
 
 def processor() -> str:

@@ -1,7 +1,7 @@
 """Gradients of several processes: each takes the mean of all before the optimiser's step.
 
 `torch.nn.parallel.DistributedDataParallel` does so in hooks of autograd, which never run for tables whose gradient is
-deferred (`nerfloom.kernels.deferred`). So the gradients are summed explicitly: large tables where they are, and all
+deferred (`kernels.adam.deferred`). So the gradients are summed explicitly: large tables where they are, and all
 other parameters in one tensor, as each exchange takes time of its own.
 """
 

@@ -11,17 +11,17 @@ from torch import Tensor
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import StepValue
 from nerfloom.base.optimised import DefersGradient, ParameterGroup, RowChange
-from nerfloom.kernels.adam import all_finite, dense_adam, sparse_adam
-from nerfloom.kernels.hash_grid_lookup import TableGradient
-from nerfloom.kernels.memory import require, table
-from nerfloom.kernels.planes import PlanesGradient
+from nerfloom.kernels.adam.adam import all_finite, dense_adam, sparse_adam
+from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
+from nerfloom.kernels.grids.planes import PlanesGradient
+from nerfloom.kernels.table_memory import require, table
 from nerfloom.model import Model, parts
 
 
 class Adam:
     """Adam (Kingma and Ba 2015), and a sparse one for groups with `sparse` set.
 
-    A sparse group holds tables (E, F) of which a step uses few entries (`nerfloom.kernels.adam`). The gradient of a
+    A sparse group holds tables (E, F) of which a step uses few entries (`kernels.adam.adam`). The gradient of a
     table is the one that the backward pass left in `deferred`, or else `grad`.
 
     Groups and states have the form of PyTorch's optimisers, but this is none of them: making one imports PyTorch's

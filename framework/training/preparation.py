@@ -14,19 +14,19 @@ from nerfloom.base.config import RayConfig, TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Decision
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import load_method
 from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.cameras.upright import sideways_up
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.folds import angle_between, folds, thumbnail
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixels import training_background
+from nerfloom.data.pixels.batch import training_background
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
 from nerfloom.ray_model import RayModel
+from nerfloom.registry import load_method
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.scene.folds import angle_between, folds, thumbnail
 from nerfloom.scene.motion import MotionConfig
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
 from nerfloom.scene.profile import SceneProfile

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from nerfloom.base.device import wait_for
-from nerfloom.data.pixels import draw_batch
+from nerfloom.data.pixels.batch import draw_batch
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.occupancy import own_cells
+from nerfloom.kernels.march.occupancy import own_cells
 from nerfloom.model import evaluating, parts
 from nerfloom.ray_model import RayModel
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.splats.capacity import Room as SplatRoom
 from nerfloom.splats.resolution import ImageSizes
-from nerfloom.splats.room import Room as SplatRoom
 
 if TYPE_CHECKING:
     from nerfloom.training.trainer import Trainer

@@ -13,16 +13,16 @@ from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
-from nerfloom.base.registry import load_dataparser, load_method
-from nerfloom.data.data_folder import find_data
 from nerfloom.data.dataset import DataParser, ParsedScene, load_dataset
 from nerfloom.data.offsets import offset_file, read_offset
-from nerfloom.data.pixel_cache import PixelMemory
+from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.local_origin import local_origin, rounding
+from nerfloom.registry import load_dataparser, load_method
 from nerfloom.splats.files import is_splat_file, read_gaussians
 from nerfloom.splats.gaussians import Gaussians, TakesGaussians
 from nerfloom.splats.transform import transformed
+from nerfloom.training.data_folder import find_data
 from nerfloom.training.run import Run
 from nerfloom.training.trained import Trained, build_model, load_trained
 

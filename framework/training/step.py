@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.device import AFTER_STEP, BEFORE_STEP, shared_stream
-from nerfloom.kernels.given import is_bad_here
+from nerfloom.kernels.argument_checks import is_bad_here
 from nerfloom.model import Loss, Model
 from nerfloom.training.mean_gradients import mean_gradients
 from nerfloom.training.optim import Adam, set_learning_rate

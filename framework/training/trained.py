@@ -13,12 +13,12 @@ from torch import Tensor
 from nerfloom.base.config import AppearanceConfig, RayConfig, RaysPerPixel, TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
-from nerfloom.base.registry import load_method
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.data_folder import find_data
 from nerfloom.data.scene import Scene
 from nerfloom.model import Model, RendersFromImages
+from nerfloom.registry import load_method
 from nerfloom.training.checkpoint import FOLDER, find_newest, load_checkpoint
+from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, read_run
 

@@ -28,7 +28,7 @@ from nerfloom.rendering.rendered import Picture
 from nerfloom.viewer.crop import picture_within
 from nerfloom.viewer.pace import Piece
 from nerfloom.viewer.request import Request
-from nerfloom.viewer.subject import Subject
+from nerfloom.viewer.viewed import Subject
 
 DEPTH, FLAWS = "depth", "error"
 """Outputs with a meaning of their own here: the median depth, and the difference from a photograph."""

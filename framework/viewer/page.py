@@ -13,15 +13,14 @@ from nerfloom.base.console import say
 from nerfloom.cameras.poses import looked_at
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.panel import Panel
 from nerfloom.viewer.path_panel import PathPanel
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.reports import curve, heading
-from nerfloom.viewer.studio import Studio
 
 if TYPE_CHECKING:
     import viser
-
 
 
 class Page:

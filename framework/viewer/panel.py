@@ -9,6 +9,7 @@ import numpy as np
 
 from nerfloom.evaluation.appearance import appearance_of
 from nerfloom.viewer.crop import meaning
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.request import (
     FARTHEST,
@@ -22,7 +23,6 @@ from nerfloom.viewer.request import (
     pose_of,
     size_of,
 )
-from nerfloom.viewer.studio import Studio
 
 if TYPE_CHECKING:
     import viser

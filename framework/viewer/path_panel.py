@@ -20,7 +20,7 @@ from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
 from nerfloom.viewer.camera_panel import move_camera
 from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
 from nerfloom.viewer.request import Request, number_in
-from nerfloom.viewer.subject import Subject
+from nerfloom.viewer.viewed import Subject
 
 if TYPE_CHECKING:
     import viser

@@ -20,7 +20,7 @@ from nerfloom.cameras.ndc import Ndc, NdcCameras
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import ParsedScene
 from nerfloom.data.image_files import Content, read_image
-from nerfloom.data.pixels import composite
+from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose

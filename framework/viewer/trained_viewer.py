@@ -9,11 +9,11 @@ from pathlib import Path
 from nerfloom.base.console import say
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.training.trained import Trained
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.server import close_server, open_server
-from nerfloom.viewer.studio import Studio
-from nerfloom.viewer.subject import newer_checkpoint, of_trained, reloaded
+from nerfloom.viewer.viewed import newer_checkpoint, of_trained, reloaded
 
 SECONDS_PER_LOOK = 2.0
 """Seconds between looks for a newer checkpoint."""

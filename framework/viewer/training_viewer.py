@@ -15,12 +15,12 @@ from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.training.curve import in_order
 from nerfloom.training.progress import StepReport
 from nerfloom.training.trainer import BetweenSteps, Trainer
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.pace import Share
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.server import close_server, open_server
-from nerfloom.viewer.studio import Studio
-from nerfloom.viewer.subject import of_trainer
+from nerfloom.viewer.viewed import of_trainer
 
 if TYPE_CHECKING:
     import viser

@@ -6,9 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.geometry.points import Points
-from nerfloom.geometry.rays import Rays
-from nerfloom.tools.benchmarks.closed_forms import (
+from benchmarks.closed_forms import (
     BOX,
     Ball,
     Blobs,
@@ -22,6 +20,8 @@ from nerfloom.tools.benchmarks.closed_forms import (
     mean_place,
     scenes,
 )
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([1.0, 0.3, 0.0], dtype=F64)

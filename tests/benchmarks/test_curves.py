@@ -7,13 +7,13 @@ from threading import Event
 
 import pytest
 
+from benchmarks import curves
+from benchmarks.__main__ import main
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import registered
-from nerfloom.cli.bench import main
-from nerfloom.tools.benchmarks import curves
-from nerfloom.tools.comparison import runner
-from nerfloom.tools.comparison.plan import Conditions, Contender, Job
-from nerfloom.tools.comparison.runner import Failure
+from nerfloom.comparison import runner
+from nerfloom.comparison.plan import Conditions, Contender, Job
+from nerfloom.comparison.runner import Failure
+from nerfloom.registry import registered
 from tests.comparison.runs import finish
 from tests.conftest import Refused
 

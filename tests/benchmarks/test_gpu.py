@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.cli.bench import main
-from nerfloom.tools.benchmarks.gpu import (
+from nerfloom.benchmarks.gpu import (
     METHODS,
     Part,
     along_rays,
@@ -19,7 +18,8 @@ from nerfloom.tools.benchmarks.gpu import (
     reached,
     timed_steps,
 )
-from nerfloom.tools.comparison.measures import Row
+from nerfloom.cli.bench import main
+from nerfloom.comparison.measures import Row
 from tests.conftest import Refused
 
 
@@ -44,7 +44,7 @@ def test_kernels_of_rays_are_right() -> None:
 
 def test_steps_are_timed_as_they_are_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU, which has no graphs, they are the same steps."""
-    monkeypatch.setattr("nerfloom.tools.benchmarks.gpu.SIZE", 16)
+    monkeypatch.setattr("nerfloom.benchmarks.gpu.SIZE", 16)
     small = {"num_rays_per_batch": 16, "log2_table_size": 8, "num_levels": 2}
     rows = timed_steps(torch.device("cpu"), 1, 2, **small)
     assert [row["method"] for row in rows] == ["nerfacto", "nerfacto", "instant-ngp", "instant-ngp"]
@@ -77,7 +77,7 @@ def test_parts_for_which_too_little_time_is_left_are_left_out_and_named(capsys: 
 
 
 def test_kernels_are_not_timed_after_their_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerfloom.tools.benchmarks.gpu.triton_kernels.available", lambda: False)
+    monkeypatch.setattr("nerfloom.benchmarks.gpu.triton_backend.available", lambda: False)
     found = measured_kernels(torch.device("cpu"), 64, 1, -1.0)
     assert found["kernels"] == []
     assert "contraction" in found["kernels not timed"]

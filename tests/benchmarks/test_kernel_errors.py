@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from nerfloom.benchmarks.kernel_cases import KINDS, cases
+from nerfloom.benchmarks.kernel_errors import largest_error
 from nerfloom.kernels.dispatch import TRITON, table
-from nerfloom.tools.benchmarks.kernel_cases import KINDS, cases
-from nerfloom.tools.benchmarks.kernel_errors import largest_error
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerfloom.benchmarks import bars
+from nerfloom.benchmarks.ceilings import Ceilings, Work
+from nerfloom.benchmarks.kernels import kernels, measured
+from nerfloom.benchmarks.timing import alternating
 from nerfloom.kernels import native
-from nerfloom.tools.benchmarks import bars
-from nerfloom.tools.benchmarks.ceilings import Ceilings, Work
-from nerfloom.tools.benchmarks.kernels import kernels, measured
-from nerfloom.tools.benchmarks.timing import alternating
 
 CEILINGS = Ceilings(copy=40e9, float32=200e9, bfloat16=800e9, gathers={1: 1e9, 8: 0.5e9, 64: 0.1e9})
 needs_kernels = pytest.mark.skipif(not native.available(), reason="no compiled kernels")

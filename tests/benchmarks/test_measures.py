@@ -10,12 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
+from benchmarks import ablation, cache, contention, pose_refinement, poses
+from benchmarks.children import output_of
 from nerfloom.base.errors import ConfigError, DataError, NerfloomError
-from nerfloom.base.registry import load_dataparser
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import load_dataset
-from nerfloom.tools.benchmarks import ablation, cache, contention, pose_refinement, poses
-from nerfloom.tools.benchmarks.children import output_of
+from nerfloom.registry import load_dataparser
 from tests.dataparsers.sparse_models import Capture, make_capture, write_colmap
 
 

@@ -1,11 +1,11 @@
-"""ns-bench processes: three kinds of runs, of which two are started by torchrun."""
+"""python -m benchmarks processes: three kinds of runs, of which two are started by torchrun."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from nerfloom.tools.benchmarks import processes
+from benchmarks import processes
 
 
 def test_each_kind_is_started_with_its_processes_and_its_share_of_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,16 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.fields.base import Field
-from nerfloom.geometry.points import Points
-from nerfloom.geometry.rays import Rays
-from nerfloom.samplers.proposal import ProposalSampler
-from nerfloom.samplers.uniform import UniformSampler
-from nerfloom.tools.benchmarks import error_curves, quadrature, sampling
-from nerfloom.tools.benchmarks.closed_forms import Block, ClosedForm, Medium, Solids, scenes
-from nerfloom.tools.benchmarks.error_curves import Curve, evaluations_needed
-from nerfloom.tools.benchmarks.quadrature import Row, Sizes, measured, skipping
-from nerfloom.tools.benchmarks.sampling import (
+from benchmarks import error_curves, quadrature, sampling
+from benchmarks.closed_forms import Block, ClosedForm, Medium, Solids, scenes
+from benchmarks.error_curves import Curve, evaluations_needed
+from benchmarks.quadrature import Row, Sizes, measured, skipping
+from benchmarks.sampling import (
     WHITE,
     filled_grid,
     fitted_proposals,
@@ -28,6 +23,11 @@ from nerfloom.tools.benchmarks.sampling import (
     renderers,
     sampled,
 )
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.samplers.proposal import ProposalSampler
+from nerfloom.samplers.uniform import UniformSampler
 
 TINY = Sizes(counts=(8, 16), rays=64, skipping_rays=100, fit_steps=4, grid_resolution=16)
 
@@ -172,7 +172,7 @@ def test_all_of_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pyte
     some = {name: scene for name, scene in scenes().items() if name in ("blobs", "sparse")}
     monkeypatch.setattr(quadrature, "scenes", lambda: some)
     monkeypatch.setattr(quadrature, "QUICK", TINY)
-    monkeypatch.setattr("nerfloom.tools.comparison.plots.available", lambda: False)
+    monkeypatch.setattr("nerfloom.comparison.plots.available", lambda: False)
     content = quadrature.main(tmp_path / "out" / "quadrature.json", tmp_path / "plots", quick=True)
     assert json.loads((tmp_path / "out" / "quadrature.json").read_text()) == json.loads(json.dumps(content))
     assert len(content["rows"]) == 2 * 2 * 7

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import starts
 from nerfloom.base.errors import NerfloomError
-from nerfloom.tools.benchmarks import starts
 
 
 def test_a_refused_start_is_a_row_and_its_message(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
+from benchmarks.__main__ import main
+from benchmarks.table_text import LOADING, estimate
+from benchmarks.tables import Row, read_table
 from nerfloom.base.errors import ConfigError
-from nerfloom.cli.bench import main
 from nerfloom.cli.train import run_of
-from nerfloom.tools.benchmarks.table_text import LOADING, estimate
-from nerfloom.tools.benchmarks.tables import Row, read_table
-from nerfloom.tools.comparison import runner
-from nerfloom.tools.comparison.plan import Conditions, Job
-from nerfloom.tools.comparison.runner import Failure
+from nerfloom.comparison import runner
+from nerfloom.comparison.plan import Conditions, Job
+from nerfloom.comparison.runner import Failure
 from tests.comparison.runs import finish
 from tests.conftest import Refused
 from tests.site.commands import found
@@ -64,9 +64,9 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
 
 
 def bench(monkeypatch: pytest.MonkeyPatch, folder: Path, *flags: object) -> None:
-    """Run ns-bench tables with all of its folders in `folder`."""
+    """Run python -m benchmarks tables with all of its folders in `folder`."""
     folders = ("--data-root", folder / "data", "--run-dir", folder / "runs", "--output-dir", folder / "results")
-    words = ("ns-bench", "tables", "--tables", folder / "table.yml", *folders, *flags)
+    words = ("benchmarks", "tables", "--tables", folder / "table.yml", *folders, *flags)
     monkeypatch.setattr(sys, "argv", list(map(str, words)))
     main()
 
@@ -119,7 +119,7 @@ def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.M
     def here(data: Path | None, named: str | None = None) -> tuple[Path | None, str]:
         return (data, named or formats[data.name]) if data and data.name in formats else found(data, named)
 
-    monkeypatch.setattr("nerfloom.data.data_folder.find_data", here)
+    monkeypatch.setattr("nerfloom.training.data_folder.find_data", here)
     rows = read_table(path, Path("data"), Path("runs")).rows
     understood: dict[str, Row] = {row.job.contender.label: row for row in rows}
     for row in understood.values():
@@ -235,7 +235,7 @@ def test_a_table_that_is_stopped_goes_on(tmp_path: Path) -> None:
     words = [
         sys.executable,
         "-m",
-        "nerfloom.cli.bench",
+        "benchmarks",
         "tables",
         "--tables",
         str(write(tmp_path, f"rows: [{block}]")),

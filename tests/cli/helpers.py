@@ -4,6 +4,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -27,12 +28,23 @@ def run(name: str, *arguments: object, folder: Path | None = None) -> subprocess
 def called(name: str, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
     """The same within this process, which saves the second that a new one takes to begin; for what ends soon."""
     (entry,) = entry_points(group="console_scripts", name=name)
-    words, here = [name, *map(str, arguments)], Path.cwd()
+    return _called(entry.load(), [name, *map(str, arguments)], folder)
+
+
+def benchmarked(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The same of `python -m benchmarks`."""
+    from benchmarks.__main__ import main
+
+    return _called(main, ["benchmarks", *map(str, arguments)], None)
+
+
+def _called(main: Callable[[], None], words: list[str], folder: Path | None) -> subprocess.CompletedProcess[str]:
+    here = Path.cwd()
     code, out, err = 0, io.StringIO(), io.StringIO()
     os.chdir(folder or here)
     try:
         with patch.object(sys, "argv", words), redirect_stdout(out), redirect_stderr(err):
-            entry.load()()
+            main()
     except SystemExit as end:
         code = int(end.code or 0)
     finally:

@@ -10,9 +10,9 @@ import torch
 
 import nerfloom
 from nerfloom.base import device
+from nerfloom.cli import environment as described
 from nerfloom.cli import train
 from nerfloom.kernels import native
-from nerfloom.tools import environment as described
 
 
 def table(text: str) -> dict[str, str]:

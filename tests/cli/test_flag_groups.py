@@ -9,12 +9,12 @@ from typing import Any, get_type_hints
 import pytest
 import tyro
 
-from nerfloom.base import registry
+from nerfloom import registry
 from nerfloom.base.config import AUTO, LEFT_TO_DATA, Auto, RayConfig, TrainConfig
-from nerfloom.base.registry import load_dataparser, load_method
 from nerfloom.cli.flag_groups import DECIDED, GROUPS, grouped_flags
 from nerfloom.cli.flag_text import plain_flags
 from nerfloom.cli.train import run_of
+from nerfloom.registry import load_dataparser, load_method
 from nerfloom.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 

@@ -9,7 +9,7 @@ import pytest
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.new_method import TEMPLATES, check_name, main, package_of
-from nerfloom.tools.testing import assert_method
+from nerfloom.testing import assert_method
 from tests.conftest import Refused
 
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,7 @@ import torch
 
 from nerfloom.cli.next_steps import after_training
 from nerfloom.data.scene import Scene
-from nerfloom.tools.processing.output import ready
+from nerfloom.processing.output import ready
 
 OBJECT = Scene(
     torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 6.0, num_cameras=10, has_alpha=True, moving=False, image_size=200

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from nerfloom.base.registry import load_method
 from nerfloom.cli.train import _default_run, _parse_flags, main
+from nerfloom.registry import load_method
 from nerfloom.training.run import Run, create_folder
 from tests.cli.helpers import TINY_NGP, called, run
 from tests.conftest import Refused

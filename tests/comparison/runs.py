@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from nerfloom.comparison.plan import Conditions, Contender, Job, Plan
 from nerfloom.evaluation.images import write_image
-from nerfloom.tools.comparison.plan import Conditions, Contender, Job, Plan
 
 CONDITIONS = Conditions(None, (), 60.0, None, None, None, "cpu", 4, None)
 MACHINE = {"processor": "abacus", "threads": 2, "kernels": "avx2", "commit": None}

@@ -7,9 +7,9 @@ from statistics import stdev
 
 import pytest
 
-from nerfloom.tools.comparison.measures import measure, pareto, rows_of, whole_levels
-from nerfloom.tools.comparison.report import level_table
-from nerfloom.tools.comparison.runner import is_done
+from nerfloom.comparison.measures import measure, pareto, rows_of, whole_levels
+from nerfloom.comparison.report import level_table
+from nerfloom.comparison.runner import is_done
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.compare import CompareFlags, plan_of
-from nerfloom.tools.comparison.crops import VIEWS
-from nerfloom.tools.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
+from nerfloom.comparison.crops import VIEWS
+from nerfloom.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
 

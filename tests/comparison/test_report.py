@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from nerfloom.tools.comparison import plots
-from nerfloom.tools.comparison.crops import data_uri, views, worst_square
-from nerfloom.tools.comparison.measures import measure, rows_of
-from nerfloom.tools.comparison.plan import Plan
-from nerfloom.tools.comparison.report import COLUMNS, console_table, write_report
+from nerfloom.comparison import plots
+from nerfloom.comparison.crops import data_uri, views, worst_square
+from nerfloom.comparison.measures import measure, rows_of
+from nerfloom.comparison.plan import Plan
+from nerfloom.comparison.report import COLUMNS, console_table, write_report
 from tests.comparison.runs import CONDITIONS, draw, finish, plan
 
 LABELS = ("instant-ngp", "kplanes --num-scales 2", "tensorf")

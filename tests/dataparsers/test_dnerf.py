@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.data_folder import find_data
 from nerfloom.data.dataset import Split, load_dataset
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.dnerf import DNeRF
+from nerfloom.training.data_folder import find_data
 from tests.conftest import EditJson
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nerfloom.tools.downloads import fetch
+from nerfloom.downloads import fetch
 
 
 @pytest.fixture(autouse=True)

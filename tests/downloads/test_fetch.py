@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.downloads import fetch as fetching
-from nerfloom.tools.downloads.catalogue import Source
-from nerfloom.tools.downloads.fetch import SourceError, fetch
+from nerfloom.downloads import fetch as fetching
+from nerfloom.downloads.catalogue import Source
+from nerfloom.downloads.fetch import SourceError, fetch
 from tests.downloads.server import Served, serving
 
 CONTENT = random.Random(0).randbytes(3_000_000)

@@ -9,10 +9,10 @@ import pytest
 
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.cli import download_data
-from nerfloom.data.data_folder import find_data
-from nerfloom.tools.downloads import install as installing
-from nerfloom.tools.downloads.catalogue import DATASETS, Archive, Dataset, Source, sources_table
-from nerfloom.tools.downloads.install import announce, install
+from nerfloom.downloads import install as installing
+from nerfloom.downloads.catalogue import DATASETS, Archive, Dataset, Source, sources_table
+from nerfloom.downloads.install import announce, install
+from nerfloom.training.data_folder import find_data
 from tests.conftest import Refused
 from tests.downloads.server import Served, serving
 

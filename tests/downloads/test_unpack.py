@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.downloads import unpack as unpacking
-from nerfloom.tools.downloads.unpack import names_of, unpack
+from nerfloom.downloads import unpack as unpacking
+from nerfloom.downloads.unpack import names_of, unpack
 
 
 def write_zip(path: Path, files: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> Path:

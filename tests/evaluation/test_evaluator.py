@@ -12,7 +12,7 @@ from torch import Tensor
 from nerfloom.base.config import RayConfig
 from nerfloom.cameras.cameras import Cameras, subpixels
 from nerfloom.cameras.view import View
-from nerfloom.data.pixels import PixelBatch
+from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.data.sources import PixelSource, Request
 from nerfloom.evaluation import evaluator

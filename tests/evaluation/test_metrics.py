@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 from torch.nn import functional
 
 from nerfloom.evaluation.metrics import ms_ssim, psnr, quick_ssim, ssim
-from nerfloom.kernels.ssim import PHOTOMETRIC
+from nerfloom.kernels.images.ssim import PHOTOMETRIC
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.3])

@@ -7,9 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.dataparsers.procedural.scene import inside, signed_distance, trace
-from nerfloom.export.mesh import Mesh
-from nerfloom.tools.benchmarks.chamfer import (
+from benchmarks.chamfer import (
     distance_to_triangles,
     distances_to_mesh,
     mesh_sample,
@@ -17,6 +15,8 @@ from nerfloom.tools.benchmarks.chamfer import (
     surface_sample,
     visible_from,
 )
+from nerfloom.dataparsers.procedural.scene import inside, signed_distance, trace
+from nerfloom.export.mesh import Mesh
 
 trimesh = pytest.importorskip("trimesh")
 CUBE = torch.tensor([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]])

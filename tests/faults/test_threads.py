@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from nerfloom.data.dataset import load_dataset
-from nerfloom.data.mapped_pixels import MappedPixels
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_stream import FIRST_STEPS, PixelStream
-from nerfloom.data.pixels import draw_pixels
+from nerfloom.data.pixels.batch import draw_pixels
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.stream import FIRST_STEPS, PixelStream
 from nerfloom.training.checkpoint import load_checkpoint
 from tests.images import write_noise
 from tests.training.helpers import tiny_trainer

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.processing.worker import Report, run_in_child
+from nerfloom.processing.worker import Report, run_in_child
 
 ROOT = Path(__file__).parents[2]
 """Not from tests.faults.runs: children import this file, and torch takes them seconds."""
@@ -47,7 +47,7 @@ PARENT = """
 import sys
 from pathlib import Path
 from nerfloom.cli.common import run_command
-from nerfloom.tools.processing.worker import run_in_child
+from nerfloom.processing.worker import run_in_child
 from tests.faults.test_worker import endless
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import chisquare
 
 from nerfloom.encodings.planes import FeaturePlanes
-from nerfloom.kernels.adam import sparse_adam_reference
+from nerfloom.kernels.adam.adam import sparse_adam_reference
 from nerfloom.training.checkpoint import load_checkpoint
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 

@@ -14,7 +14,7 @@ from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField, opened_frequencies
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.frequency import frequency_encoding_reference
+from nerfloom.kernels.encodings.frequency import frequency_encoding_reference
 from nerfloom.training.optim import Adam
 from tests.kernels.compiled import needs_kernels
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer

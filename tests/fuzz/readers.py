@@ -22,8 +22,8 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
-from nerfloom.data.mapped_pixels import MappedPixels
-from nerfloom.data.pixel_cache import PixelMemory, pack, unpack
+from nerfloom.data.pixels.cache import PixelMemory, pack, unpack
+from nerfloom.data.pixels.mapped import MappedPixels
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap
@@ -33,14 +33,14 @@ from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.dataparsers.phototourism import Phototourism
 from nerfloom.dataparsers.polycam import Polycam
 from nerfloom.dataparsers.record3d import Record3D
+from nerfloom.downloads import unpack as downloads
 from nerfloom.evaluation.lpips import SHAPES, read_weights
+from nerfloom.processing import polycam, record3d
+from nerfloom.processing.images import prepare_all
+from nerfloom.processing.listing import find_images
 from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, Look
-from nerfloom.tools.downloads import unpack as downloads
-from nerfloom.tools.processing import polycam, record3d
-from nerfloom.tools.processing.images import prepare_all
-from nerfloom.tools.processing.listing import find_images
 from nerfloom.training.checkpoint import FOLDER, load_newest
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder, read_run

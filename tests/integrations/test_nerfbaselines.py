@@ -19,10 +19,9 @@ import torch
 
 from nerfloom.base.config import from_plain
 from nerfloom.base.errors import CheckpointError, ConfigError, DataError
-from nerfloom.base.registry import load_method, registered
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.blender import Blender
-from nerfloom.tools.integrations.nerfbaselines import (
+from nerfloom.integrations.nerfbaselines import (
     InstantNGP,
     KPlanes,
     Nerfacto,
@@ -30,9 +29,10 @@ from nerfloom.tools.integrations.nerfbaselines import (
     TensoRF,
     VanillaNeRF,
 )
-from nerfloom.tools.integrations.nerfbaselines_data import ArrayImages, Frame, FrameFlags, cameras_of, dataset_of
-from nerfloom.tools.integrations.nerfbaselines_settings import flattened, parse_overrides
-from nerfloom.tools.integrations.nerfbaselines_spec import SPECS
+from nerfloom.integrations.nerfbaselines_data import ArrayImages, Frame, FrameFlags, cameras_of, dataset_of
+from nerfloom.integrations.nerfbaselines_settings import flattened, parse_overrides
+from nerfloom.integrations.nerfbaselines_spec import SPECS
+from nerfloom.registry import load_method, registered
 from tests.conftest import ball_view
 from tests.training.helpers import TINY
 
@@ -189,8 +189,8 @@ def test_presets_are_settings_that_the_method_has(spec: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("module", "forbidden"),
     [
-        ("nerfloom.tools.integrations.nerfbaselines_spec", "torch"),
-        ("nerfloom.tools.integrations.nerfbaselines", "methods"),
+        ("nerfloom.integrations.nerfbaselines_spec", "torch"),
+        ("nerfloom.integrations.nerfbaselines", "methods"),
     ],
 )
 def test_without_nerfbaselines_both_are_imported_and_the_spec_without_torch(module: str, forbidden: str) -> None:
@@ -202,7 +202,7 @@ def test_the_spec_is_an_entry_point() -> None:
     tomllib = pytest.importorskip("tomllib", reason="Python 3.10 has no tomllib")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     specs = project["entry-points"]["nerfbaselines.specs"]
-    assert specs == {"nerfloom": "nerfloom.tools.integrations.nerfbaselines_spec"}
+    assert specs == {"nerfloom": "nerfloom.integrations.nerfbaselines_spec"}
 
 
 @pytest.mark.parametrize("document", ["docs/guides/comparing.md", "docs/plugins.md"])

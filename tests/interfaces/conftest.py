@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.base import registry
+from nerfloom import registry
 
 METHODS = {
     "fog": "plugins.fog",

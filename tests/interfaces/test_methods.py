@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import nerfloom
-from nerfloom.base.registry import load_method
-from nerfloom.tools.testing import check_method
+from nerfloom.registry import load_method
+from nerfloom.testing import check_method
 from tests.cli.helpers import called
 from tests.interfaces.conftest import HERE
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.base import registry
+from nerfloom import registry
 from tests.cli.helpers import called
 
 WHERE = "docs/plugins.md, 'Plugins for an older interface', says what to change"

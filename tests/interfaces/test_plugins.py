@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from nerfloom import Rays
-from nerfloom.base.registry import load_method
 from nerfloom.methods import instant_ngp
-from nerfloom.tools.stress.scenes import ball_dataset
+from nerfloom.registry import load_method
+from nerfloom.stress.scenes import ball_dataset
 from tests.cli.helpers import TINY_NGP, called
 from tests.interfaces.conftest import HERE
 
@@ -52,8 +52,8 @@ def test_each_is_trained_and_evaluated_by_the_commands(name: str, tmp_path: Path
 
 def test_fog_hides_by_distance() -> None:
     """Grey where a ray goes far, and the colour itself where it ends at once: by hand."""
+    from benchmarks.closed_forms import scenes
     from nerfloom.samplers.uniform import UniformSampler
-    from nerfloom.tools.benchmarks.closed_forms import scenes
     from tests.interfaces.plugins.fog import DENSITY, GREY, FogRenderer
 
     field = scenes()["nested"]

@@ -16,25 +16,25 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.adam import dense_adam, dense_adam_reference, sparse_adam, sparse_adam_reference
-from nerfloom.kernels.compositing import composite, composite_reference, distortion
-from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from nerfloom.kernels.intervals import (
+from nerfloom.kernels.adam.adam import dense_adam, dense_adam_reference, sparse_adam, sparse_adam_reference
+from nerfloom.kernels.compositing.density import composite, composite_reference, distortion
+from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.histograms.intervals import (
     interval_weights,
     interval_weights_reference,
     resample,
     resample_reference,
 )
-from nerfloom.kernels.march import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
-from nerfloom.kernels.mlp import mlp, mlp_reference
+from nerfloom.kernels.images.ssim import ssim, ssim_reference
+from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
 from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.kernels.planes import PlanesLayout, planes, planes_reference
-from nerfloom.kernels.splat_blend import blend, blend_reference
-from nerfloom.kernels.splat_project import RECORD, SplatCamera, project_gaussians, project_reference
-from nerfloom.kernels.splat_tiles import tile_lists, tile_lists_reference
-from nerfloom.kernels.ssim import ssim, ssim_reference
+from nerfloom.kernels.networks.mlp import mlp, mlp_reference
+from nerfloom.kernels.splats.blend import blend, blend_reference
+from nerfloom.kernels.splats.project import RECORD, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.tiles import tile_lists, tile_lists_reference
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels import test_trace
 from tests.kernels.compiled import relative_error

@@ -18,9 +18,9 @@ from torch.func import jacrev, vmap
 
 from nerfloom.geometry.lenses import Distortion
 from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.kernels.splat_blend import Blended, blend
-from nerfloom.kernels.splat_project import SplatCamera, project_gaussians
-from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.kernels.splats.blend import Blended, blend
+from nerfloom.kernels.splats.project import SplatCamera, project_gaussians
+from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.splats.density_control import image_gradients
 from tests.kernels.compiled import relative_error
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfloom.kernels import native
-from nerfloom.kernels.adam import (
+from nerfloom.kernels.adam.adam import (
     ALL_FINITE,
     DENSE_ADAM,
     SPARSE_ADAM,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.alpha import alpha_depth, composite_alpha
+from nerfloom.kernels.compositing.alpha import alpha_depth, composite_alpha
 from tests.kernels.test_compositing import ragged
 
 F64 = torch.float64

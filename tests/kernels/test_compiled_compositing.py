@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing import (
+from nerfloom.kernels.compositing.density import (
     MAX_OPTICAL_DEPTH,
     Composited,
     composite,

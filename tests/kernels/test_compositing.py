@@ -7,7 +7,7 @@ import torch
 from scipy.special import erf
 
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.compositing import exclusive_sum, optical_depth, ray_sum, weights_and_transmittance
+from nerfloom.kernels.compositing.density import exclusive_sum, optical_depth, ray_sum, weights_and_transmittance
 from nerfloom.rendering.volume import volume_render
 
 F64 = torch.float64

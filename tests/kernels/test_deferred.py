@@ -8,8 +8,8 @@ from torch import Tensor
 
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes
-from nerfloom.kernels.hash_grid_lookup import TableGradient
-from nerfloom.kernels.planes import PlanesGradient
+from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
+from nerfloom.kernels.grids.planes import PlanesGradient
 from nerfloom.training.optim import Adam
 from tests.kernels.compiled import needs_kernels, relative_error
 

@@ -10,36 +10,38 @@ import torch
 from torch import Tensor
 
 from nerfloom.cameras.cameras import CAMERA_RAYS, Cameras, subpixels
-from nerfloom.data.pixels import GATHER_COLORS
+from nerfloom.cameras.rigid_motion import RIGID_MOTIONS
+from nerfloom.data.pixels.batch import GATHER_COLORS
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels import dispatch, native
-from nerfloom.kernels.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
-from nerfloom.kernels.compositing import COMPOSITE, DISTORTION
-from nerfloom.kernels.contraction import CONTRACT
+from nerfloom.kernels.adam.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
+from nerfloom.kernels.compositing.density import COMPOSITE, DISTORTION
 from nerfloom.kernels.dispatch import TRITON, Backend, Operation, derivatives
-from nerfloom.kernels.first_shared import CELLS, FIRST_SHARED, LEVELS
-from nerfloom.kernels.fixed_march import FILL, REACH, fill
-from nerfloom.kernels.frequency import FREQUENCY_ENCODING
-from nerfloom.kernels.hash_grid import HASH_GRID, HashGridLayout, hash_grid
-from nerfloom.kernels.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
-from nerfloom.kernels.march import MARCH, SORT_BY_RAY, March, march
-from nerfloom.kernels.mlp import DENSITY_NETWORK, NETWORK
-from nerfloom.kernels.multisampled_grid import MULTISAMPLED_GRID
-from nerfloom.kernels.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
-from nerfloom.kernels.occupancy import REFRESH_OCCUPANCY, Occupancy
-from nerfloom.kernels.plane_bands import BAND_VARIATION, PLANE_BANDS
-from nerfloom.kernels.planes import PLANES, PlanesGradient, PlanesLayout
-from nerfloom.kernels.proposals import PROPOSAL_WEIGHTS
-from nerfloom.kernels.rigid_motion import RIGID_MOTIONS
+from nerfloom.kernels.encodings.contraction import CONTRACT
+from nerfloom.kernels.encodings.frequency import FREQUENCY_ENCODING
+from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
+from nerfloom.kernels.grids.hash_grid import HASH_GRID, HashGridLayout, hash_grid
+from nerfloom.kernels.grids.multisampled_grid import MULTISAMPLED_GRID
+from nerfloom.kernels.grids.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
+from nerfloom.kernels.grids.plane_bands import BAND_VARIATION, PLANE_BANDS
+from nerfloom.kernels.grids.planes import PLANES, PlanesGradient, PlanesLayout
+from nerfloom.kernels.histograms.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
+from nerfloom.kernels.histograms.proposals import PROPOSAL_WEIGHTS
+from nerfloom.kernels.histograms.spacing import SPACED
+from nerfloom.kernels.histograms.step_functions import BLURRED_EXCESS
+from nerfloom.kernels.images.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
+from nerfloom.kernels.images.ssim import PHOTOMETRIC, SIMILARITY
+from nerfloom.kernels.march.first_shared import CELLS, FIRST_SHARED, LEVELS
+from nerfloom.kernels.march.fixed_slots import FILL, REACH, fill
+from nerfloom.kernels.march.occupancy import REFRESH_OCCUPANCY, Occupancy
+from nerfloom.kernels.march.waves import MARCH, SORT_BY_RAY, March, march
+from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, NETWORK
 from nerfloom.kernels.rows import GATHER_ROWS
-from nerfloom.kernels.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
-from nerfloom.kernels.spacing import SPACED
-from nerfloom.kernels.spherical_harmonics import SPHERICAL_HARMONICS
-from nerfloom.kernels.splat_blend import BLEND
-from nerfloom.kernels.splat_packed import PROJECT_PACKED, pack_gaussians
-from nerfloom.kernels.splat_project import (
+from nerfloom.kernels.splats.blend import BLEND
+from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
+from nerfloom.kernels.splats.project import (
     CUT,
     DISTANCE,
     PROJECT,
@@ -49,12 +51,10 @@ from nerfloom.kernels.splat_project import (
     SplatCamera,
     project_gaussians,
 )
-from nerfloom.kernels.splat_tiles import TILES, tile_lists
-from nerfloom.kernels.ssim import PHOTOMETRIC, SIMILARITY
-from nerfloom.kernels.step_functions import BLURRED_EXCESS
-from nerfloom.kernels.trace import TRACE, GridDensity
-from nerfloom.kernels.traced_colors import TRACED_COLORS, GridColor
-from nerfloom.kernels.traced_error import TRACED_ERROR, PixelTargets
+from nerfloom.kernels.splats.tiles import TILES, tile_lists
+from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
+from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
+from nerfloom.kernels.traced.trace import TRACE, GridDensity
 from tests.kernels.compiled import needs_kernels
 
 GRID = HashGridLayout.build(3, 4, 20, 8)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from nerfloom.kernels.downweighting import level_weights
+from nerfloom.kernels.grids.downweighting import level_weights
 
 RESOLUTIONS = torch.tensor([1, 16, 100, 8192])
 DEVIATIONS = torch.logspace(-7, 3, 41, dtype=torch.float64)

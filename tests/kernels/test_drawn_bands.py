@@ -3,8 +3,8 @@
 import torch
 
 from nerfloom.encodings.planes import FeaturePlanes
-from nerfloom.kernels.drawn_bands import drawn_bands
-from nerfloom.kernels.planes_layout import PlanesLayout
+from nerfloom.kernels.grids.drawn_bands import drawn_bands
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 
 LAYOUT = PlanesLayout.build(((5, 7, 9), (4, 3, 2)))
 NUMBERED = torch.arange(LAYOUT.num_entries * 2.0).view(-1, 2)

@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy import special
 
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 
 
 def unit_vectors(count: int) -> torch.Tensor:

@@ -7,19 +7,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels import hash_grid, planes, splat_blend
-from nerfloom.kernels.compositing import bounded_sum, segmented_sum
+from nerfloom.cameras.rigid_motion import RIGID_MOTIONS
+from nerfloom.kernels.compositing.density import bounded_sum, segmented_sum
 from nerfloom.kernels.dispatch import FEW_OPERATIONS, Operation
-from nerfloom.kernels.hash_grid import HASH_GRID, HashGridLayout
-from nerfloom.kernels.march import ReferenceMarch
-from nerfloom.kernels.multisampled_grid import MULTISAMPLED_GRID
-from nerfloom.kernels.plane_bands import PLANE_BANDS
-from nerfloom.kernels.planes import PLANES, PlanesLayout
-from nerfloom.kernels.rigid_motion import RIGID_MOTIONS
+from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
+from nerfloom.kernels.grids import hash_grid, planes
+from nerfloom.kernels.grids.hash_grid import HASH_GRID, HashGridLayout
+from nerfloom.kernels.grids.multisampled_grid import MULTISAMPLED_GRID
+from nerfloom.kernels.grids.plane_bands import PLANE_BANDS
+from nerfloom.kernels.grids.planes import PLANES, PlanesLayout
+from nerfloom.kernels.march.waves import ReferenceMarch
 from nerfloom.kernels.rows import gather_rows
-from nerfloom.kernels.spherical_harmonics import SPHERICAL_HARMONICS
-from nerfloom.kernels.splat_blend import BLEND, CHANNELS, blend_reference
-from nerfloom.kernels.splat_project import (
+from nerfloom.kernels.splats import blend
+from nerfloom.kernels.splats.blend import BLEND, CHANNELS, blend_reference
+from nerfloom.kernels.splats.project import (
     CUT,
     DISTANCE,
     NORMAL,
@@ -29,7 +30,7 @@ from nerfloom.kernels.splat_project import (
     SplatCamera,
     project_reference,
 )
-from nerfloom.kernels.splat_tiles import TILES, TileLists, tile_lists_reference
+from nerfloom.kernels.splats.tiles import TILES, TileLists, tile_lists_reference
 from tests.kernels.test_march import occupancy, random_rays
 
 GRID = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=40, log2_table_size=9)
@@ -126,7 +127,7 @@ def test_harmonics(levels: int) -> None:
 
 @pytest.mark.parametrize("memory", [2**26, 1])
 def test_sums_on_rays_of_bounded_length(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerfloom.kernels.compositing.MAX_PADDED", memory)
+    monkeypatch.setattr("nerfloom.kernels.compositing.density.MAX_PADDED", memory)
     counts = torch.tensor([3, 0, 1, 7, 0, 5])
     owners = torch.arange(6).repeat_interleave(counts)
     places = torch.cat([torch.arange(count) for count in counts.tolist()])
@@ -225,7 +226,7 @@ def test_projection(basis: int) -> None:
 @pytest.mark.parametrize("content", CHANNELS)
 def test_blending(content: str, pairs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """All tiles at once, and a few at a time, which are computed again for the gradient."""
-    monkeypatch.setattr(splat_blend, "MAX_PAIRS", pairs)
+    monkeypatch.setattr(blend, "MAX_PAIRS", pairs)
     records, camera = splats()
     lists = tile_lists_reference(records, camera.width, camera.height)
     found = []

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.compositing import composite
-from nerfloom.kernels.fixed_march import Placed, fill, fill_reference, longest_ray, most_steps, reach, share_out
-from nerfloom.kernels.march import candidates
-from nerfloom.kernels.occupancy import Occupancy
+from nerfloom.kernels.compositing.density import composite
+from nerfloom.kernels.march.fixed_slots import Placed, fill, fill_reference, longest_ray, most_steps, reach, share_out
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import candidates
 from tests.kernels.test_march import BOX, occupancy, random_rays
 
 STEPS = 40

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
 pytestmark = needs_kernels

@@ -13,37 +13,37 @@ from torch import Tensor
 
 import nerfloom
 from nerfloom.cameras.cameras import Cameras, subpixels
-from nerfloom.data.pixels import gather_colors, gather_colors_reference
+from nerfloom.data.pixels.batch import gather_colors, gather_colors_reference
 from nerfloom.fields.base import Field
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.compositing import composite, composite_reference, distortion, distortion_by_pairs
-from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from nerfloom.kernels.intervals import (
-    interval_weights,
-    interval_weights_reference,
-    proposal_excess,
-    proposal_excess_reference,
-)
-from nerfloom.kernels.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
-from nerfloom.kernels.multisampled_grid import multisampled_grid, multisampled_grid_reference
-from nerfloom.kernels.multisamples import (
+from nerfloom.kernels.compositing.density import composite, composite_reference, distortion, distortion_by_pairs
+from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
+from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.multisampled_grid import multisampled_grid, multisampled_grid_reference
+from nerfloom.kernels.grids.multisamples import (
     frustum_balls,
     frustum_balls_reference,
     unit_multisamples,
     unit_multisamples_reference,
 )
-from nerfloom.kernels.plane_bands import Band, band_variation
-from nerfloom.kernels.planes import PlanesGradient, PlanesLayout, planes, planes_reference
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from nerfloom.kernels.splat_blend import blend, blend_reference
-from nerfloom.kernels.splat_project import SplatCamera, project_gaussians, project_reference
-from nerfloom.kernels.splat_tiles import tile_lists
-from nerfloom.kernels.ssim import photometric_loss, photometric_reference
-from nerfloom.kernels.step_functions import blurred_excess, blurred_excess_reference
+from nerfloom.kernels.grids.plane_bands import Band, band_variation
+from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout, planes, planes_reference
+from nerfloom.kernels.histograms.intervals import (
+    interval_weights,
+    interval_weights_reference,
+    proposal_excess,
+    proposal_excess_reference,
+)
+from nerfloom.kernels.histograms.step_functions import blurred_excess, blurred_excess_reference
+from nerfloom.kernels.images.ssim import photometric_loss, photometric_reference
+from nerfloom.kernels.networks.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
+from nerfloom.kernels.splats.blend import blend, blend_reference
+from nerfloom.kernels.splats.project import SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 

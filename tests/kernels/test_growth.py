@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerfloom.kernels.dispatch import CPP
-from nerfloom.kernels.splat_blend import BLEND, CHANNELS, Blended, blend_reference
+from nerfloom.kernels.splats.blend import BLEND, CHANNELS, Blended, blend_reference
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, growth_error, scene
 from tests.kernels.test_few_operations import few

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from nerfloom.kernels.contraction import contract_to_unit, contract_to_unit_reference
-from nerfloom.kernels.intervals import (
+from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
+from nerfloom.kernels.histograms.intervals import (
     interval_weights,
     interval_weights_reference,
     proposal_excess,

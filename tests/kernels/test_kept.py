@@ -17,11 +17,11 @@ from nerfloom.fields.encoded import DensityField, EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.tensor import VM, TensorField
 from nerfloom.geometry.points import Points
-from nerfloom.kernels import kept, native
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.hash_grid import hash_grid
-from nerfloom.kernels.kept import Waves
-from nerfloom.kernels.mlp import mlp
+from nerfloom.kernels import native, result_cache
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.grids.hash_grid import hash_grid
+from nerfloom.kernels.networks.mlp import mlp
+from nerfloom.kernels.result_cache import Waves
 from nerfloom.methods.kplanes import ExplicitField
 from tests.kernels.compiled import needs_kernels
 
@@ -401,7 +401,7 @@ def test_an_error_leaves_nothing_behind(stage: str) -> None:
     with pytest.raises(Broken):
         waves.choose(torch.arange(30), broken) if stage == "choosing" else waves.evaluate(30, broken)
     assert torch.is_grad_enabled()
-    assert kept._thread.tape is None
+    assert result_cache._thread.tape is None
 
 
 def test_another_thread_is_left_alone() -> None:

@@ -8,7 +8,8 @@ import torch
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.march import (
+from nerfloom.kernels.march.occupancy import refresh_occupancy_reference
+from nerfloom.kernels.march.waves import (
     CompiledMarch,
     Occupancy,
     ReferenceMarch,
@@ -17,7 +18,6 @@ from nerfloom.kernels.march import (
     sort_by_ray,
     step_start,
 )
-from nerfloom.kernels.occupancy import refresh_occupancy_reference
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

@@ -11,7 +11,7 @@ from torch import nn
 from nerfloom.fields.base import MLP
 from nerfloom.kernels import native
 from nerfloom.kernels.math import MAX_LOG_DENSITY
-from nerfloom.kernels.mlp import Activation, density_mlp, density_mlp_reference, mlp, mlp_reference
+from nerfloom.kernels.networks.mlp import Activation, density_mlp, density_mlp_reference, mlp, mlp_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
 SHAPES: list[tuple[tuple[int, ...], tuple[int, ...]]] = [

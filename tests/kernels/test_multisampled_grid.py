@@ -10,11 +10,11 @@ from nerfloom.encodings.multisampled import DECAYED, MultisampledHashGrid, _Deca
 from nerfloom.geometry.bounds import to_unit_box
 from nerfloom.geometry.multisamples import fixed_pattern, hashed_pattern
 from nerfloom.geometry.points import Frustums
-from nerfloom.kernels.contraction import contract_to_unit_reference
-from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid_reference
-from nerfloom.kernels.hash_grid_lookup import TableGradient
-from nerfloom.kernels.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
-from nerfloom.kernels.multisamples import (
+from nerfloom.kernels.encodings.contraction import contract_to_unit_reference
+from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
+from nerfloom.kernels.grids.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
+from nerfloom.kernels.grids.multisamples import (
     frustum_balls,
     frustum_balls_reference,
     unit_multisamples,

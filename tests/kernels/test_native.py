@@ -48,7 +48,7 @@ def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path: Path, forks:
         "from pathlib import Path\n"
         "from nerfloom.kernels import native\n"
         f"native.FOLDER = Path({str(tmp_path)!r})\n"
-        "from nerfloom.kernels.mlp import mlp\n"
+        "from nerfloom.kernels.networks.mlp import mlp\n"
         "import torch\n"
         "for _ in range(3): out = mlp([torch.ones(2, 3)], [torch.ones(1, 3)])\n"
         "print(out.tolist())"
@@ -80,8 +80,8 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
     code = (
         "import torch\n"
         "from nerfloom.kernels import native\n"
-        "from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference\n"
-        "from nerfloom.kernels.mlp import mlp, mlp_reference\n"
+        "from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference\n"
+        "from nerfloom.kernels.networks.mlp import mlp, mlp_reference\n"
         "torch.manual_seed(0)\n"
         "layout = HashGridLayout.build(4, 4, 64, 10)\n"
         "x, table = torch.rand(99, 3), torch.randn(layout.num_entries, 2)\n"
@@ -109,7 +109,8 @@ def test_libraries_of_other_sources_are_not_called(tmp_path: Path, forks: Forks)
     shutil.copytree(native.SOURCES, tmp_path, dirs_exist_ok=True)
     variant = native.variant()
     assert forks.run(code, NERFLOOM_KERNELS=variant).stdout.split() == [variant]
-    (tmp_path / "march.h").write_bytes((tmp_path / "march.h").read_bytes() + b"\n")
+    header = tmp_path / "march" / "waves.h"
+    header.write_bytes(header.read_bytes() + b"\n")
     chosen = forks.run(code, NERFLOOM_KERNELS="auto")
     assert chosen.stdout.split()[-1] == "reference"
     assert "without its compiled kernels (they were built from other sources)" in chosen.stdout + chosen.stderr
@@ -121,9 +122,9 @@ def test_libraries_of_other_sources_are_not_called(tmp_path: Path, forks: Forks)
 def test_every_file_counts_by_name_and_content(tmp_path: Path) -> None:
     def number(**files: str) -> int:
         folder = tmp_path / "-".join([*files, *files.values()])
-        folder.mkdir()
+        (folder / "family").mkdir(parents=True)
         for name, text in files.items():
-            (folder / name.replace("_", ".")).write_text(text)
+            (folder / "family" / name.replace("_", ".")).write_text(text)
         return fingerprint(folder)
 
     numbers = [number(a_cpp="x", b_h="y"), number(a_cpp="xy", b_h=""), number(c_cpp="x", b_h="y"), number(b_h="y")]

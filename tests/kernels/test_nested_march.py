@@ -10,8 +10,8 @@ import torch
 from nerfloom.geometry.bounds import intersect_box, nested_boxes
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.march import CompiledMarch, March, ReferenceMarch
-from nerfloom.kernels.occupancy import Occupancy, own_cells
+from nerfloom.kernels.march.occupancy import Occupancy, own_cells
+from nerfloom.kernels.march.waves import CompiledMarch, March, ReferenceMarch
 
 BOX = torch.tensor([[-1.0, -1.5, -0.5], [1.0, 0.5, 1.5]])
 LEVELS, RESOLUTION = 5, 16

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerfloom.kernels.plane_bands import Band, band_variation
-from nerfloom.kernels.planes import PlanesGradient, PlanesLayout
+from nerfloom.kernels.grids.plane_bands import Band, band_variation
+from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout
 from tests.kernels.compiled import needs_kernels, relative_error
 
 pytestmark = needs_kernels

@@ -9,8 +9,8 @@ from nerfloom.fields.base import MLP
 from nerfloom.fields.encoded import DensityField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.intervals import interval_weights_reference
-from nerfloom.kernels.proposals import PROPOSAL_WEIGHTS, proposal_weights, proposal_weights_reference
+from nerfloom.kernels.histograms.intervals import interval_weights_reference
+from nerfloom.kernels.histograms.proposals import PROPOSAL_WEIGHTS, proposal_weights, proposal_weights_reference
 from nerfloom.samplers.proposal import ProposalSampler, density_of
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.test_trace import BOX, rays

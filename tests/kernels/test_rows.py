@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from nerfloom.kernels.rows import gather_rows, take_rows
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from tests.kernels.compiled import needs_kernels, relative_error
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import nerfloom.cameras.cameras
-import nerfloom.data.pixels
+import nerfloom.data.pixels.batch
 import nerfloom.kernels
 from nerfloom.kernels import native
 
-SOURCES = Path(native.__file__).parent / "csrc"
+SOURCES = Path(native.__file__).parent
 LETTERS = {"int64_t": "q", "int": "i", "float": "f", "double": "d"}
 
 
@@ -37,10 +37,11 @@ def kind(parameter: str) -> str:
 
 def declared() -> dict[str, list[native.Function]]:
     """The declarations of every module that can have any, by the name of their function."""
-    names = [module.name for module in pkgutil.iter_modules(nerfloom.kernels.__path__, "nerfloom.kernels.")]
+    found_modules = pkgutil.walk_packages(nerfloom.kernels.__path__, "nerfloom.kernels.")
+    names = [module.name for module in found_modules if not module.name.endswith(("_triton", "triton_launch"))]
     modules = [importlib.import_module(name) for name in names]
     found: dict[str, list[native.Function]] = {}
-    for module in (*modules, nerfloom.cameras.cameras, nerfloom.data.pixels):
+    for module in (*modules, nerfloom.cameras.cameras, nerfloom.data.pixels.batch):
         for value in vars(module).values():
             if isinstance(value, native.Function):
                 found.setdefault(value.name, []).append(value)
@@ -58,16 +59,15 @@ def problem(function: native.Function, parameters: tuple[str, ...]) -> str | Non
     return None
 
 
-EXPORTED = {name: kinds for file in sorted(SOURCES.glob("*.cpp")) for name, kinds in exported(file.read_text()).items()}
+CPP = sorted(SOURCES.glob("*/*.cpp"))
+EXPORTED = {name: kinds for file in CPP for name, kinds in exported(file.read_text()).items()}
 DECLARED = declared()
 
 
 def test_every_exported_function_is_declared_once_and_every_declared_one_exported() -> None:
     assert set(DECLARED) == set(EXPORTED)
     assert {name for name, functions in DECLARED.items() if len(functions) > 1} == set()
-    count = sum(
-        len(re.findall(r"^EXPORT int ", file.read_text(), flags=re.MULTILINE)) for file in SOURCES.glob("*.cpp")
-    )
+    count = sum(len(re.findall(r"^EXPORT int ", file.read_text(), flags=re.MULTILINE)) for file in CPP)
     assert len(EXPORTED) == count > 30
 
 

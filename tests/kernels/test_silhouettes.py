@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerfloom.kernels.silhouettes import (
+from nerfloom.kernels.images.silhouettes import (
     Photograph,
     hold_balls,
     hold_balls_reference,

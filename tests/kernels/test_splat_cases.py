@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.lenses import Distortion
-from nerfloom.kernels.splat_blend import MAX_ALPHA, OPAQUE, blend
-from nerfloom.kernels.splat_project import MIN_ALPHA, SplatCamera, project_gaussians, project_reference
-from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.kernels.splats.blend import MAX_ALPHA, OPAQUE, blend
+from nerfloom.kernels.splats.project import MIN_ALPHA, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.tiles import tile_lists
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.splat_truth import NAMES, camera, compared, drawn, leaves, scene, true_image
 

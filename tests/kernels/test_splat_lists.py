@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splat_project import CUT, DISTANCE, OPACITY, RECORD, U_X, project_gaussians
-from nerfloom.kernels.splat_tiles import TILE, TILES, TileLists, tile_lists, tile_lists_reference
+from nerfloom.kernels.splats.project import CUT, DISTANCE, OPACITY, RECORD, U_X, project_gaussians
+from nerfloom.kernels.splats.tiles import TILE, TILES, TileLists, tile_lists, tile_lists_reference
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, scene
 from tests.kernels.test_few_operations import few

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from nerfloom.kernels.splat_packed import PACK, PackedGaussians, pack_gaussians, project_packed
-from nerfloom.kernels.splat_project import CUT, SplatCamera, project_gaussians
+from nerfloom.kernels.splats.packed import PACK, PackedGaussians, pack_gaussians, project_packed
+from nerfloom.kernels.splats.project import CUT, SplatCamera, project_gaussians
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, scene
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splat_blend import blend
-from nerfloom.kernels.splat_project import SplatCamera, project_gaussians
-from nerfloom.kernels.splat_tiles import tile_lists
+from nerfloom.kernels.splats.blend import blend
+from nerfloom.kernels.splats.project import SplatCamera, project_gaussians
+from nerfloom.kernels.splats.tiles import tile_lists
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.splat_truth import (
     BACKGROUND,

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfloom.evaluation import metrics
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import derivatives
-from nerfloom.kernels.ssim import (
+from nerfloom.kernels.images.ssim import (
     WINDOW,
     photometric_loss,
     photometric_reference,

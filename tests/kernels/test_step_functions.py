@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.step_functions import EPS, blurred_excess, blurred_excess_reference, blurred_weights
+from nerfloom.kernels.histograms.step_functions import EPS, blurred_excess, blurred_excess_reference, blurred_weights
 from tests.kernels.compiled import needs_kernels, relative_error
 
 F64 = torch.float64

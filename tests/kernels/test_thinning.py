@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid
-from nerfloom.kernels.planes import PlanesLayout, planes
-from nerfloom.kernels.thinning import thinned
+from nerfloom.kernels.compositing.thinning import thinned
+from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid
+from nerfloom.kernels.grids.planes import PlanesLayout, planes
 
 COPIES = 4_000
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
-from nerfloom.kernels.mlp import mlp
+from nerfloom.kernels.networks.mlp import mlp
 from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.large import bits, measured
@@ -83,7 +83,7 @@ def test_a_forked_process_has_threads_of_its_own(forks: Forks) -> None:
     """In a process of its own: what is forked here would hold this one's files."""
     code = (
         "import os, torch\n"
-        "from nerfloom.kernels.mlp import mlp\n"
+        "from nerfloom.kernels.networks.mlp import mlp\n"
         "torch.manual_seed(0); torch.set_num_threads(2)\n"
         "x, w = [torch.randn(20_000, 32)], [torch.randn(64, 32), torch.randn(16, 64)]\n"
         "expected = mlp(x, w)\n"
@@ -97,7 +97,7 @@ def test_a_forked_process_has_threads_of_its_own(forks: Forks) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -> None:
-    from nerfloom.data.pixels import gather_colors
+    from nerfloom.data.pixels.batch import gather_colors
 
     pixels, behind = torch.randint(256, (100, 4)).to(torch.uint8), torch.rand(50_000, 3)
     good, before = torch.randint(100, (50_000,)), torch.get_num_threads()

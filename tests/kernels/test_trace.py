@@ -13,9 +13,9 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels import dispatch
-from nerfloom.kernels.march import march
-from nerfloom.kernels.occupancy import Occupancy
-from nerfloom.kernels.trace import TRACE, trace_reference
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import march
+from nerfloom.kernels.traced.trace import TRACE, trace_reference
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfloom.data.dataset import Dataset
-from nerfloom.kernels.traced_colors import TRACED_COLORS, traced_colors, traced_colors_reference
+from nerfloom.kernels.traced.colors import TRACED_COLORS, traced_colors, traced_colors_reference
 from nerfloom.rendering.traced import traced_rays
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels

@@ -12,17 +12,17 @@ from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import dispatch
-from nerfloom.kernels.march import March, march
-from nerfloom.kernels.occupancy import Occupancy
-from nerfloom.kernels.trace import GridDensity, trace
-from nerfloom.kernels.traced_colors import GridColor
-from nerfloom.kernels.traced_error import (
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import March, march
+from nerfloom.kernels.traced.colors import GridColor
+from nerfloom.kernels.traced.squared_error import (
     TRACED_ERROR,
     PixelTargets,
     TracedError,
     traced_error,
     traced_error_reference,
 )
+from nerfloom.kernels.traced.trace import GridDensity, trace
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

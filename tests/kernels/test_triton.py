@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.kernels import native, triton_kernels
+from nerfloom.kernels import native, triton_backend
 from tests.forked import Forks
 
 ROOT = Path(__file__).parents[2]
@@ -45,7 +45,7 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_there(target: tuple[str, st
     assert done.returncode == 0, done.stderr[-4000:]
     started = {
         f"{file.stem}.{name}"
-        for file in (ROOT / "framework" / "kernels" / "triton_kernels").glob("*.py")
+        for file in (ROOT / "framework" / "kernels").glob("*/*_triton.py")
         for name in re.findall(r"\blaunch\(\s*(_\w+),", file.read_text(encoding="utf-8"))
     }
     assert started <= set(done.stdout.split())
@@ -55,17 +55,17 @@ def test_every_kernel_compiles_for_a_gpu_that_is_not_there(target: tuple[str, st
 def test_triton_is_imported_by_no_user_of_the_cpu(forks: Forks) -> None:
     code = (
         "import sys, torch\n"
-        "from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid\n"
+        "from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid\n"
         "layout = HashGridLayout.build(2, 2, 4, 6)\n"
         "hash_grid(torch.rand(3, 3), torch.rand(layout.num_entries, 2), layout)\n"
-        "print('triton' in sys.modules, any('triton_kernels.' in name for name in sys.modules))"
+        "print('triton' in sys.modules, any(name.endswith('_triton') for name in sys.modules))"
     )
     done = forks.run(code, TRITON_INTERPRET="0")
     assert done.stdout.split() == ["False", "False"], done.stderr
 
 
 def test_asking_for_triton_without_a_gpu_is_an_error(forks: Forks) -> None:
-    code = "from nerfloom.kernels import triton_kernels as t; print(t.available())"
+    code = "from nerfloom.kernels import triton_backend as t; print(t.available())"
     assert forks.run(code, NERFLOOM_KERNELS="reference").stdout.split() == ["False"]
     done = forks.run(code, NERFLOOM_KERNELS="triton", TRITON_INTERPRET="0", CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 1
@@ -74,11 +74,11 @@ def test_asking_for_triton_without_a_gpu_is_an_error(forks: Forks) -> None:
 
 def test_the_processors_kernels_come_first() -> None:
     """Also while Triton interprets, unless they are left out."""
-    from nerfloom.kernels.compositing import COMPOSITE
+    from nerfloom.kernels.compositing.density import COMPOSITE
 
     names = [implementation.backend.name for implementation in COMPOSITE.implementations]
     assert names == ["c++", "triton"]
-    if native.available() and not triton_kernels.INTERPRETED:
+    if native.available() and not triton_backend.INTERPRETED:
         import torch
 
         assert COMPOSITE.choose((torch.rand(3),)).backend.name == "c++"

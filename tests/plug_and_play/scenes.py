@@ -5,9 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from benchmarks.closed_forms import BOX, ClosedForm, scenes
 from nerfloom import Rays
 from nerfloom.geometry.points import Points
-from nerfloom.tools.benchmarks.closed_forms import BOX, ClosedForm, scenes
 
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 

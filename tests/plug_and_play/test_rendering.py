@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 import nerfloom
+from benchmarks.sampling import random_rays
 from nerfloom.geometry.rays import Samples
-from nerfloom.tools.benchmarks.sampling import random_rays
 from tests.kernels.test_compositing import ragged
 
 F64 = torch.float64

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor, nn
 
 import nerfloom
+from benchmarks.closed_forms import BOX, Ball, ClosedForm, Medium, Solids, scenes
+from benchmarks.sampling import random_rays
 from nerfloom.geometry.rays import Samples
-from nerfloom.tools.benchmarks.closed_forms import BOX, Ball, ClosedForm, Medium, Solids, scenes
-from nerfloom.tools.benchmarks.sampling import random_rays
 from tests.plug_and_play.scenes import BACKGROUND, functions
 
 

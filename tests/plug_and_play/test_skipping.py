@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 import nerfloom
+from benchmarks.closed_forms import BOX, scenes
+from benchmarks.sampling import random_rays
 from nerfloom.kernels import native
-from nerfloom.tools.benchmarks.closed_forms import BOX, scenes
-from nerfloom.tools.benchmarks.sampling import random_rays
 from tests.plug_and_play.scenes import BACKGROUND, dense_quadrature, functions, steps_through_box
 
 STEPS = 256

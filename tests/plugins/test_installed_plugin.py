@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.base.registry import VARIABLES
+from nerfloom.registry import VARIABLES
 
 pytestmark = pytest.mark.slow
 

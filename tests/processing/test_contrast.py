@@ -7,9 +7,9 @@ import pytest
 from PIL import Image
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.processing.brightness import stretched, tones
-from nerfloom.tools.processing.contrast import for_features
-from nerfloom.tools.processing.images import prepare_all
+from nerfloom.processing.brightness import stretched, tones
+from nerfloom.processing.contrast import for_features
+from nerfloom.processing.images import prepare_all
 
 
 def ramp(low: float, high: float) -> np.ndarray:

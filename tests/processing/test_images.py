@@ -7,8 +7,8 @@ import pytest
 from PIL import Image, features
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.processing.images import output_names, prepare, prepare_all
-from nerfloom.tools.processing.listing import find_images
+from nerfloom.processing.images import output_names, prepare, prepare_all
+from nerfloom.processing.listing import find_images
 
 
 def write(path: Path, size: tuple[int, int] = (6, 4), mode: str = "RGB", orientation: int | None = None) -> np.ndarray:

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.processing.listing import find_images, kind_of
-from nerfloom.tools.processing.sequence import is_sequence
+from nerfloom.processing.listing import find_images, kind_of
+from nerfloom.processing.sequence import is_sequence
 
 
 def touch(folder: Path, *names: str) -> Path:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerfloom.dataparsers.camera_spread import camera_spread
-from nerfloom.tools.processing.parallax import share_that_turned
+from nerfloom.processing.parallax import share_that_turned
 
 
 def matches(shift: float, focal: float, count: int = 6) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.processing import polycam, record3d
+from nerfloom.processing import polycam, record3d
 from tests.dataparsers.test_polycam import STAMPS, write_polycam
 from tests.dataparsers.test_record3d import write_record3d
 

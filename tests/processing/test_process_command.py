@@ -10,7 +10,7 @@ from PIL import Image
 
 from nerfloom.cli.process_data import main
 from nerfloom.geometry.alignment import pose_errors
-from nerfloom.tools.processing.record3d import convert
+from nerfloom.processing.record3d import convert
 from tests.conftest import Refused
 from tests.processing.scene import write_corner
 
@@ -96,7 +96,7 @@ def test_a_stopped_run_keeps_features_and_matches(
 
     with monkeypatch.context() as stopped:
         stopped.setattr("sys.argv", ["ns-process-data", *map(str, words)])
-        stopped.setattr("nerfloom.tools.processing.mapping.reconstruct", stop)
+        stopped.setattr("nerfloom.processing.mapping.reconstruct", stop)
         with pytest.raises(SystemExit):
             main()
     assert "features and matches are kept: --resume goes on" in " ".join(capsys.readouterr().err.split())

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nerfloom.tools.processing.pair_matching import match
-from nerfloom.tools.processing.retrieval import all_pairs, global_descriptors, sequential_pairs, similar_pairs
+from nerfloom.processing.pair_matching import match
+from nerfloom.processing.retrieval import all_pairs, global_descriptors, sequential_pairs, similar_pairs
 
 
 def test_all_and_neighbouring_pairs() -> None:

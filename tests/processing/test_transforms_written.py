@@ -9,8 +9,8 @@ from PIL import Image
 
 from nerfloom.base.errors import DataError
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.tools.processing import transforms
-from nerfloom.tools.processing.output import check_apart, claim
+from nerfloom.processing import transforms
+from nerfloom.processing.output import check_apart, claim
 
 
 def world_to_camera(index: int) -> np.ndarray:

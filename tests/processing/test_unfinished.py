@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from nerfloom.base.errors import DataError, FlagError
-from nerfloom.tools.processing.estimate import about
-from nerfloom.tools.processing.matching import choose_matching
-from nerfloom.tools.processing.output import begin, claim
-from nerfloom.tools.processing.retrieval import similar_pairs
-from nerfloom.tools.processing.settings import ColmapFlags
-from nerfloom.tools.processing.unfinished import unfinished
+from nerfloom.processing.estimate import about
+from nerfloom.processing.matching import choose_matching
+from nerfloom.processing.output import begin, claim
+from nerfloom.processing.retrieval import similar_pairs
+from nerfloom.processing.settings import ColmapFlags
+from nerfloom.processing.unfinished import unfinished
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfloom.data.folds import folds, thumbnail
 from nerfloom.data.image_files import read_image
-from nerfloom.tools.processing.colmap import Model
-from nerfloom.tools.processing.database import PAIR_BASE
-from nerfloom.tools.processing.unfolding import folded_pairs, unfold
+from nerfloom.processing.colmap import Model
+from nerfloom.processing.database import PAIR_BASE
+from nerfloom.processing.unfolding import folded_pairs, unfold
+from nerfloom.scene.folds import folds, thumbnail
 from tests.test_folds import walk
 
 COUNT = 60

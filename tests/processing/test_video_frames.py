@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from nerfloom.base.errors import DataError
-from nerfloom.tools.processing.ffmpeg import chosen_frames, frame_count, survey
-from nerfloom.tools.processing.frame_choice import blocks, different, intervals, sharpest, sharpness
-from nerfloom.tools.processing.video import line, write_frames
+from nerfloom.processing.ffmpeg import chosen_frames, frame_count, survey
+from nerfloom.processing.frame_choice import blocks, different, intervals, sharpest, sharpness
+from nerfloom.processing.video import line, write_frames
 
 BITS = 6
 """Squares of a frame whose brightness is its number in binary."""

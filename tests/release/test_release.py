@@ -116,7 +116,7 @@ def test_wheels_that_are_not(change: dict[str, str], said: str, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"left_out": "framework/kernels/csrc/parallel.h"}, "the sdist lacks framework/kernels/csrc/parallel.h"),
+        ({"left_out": "framework/kernels/runtime/parallel.h"}, "the sdist lacks framework/kernels/runtime/parallel.h"),
         ({"left_out": "constraints.txt"}, "the sdist lacks constraints.txt"),
         ({"more": "tests/conftest.py"}, "holds tests/conftest.py"),
         ({"more": "framework/kernels/lib/avx2.so"}, "holds framework/kernels/lib/avx2.so"),

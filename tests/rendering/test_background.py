@@ -18,7 +18,7 @@ from nerfloom.fields.nerf import NeRFField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.geometry.spheres import InvertedRays, distances_behind
-from nerfloom.kernels.contraction import contract_to_unit_reference
+from nerfloom.kernels.encodings.contraction import contract_to_unit_reference
 from nerfloom.method import Method
 from nerfloom.methods import instant_ngp, nerf_plus_plus, vanilla_nerf
 from nerfloom.ray_model import RayModel
@@ -31,9 +31,9 @@ from nerfloom.samplers.inside import InsideSphere
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.samplers.uniform import UniformSampler
-from nerfloom.tools.testing import check_method
-from nerfloom.tools.testing.scenes import ball_in_a_box, ball_under_a_sky
-from nerfloom.tools.testing.subject import Learner
+from nerfloom.testing import check_method
+from nerfloom.testing.scenes import ball_in_a_box, ball_under_a_sky
+from nerfloom.testing.trial_run import Learner
 from tests.training.helpers import TINY
 
 SPHERE = torch.tensor([0.2, -0.1, 0.0, 1.5]).double()

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerfloom.data.pixels import PixelBatch, thinned
+from nerfloom.data.pixels.batch import PixelBatch, thinned
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.losses.functions import mean_squared_error, opacity_of_transparent
 from nerfloom.rendering.volume import volume_render

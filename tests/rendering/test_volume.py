@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.base.registry import load_method, registered
 from nerfloom.data.scene import Scene
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Footprint, Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.ray_model import RayModel
+from nerfloom.registry import load_method, registered
 from nerfloom.rendering.background import SphereRenderer
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import VolumeRenderer, shade

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.base.registry import load_method
 from nerfloom.cameras.cameras import Cameras, subpixels
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
@@ -14,6 +13,7 @@ from nerfloom.evaluation.paths import look_at
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.ray_model import RayModel
+from nerfloom.registry import load_method
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.in_view import pixels_in_view
 from nerfloom.samplers.occupancy import OccupancySampler

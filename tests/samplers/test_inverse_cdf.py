@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from nerfloom.samplers.inverse_cdf import inverse_cdf, uniform_variates
+from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf, uniform_variates
 
 EDGES = torch.tensor([[0.0, 0.5, 0.7, 2.0, 2.5, 4.0]], dtype=torch.float64)
 WEIGHTS = torch.tensor([[1.0, 0.0, 3.0, 0.5, 0.1]], dtype=torch.float64)

@@ -5,7 +5,7 @@ import torch
 
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.spacing import spacing
+from nerfloom.kernels.histograms.spacing import spacing
 from nerfloom.samplers.choice import SamplingConfig, make_sampler
 from nerfloom.samplers.occupancy import DECAY, MOVING_DECAY, WARM_UP_STEPS, OccupancySampler
 

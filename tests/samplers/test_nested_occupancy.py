@@ -14,8 +14,8 @@ from nerfloom.fields.base import Field
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.compositing import composite
-from nerfloom.kernels.occupancy import own_cells
+from nerfloom.kernels.compositing.density import composite
+from nerfloom.kernels.march.occupancy import own_cells
 from nerfloom.samplers.choice import SamplingConfig, contracted_box, make_sampler
 from nerfloom.samplers.occupancy import FARTHEST, WARM_UP_STEPS, OccupancySampler
 from nerfloom.scene.seen_cells import seen_cells

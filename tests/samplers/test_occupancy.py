@@ -9,7 +9,7 @@ from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels import native
-from nerfloom.kernels.mlp import mlp
+from nerfloom.kernels.networks.mlp import mlp
 from nerfloom.rendering.volume import volume_render
 from nerfloom.samplers.occupancy import WARM_UP_STEPS, OccupancySampler
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.spacing import from_disparity, to_disparity
+from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
 from nerfloom.rendering.volume import Rendered, VolumeRenderer
 from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
 

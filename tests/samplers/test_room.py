@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.operations import Counting
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.rendering.volume import shade
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.samplers.room import HEADROOM, LIMIT, PIECE, Room
-from nerfloom.tools.benchmarks.operations import Counting
+from nerfloom.samplers.sample_capacity import HEADROOM, LIMIT, PIECE, Room
 from tests.samplers.test_occupancy import BOX, CountingField, KeptField, random_rays
 
 

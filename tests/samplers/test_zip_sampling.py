@@ -7,8 +7,8 @@ from torch import Tensor
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Histogram, Rays, Samples
-from nerfloom.kernels.spacing import inverse_power_ladder, power_ladder, spacing
-from nerfloom.kernels.step_functions import blurred_excess_reference
+from nerfloom.kernels.histograms.spacing import inverse_power_ladder, power_ladder, spacing
+from nerfloom.kernels.histograms.step_functions import blurred_excess_reference
 from nerfloom.samplers.proposal import ProposalSampler, interlevel_loss, propose
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

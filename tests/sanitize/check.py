@@ -9,7 +9,7 @@ from tests.sanitize.build import ROOT, Sanitized
 BAD_CALL = """
 import torch
 from nerfloom.kernels import native
-from nerfloom.data.pixels import _gather_colors
+from nerfloom.data.pixels.batch import _gather_colors
 
 pixels = torch.zeros(64, 4, dtype=torch.uint8)
 flat, floats = torch.tensor([{index}]), [torch.zeros(3) for _ in range(3)]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from nerfloom.base.registry import load_dataparser, registered
+from nerfloom.registry import load_dataparser, registered
 from nerfloom.training.run import Run
 from tests.site.pages import ROOT
 
@@ -18,7 +18,7 @@ EXAMPLES = ("my-method", "voxels")
 """Methods that the documents let their readers write."""
 UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
 """Commands of others, and those that no parser here knows."""
-TAKE_RUNS = ("bench", "evaluate", "export", "render", "viewer")
+TAKE_RUNS = ("evaluate", "export", "render", "viewer")
 """Commands that take a trained run, and look whether it is there."""
 FORMATS = {"lego": "blender", "balls": "dnerf", "ring": "blender"}
 """Name of a folder in the documents -> its format; of any other, nerfstudio."""
@@ -50,11 +50,18 @@ class Checker:
         shutil.copytree(ROOT / "configs", folder / "configs")
         (folder / "path" / "to" / "masks").mkdir(parents=True)
         exchanged: dict[str, Callable[..., Any]] = {
-            "nerfloom.data.data_folder.find_data": found,
+            "nerfloom.training.data_folder.find_data": found,
             "nerfloom.cli.train_paths.check_paths": lambda *_: None,
             "nerfloom.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
+            "benchmarks.__main__.trained_run": lambda path, *_: path,
             **{f"nerfloom.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
-            **{f"nerfloom.cli.{name}.check_data": lambda path: None for name in ("bench", "compare", "stress")},
+            **{
+                f"{module}.check_data": lambda path: None
+                for module in (
+                    "benchmarks.__main__",
+                    *(f"nerfloom.cli.{name}" for name in ("bench", "compare", "stress")),
+                )
+            },
             "nerfloom.cli.session.start": begin,
             "nerfloom.cli.session.resume": begin,
             "nerfloom.training.splat_files.load_run_or_splats": begin,
@@ -62,7 +69,7 @@ class Checker:
             "nerfloom.cli.process_data._process": begin,
             "nerfloom.cli.compare.compare": begin,
             "nerfloom.cli.stress.stress": stress,
-            "nerfloom.tools.downloads.install.announce": begin,
+            "nerfloom.downloads.install.announce": begin,
         }
         for name, replacement in exchanged.items():
             module, _, attribute = name.rpartition(".")
@@ -72,9 +79,9 @@ class Checker:
         train = import_module("nerfloom.cli.train")
         read = train._read_run
         monkeypatch.setattr(train, "_read_run", lambda path: read(path) if path.is_file() else run_at(path))
-        bench = import_module("nerfloom.cli.bench")
-        for name, (flags, _) in bench.KINDS.items():
-            monkeypatch.setitem(bench.KINDS, name, (flags, begin))
+        for bench in map(import_module, ("nerfloom.cli.bench", "benchmarks.__main__")):
+            for name, (flags, _) in bench.KINDS.items():
+                monkeypatch.setitem(bench.KINDS, name, (flags, begin))
 
     def check(self, words: list[str]) -> None:
         """Raise an error if a command does not exist, or does not understand its flags."""
@@ -89,6 +96,8 @@ class Checker:
             assert rest[0] in targets, f"make has no target {rest[0]}"
         elif name == "pip":
             check_extras(rest)
+        elif words[1:3] == ["-m", "benchmarks"]:
+            assert status_of(import_module("benchmarks.__main__")._command, words[3:]) in (0, None)
         elif name in ("python", "python3"):
             check_python(rest)
         else:

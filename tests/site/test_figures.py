@@ -7,8 +7,8 @@ from pathlib import Path
 from statistics import fmean, stdev
 
 from nerfloom.base import from_nerfstudio
-from nerfloom.base.elsewhere import ELSEWHERE
-from nerfloom.base.registry import registered
+from nerfloom.base.other_projects import ELSEWHERE
+from nerfloom.registry import registered
 from tests.site.pages import ROOT
 
 DOCS = ROOT / "docs"

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from nerfloom.base.config import ConfigError
-from nerfloom.base.registry import load_method, registered
 from nerfloom.cli.train import _flag_names
+from nerfloom.registry import load_method, registered
 from tests.site.commands import Checker
 from tests.site.pages import ROOT, words_of
 

@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from nerfloom.base.registry import registered
+from nerfloom.registry import registered
 from tests.site.pages import PAGES, ROOT
 
 BUILD = """

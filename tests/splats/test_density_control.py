@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from nerfloom import View
-from nerfloom.kernels.splat_blend import ABSOLUTE_X, ABSOLUTE_Y
-from nerfloom.kernels.splat_project import RECORD, X
+from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y
+from nerfloom.kernels.splats.project import RECORD, X
 from nerfloom.splats.density_control import (
     CHILDREN,
     GRADIENT,

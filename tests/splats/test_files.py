@@ -16,9 +16,9 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.cli.export import main
 from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.ply import read_columns, read_header, write_columns
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics_reference
-from nerfloom.splats.budget import colour_error, fitted_ply, fitted_spz, visibility
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
 from nerfloom.splats.files import read_gaussians, write_gaussians
+from nerfloom.splats.gaussian_limit import colour_error, fitted_ply, fitted_spz, visibility
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.ply import SURE, ply_size, property_names, write_ply

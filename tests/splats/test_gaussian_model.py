@@ -12,7 +12,7 @@ from nerfloom.splats.drawing import draw, splat_camera
 from nerfloom.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, MOVES_PER_DOUBLING, steps_per_move
 from nerfloom.splats.settings import SplattingConfig, decide_splatting
 from nerfloom.splats.start import first_points, from_points, seen_colors
-from nerfloom.tools.testing import check_method
+from nerfloom.testing import check_method
 
 
 class Plain(GaussianModel[SplattingConfig]):

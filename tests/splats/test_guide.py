@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from nerfloom.cameras.view import View
-from nerfloom.data.pixels import ViewBatch
+from nerfloom.data.pixels.batch import ViewBatch
+from nerfloom.export.surfaces import found_surfaces
 from nerfloom.methods.gaussian_splatting import GaussianSplattingConfig, decide
 from nerfloom.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
-from nerfloom.tools.surfaces import found_surfaces
 from nerfloom.training.datasets import load_split
 from tests.splats.test_method import SCENE, ball, camera
 from tests.splats.test_what_images_differ_in import model_of

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splat_project import rotation_matrices
+from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.mcmc import DEAD, MOST_COPIES, moved, shaken, shared
 

@@ -11,7 +11,7 @@ import torch
 
 from nerfloom import ConfigError, View
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.pixels import ViewBatch
+from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.data.scene import Scene
 from nerfloom.methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.splats.drawing import draw_colors, draw_view, splat_camera

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from nerfloom import View
+from nerfloom.benchmarks.frames import measure
 from nerfloom.splats.drawing import draw, draw_colors, draw_view, on_image, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import ELSEWHERE, OURS
 from nerfloom.splats.redrawn import Redrawn, packed
-from nerfloom.tools.benchmarks.frames import measure
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import scene
 from tests.splats.test_method import ball, camera

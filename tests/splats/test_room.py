@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splat_tiles import TileLists
-from nerfloom.splats.room import FADED, HEADROOM, PIECE, Room
-from nerfloom.tools.benchmarks.operations import trainer_of
+from benchmarks.operations import trainer_of
+from nerfloom.kernels.splats.tiles import TileLists
+from nerfloom.splats.capacity import FADED, HEADROOM, PIECE, Room
 from nerfloom.training.skipping import skip_report
 from tests.training.recorded import ahead
 

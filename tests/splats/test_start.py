@@ -9,7 +9,7 @@ import torch
 
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.blender import Blender
-from nerfloom.kernels.splat_project import DC
+from nerfloom.kernels.splats.project import DC
 from nerfloom.splats.start import (
     first_points,
     from_points,

@@ -8,7 +8,7 @@ import torch
 
 from nerfloom import View
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.pixels import ViewBatch
+from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance
 from nerfloom.kernels.math import cross_matrix
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide

@@ -11,12 +11,12 @@ from nerfloom.geometry.bounds import contract, contract_gaussians, contraction_s
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points, frames, sample_points
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.downweighting import level_weights
-from nerfloom.kernels.frequency import frequency_encoding_reference
-from nerfloom.kernels.hash_grid_layout import HashGridLayout
-from nerfloom.kernels.integrated import integrated_encoding
-from nerfloom.kernels.multisampled_grid import multisampled_grid
-from nerfloom.kernels.multisamples import unit_multisamples
+from nerfloom.kernels.encodings.frequency import frequency_encoding_reference
+from nerfloom.kernels.encodings.integrated import integrated_encoding
+from nerfloom.kernels.grids.downweighting import level_weights
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.multisampled_grid import multisampled_grid
+from nerfloom.kernels.grids.multisamples import unit_multisamples
 from nerfloom.samplers.proposal import FARTHEST
 from tests.stress.backends import backends
 from tests.stress.test_cones import assert_like, drawn_in_frustum, two_rays

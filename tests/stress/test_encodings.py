@@ -13,17 +13,17 @@ from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.geometry.bounds import contract
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing import composite
-from nerfloom.kernels.contraction import contract_to_unit
-from nerfloom.kernels.frequency import frequency_encoding, frequency_encoding_reference
-from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from nerfloom.kernels.intervals import interval_weights, resample
+from nerfloom.kernels.compositing.density import composite
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.histograms.intervals import interval_weights, resample
+from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf
+from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
 from nerfloom.kernels.math import cross_matrix, safe_normalize, truncated_exp
-from nerfloom.kernels.mlp import mlp
-from nerfloom.kernels.planes import PlanesLayout, planes, planes_reference
-from nerfloom.kernels.spacing import from_disparity, to_disparity
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
-from nerfloom.samplers.inverse_cdf import inverse_cdf
+from nerfloom.kernels.networks.mlp import mlp
 from tests.kernels.compiled import relative_error
 from tests.stress.backends import COMPILED, FEW, backends
 

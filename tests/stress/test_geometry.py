@@ -20,10 +20,10 @@ from nerfloom.fields.normals import NormalHead, density_normals
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.contraction import contract_to_unit
-from nerfloom.kernels.march import CompiledMarch, Occupancy
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
+from nerfloom.kernels.march.waves import CompiledMarch, Occupancy
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.kernels.spacing import from_disparity, to_disparity
 from tests.stress.backends import COMPILED, FEW, backends
 
 CUBE = torch.tensor([[-1.0] * 3, [1.0] * 3])

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.compositing import (
+from nerfloom.kernels.compositing.density import (
     MAX_OPTICAL_DEPTH,
     Composited,
     composite,
     optical_depth,
     weights_and_transmittance,
 )
-from nerfloom.kernels.intervals import interval_weights
+from nerfloom.kernels.histograms.intervals import interval_weights
 from nerfloom.rendering.volume import Rendered, volume_render
 from tests.kernels.test_compositing import EXTREMES, ragged
 from tests.stress.backends import FEW, backends

@@ -11,11 +11,11 @@ from torch import Tensor
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.intervals import resample
-from nerfloom.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
-from nerfloom.kernels.spacing import spacing
+from nerfloom.kernels.histograms.intervals import resample
+from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf
+from nerfloom.kernels.histograms.spacing import spacing
+from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarch
 from nerfloom.rendering.volume import VolumeRenderer
-from nerfloom.samplers.inverse_cdf import inverse_cdf
 from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss
 from tests.kernels.test_march import walk
 from tests.stress.backends import COMPILED, FEW, backends

@@ -20,7 +20,7 @@ from nerfloom.fields.base import Field
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.adam import sparse_adam
+from nerfloom.kernels.adam.adam import sparse_adam
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.uniform import UniformSampler

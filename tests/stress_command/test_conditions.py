@@ -9,12 +9,12 @@ import torch
 
 from nerfloom.base.config import from_plain
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.registry import load_method
 from nerfloom.cli.stress import USAGE
 from nerfloom.data.sources import make_source
-from nerfloom.tools.stress.conditions import CONDITIONS, PLAIN, Condition, select
-from nerfloom.tools.stress.scenes import ball_views
-from nerfloom.tools.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedSource, shortened
+from nerfloom.registry import load_method
+from nerfloom.stress.conditions import CONDITIONS, PLAIN, Condition, select
+from nerfloom.stress.scenes import ball_views
+from nerfloom.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedSource, shortened
 from nerfloom.training.run import Run, create_folder
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run

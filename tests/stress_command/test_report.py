@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-from nerfloom.tools.stress.report import Result, markdown, notes, settings_of, table
-from nerfloom.tools.stress.scenes import ball_views
-from nerfloom.tools.stress.trial import Budget
-from nerfloom.tools.stress.verdict import Outcome, Verdict
+from nerfloom.stress.report import Result, markdown, notes, settings_of, table
+from nerfloom.stress.scenes import ball_views
+from nerfloom.stress.trial import Budget
+from nerfloom.stress.verdict import Outcome, Verdict
 from tests.training.helpers import tiny_run
 
 MACHINE = {

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfloom.base import registry
+from nerfloom import registry
 from nerfloom.cli.stress import main
-from nerfloom.tools.stress.conditions import CONDITIONS, PLAIN, select
-from nerfloom.tools.stress.scenes import ball_views
-from nerfloom.tools.stress.trial import Budget, attempt, unsound
-from nerfloom.tools.stress.verdict import verdicts
+from nerfloom.stress.conditions import CONDITIONS, PLAIN, select
+from nerfloom.stress.scenes import ball_views
+from nerfloom.stress.trial import Budget, attempt, unsound
+from nerfloom.stress.verdict import verdicts
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import Refused
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
@@ -201,7 +201,7 @@ def test_what_cannot_be_begun_is_one_line(
 def test_a_place_that_cannot_be_written_is_named_before_anything_is_trained(
     tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("nerfloom.tools.stress.verdict.verdicts", None)
+    monkeypatch.setattr("nerfloom.stress.verdict.verdicts", None)
     (tmp_path / "file").touch()
     said = refused(main, "instant-ngp", "--output-path", tmp_path / "file" / "table.json")
     assert f"cannot write {tmp_path / 'file' / 'table.json'}: Not a directory; name another place" in said

@@ -11,10 +11,10 @@ from torch.nn.functional import normalize
 
 from nerfloom.cameras.cameras import check_pose, subpixels
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixel_set import PixelSet
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.geometry.bounds import intersect_box
-from nerfloom.tools.stress.scenes import (
+from nerfloom.stress.scenes import (
     FIELD_OF_VIEW,
     NUM_TEST,
     NUM_TRAIN,
@@ -26,7 +26,7 @@ from nerfloom.tools.stress.scenes import (
     data_views,
     reduced,
 )
-from nerfloom.tools.testing.ball import RADIUS, trace
+from nerfloom.testing.ball import RADIUS, trace
 
 INSIDE = RADIUS / 2
 views_of = cache(ball_views)

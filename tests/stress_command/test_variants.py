@@ -9,11 +9,11 @@ import torch
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import check_pose
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixels import draw_batch
-from nerfloom.tools.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
-from nerfloom.tools.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
-from nerfloom.tools.stress.variants import (
+from nerfloom.data.pixels.batch import draw_batch
+from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.stress.faults import EVERY, spoiled_batches, spoiled_pixel, spoiled_pose
+from nerfloom.stress.scenes import NUM_TRAIN, SIZE, Views, ball_views
+from nerfloom.stress.variants import (
     chosen,
     first_image,
     mean_color,

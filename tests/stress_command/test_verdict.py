@@ -5,10 +5,10 @@ import math
 import pytest
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.tools.stress.conditions import ALLOWED, PLAIN, Condition
-from nerfloom.tools.stress.faults import spoiled_pixel
-from nerfloom.tools.stress.trial import Trial, in_a_line
-from nerfloom.tools.stress.verdict import LEAST_LEARNT, Outcome, verdict_of
+from nerfloom.stress.conditions import ALLOWED, PLAIN, Condition
+from nerfloom.stress.faults import spoiled_pixel
+from nerfloom.stress.trial import Trial, in_a_line
+from nerfloom.stress.verdict import LEAST_LEARNT, Outcome, verdict_of
 
 HARD = Condition("hard", "anything")
 EXPLAINED = Condition("explained", "anything", reason="who could do better")

@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from nerfloom.base.registry import load_method
 from nerfloom.dataparsers.blender import Blender
+from nerfloom.registry import load_method
 from nerfloom.training.checkpoint import FOLDER, load_newest
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder

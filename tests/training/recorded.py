@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_map_only
 
-from nerfloom.kernels import given
-from nerfloom.tools.benchmarks.operations import _place, _tensors, _waits
+from benchmarks.operations import _place, _tensors, _waits
 
 T = TypeVar("T")
 
@@ -113,4 +112,3 @@ def ahead(monkeypatch: Any) -> None:
     monkeypatch.setattr(native, "has", lambda name: False)
     monkeypatch.setattr("nerfloom.base.device.runs_ahead", lambda device: True)
     monkeypatch.setattr("nerfloom.training.step.is_bad_here", lambda loss: False)
-    assert given.is_bad_here is not None

@@ -17,7 +17,7 @@ from nerfloom import Loss
 from nerfloom.base.device import seed_step
 from nerfloom.base.processes import joined_processes, processes
 from nerfloom.cli import train
-from nerfloom.data.pixels import PixelBatch, draw_pixels, gather_batch
+from nerfloom.data.pixels.batch import PixelBatch, draw_pixels, gather_batch
 from nerfloom.data.sources import PixelSource, Request
 from nerfloom.training import mean_gradients as averaging
 from nerfloom.training.checkpoint import FOLDER, load_newest

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from nerfloom.base.checked import checked
-from nerfloom.base.registry import load_method, registered
 from nerfloom.cameras.view import every
 from nerfloom.evaluation.evaluator import Measured, evaluate, evaluation_background
 from nerfloom.evaluation.metrics import psnr
+from nerfloom.registry import load_method, registered
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.curve import (
     FEW,

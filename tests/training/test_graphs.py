@@ -14,12 +14,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.operations import trainer_of
 from nerfloom.base.errors import ConfigError, DivergenceError
 from nerfloom.base.step_kind import StepKind
 from nerfloom.model import Loss
 from nerfloom.samplers import proposal
-from nerfloom.tools.benchmarks.operations import trainer_of
-from nerfloom.tools.testing.scenes import moving_ball
+from nerfloom.testing.scenes import moving_ball
 from nerfloom.training import graphs
 from nerfloom.training.batch_size import BatchSize
 from nerfloom.training.graphs import WARM_UP, CudaRecorder, StepGraphs, kind_of_step, make_graphs

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.operations import METHODS, Counting, counted, trainer_of
 from nerfloom.kernels import native
-from nerfloom.tools.benchmarks.operations import METHODS, Counting, counted, trainer_of
 from nerfloom.training.optim import Adam
 from nerfloom.training.step import backward
 from tests.training.helpers import tiny_trainer

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from nerfloom import DataParser, ParsedScene
 from nerfloom.base.errors import DataError
-from nerfloom.base.registry import load_method
 from nerfloom.data.dataset import Split, load_dataset
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from nerfloom.registry import load_method
 from nerfloom.training.run import TRANSFORMS, Run, write_transforms
 from tests.dataparsers.captures import write_capture
 

@@ -20,9 +20,9 @@ from nerfloom.base.machine_config import MachineConfig
 from nerfloom.base.processes import Processes, gathered
 from nerfloom.cli.session import resume
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixel_cache import PixelMemory
-from nerfloom.data.pixel_stream import PixelStream
-from nerfloom.data.pixels import draw_batch
+from nerfloom.data.pixels.batch import draw_batch
+from nerfloom.data.pixels.cache import PixelMemory
+from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.data.sources import Request, ViewSource
 from nerfloom.training import mean_gradients as averaging
 from nerfloom.training.checkpoint import FOLDER, load_newest

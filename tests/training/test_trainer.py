@@ -14,8 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom import Loss, Model, PixelBatch, RayModel, Rays, Rendered
-from nerfloom.base import registry
+from nerfloom import Loss, Model, PixelBatch, RayModel, Rays, Rendered, registry
 from nerfloom.base.errors import CheckpointError, ConfigError, DivergenceError
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.evaluation.evaluator import evaluate, evaluation_background

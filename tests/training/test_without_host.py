@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.operations import Counting, _tensors
 from nerfloom.base.device import StepValue, runs_ahead, seed_step
-from nerfloom.data.error_map import DECAY, ErrorMap
+from nerfloom.data.pixels.error_map import DECAY, ErrorMap
 from nerfloom.losses.functions import depth_error
 from nerfloom.methods.tensorf import TensoRF
 from nerfloom.scene.shared_space import SharedSpace
-from nerfloom.tools.benchmarks.operations import Counting, _tensors
 from nerfloom.training.trainer import Trainer
 from tests.training.test_graphs import VARIANTS, idle, small
 

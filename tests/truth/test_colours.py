@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixels import gather_batch, gather_colors_reference
+from nerfloom.data.pixels.batch import gather_batch, gather_colors_reference
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.evaluation.evaluator import evaluate, evaluation_background
 from nerfloom.training.datasets import load_split

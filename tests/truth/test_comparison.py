@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from nerfloom.cli.train import run_of
-from nerfloom.tools.comparison.measures import Measured, measure, rows_of
-from nerfloom.tools.comparison.plan import Contender, Job
-from nerfloom.tools.comparison.report import COLUMNS, table
+from nerfloom.comparison.measures import Measured, measure, rows_of
+from nerfloom.comparison.plan import Contender, Job
+from nerfloom.comparison.report import COLUMNS, table
 from tests.comparison.runs import CONDITIONS, finish, plan
 
 BETTER = {

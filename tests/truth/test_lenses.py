@@ -14,7 +14,7 @@ import torch
 from nerfloom import ParsedScene
 from nerfloom.dataparsers.colmap import Colmap
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.tools.processing import transforms
+from nerfloom.processing import transforms
 from tests.dataparsers.sparse_models import write_colmap
 from tests.truth.ball import HEIGHT, NAMES, WIDTH, Lens, opencv_pose, pose_of, write_photographs
 from tests.truth.formats import COLMAP_CAMERAS, camera_line, model_of

@@ -12,7 +12,7 @@ import torch
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.march import CompiledMarch, Occupancy, ReferenceMarch
+from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarch
 
 BOX = np.array([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.3]])
 RESOLUTION, STEP = 48, 0.013

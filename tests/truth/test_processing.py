@@ -12,9 +12,9 @@ from PIL import Image
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.tools.processing import features, mapping, matching, transforms
-from nerfloom.tools.processing import job as job_module
-from nerfloom.tools.processing.job import Job
+from nerfloom.processing import features, mapping, matching, transforms
+from nerfloom.processing import job as job_module
+from nerfloom.processing.job import Job
 from tests.cli.helpers import called
 from tests.dataparsers.sparse_models import write_colmap
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, NAMES, PINHOLE, RADIUS, WIDTH, Lens, photograph, write_photographs

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.machine_config import MachineConfig
-from nerfloom.base.registry import load_method
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixel_set import PixelSet
-from nerfloom.data.pixels import PixelBatch, draw_batch
+from nerfloom.data.pixels.batch import PixelBatch, draw_batch
+from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
 from nerfloom.data.sources import PixelSource, Request
 from nerfloom.evaluation.appearance import fitted_appearance
@@ -25,6 +24,7 @@ from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.losses.terms import Distortion
+from nerfloom.registry import load_method
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import shade, volume_render
 from nerfloom.samplers.choice import SamplingConfig, make_sampler

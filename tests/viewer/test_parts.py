@@ -30,13 +30,13 @@ from nerfloom.training.run import Run
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.crop import CroppedCameras, picture_within
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
 from nerfloom.viewer.photographs import THUMBNAIL, Photographs, small_picture
 from nerfloom.viewer.reports import curve, heading
 from nerfloom.viewer.request import Crop, Pose, Request
-from nerfloom.viewer.studio import Studio
-from nerfloom.viewer.subject import Subject, newer_checkpoint, of_trained, reloaded
+from nerfloom.viewer.viewed import Subject, newer_checkpoint, of_trained, reloaded
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 

@@ -13,12 +13,12 @@ import pytest
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.request import pose_of
 from nerfloom.viewer.server import free_port, is_allowed
-from nerfloom.viewer.studio import Studio
-from nerfloom.viewer.subject import of_trainer
+from nerfloom.viewer.viewed import of_trainer
 from tests.training.helpers import tiny_trainer
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")

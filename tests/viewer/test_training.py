@@ -8,10 +8,10 @@ import pytest
 
 from nerfloom.training.progress import StepReport
 from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.request import Request, pose_of
-from nerfloom.viewer.studio import Studio
-from nerfloom.viewer.subject import of_trainer
 from nerfloom.viewer.training_viewer import Turns
+from nerfloom.viewer.viewed import of_trainer
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
 
 KINDS = [

@@ -25,7 +25,7 @@ from nerfloom.export.web import (
     pinhole,
     upright,
 )
-from nerfloom.kernels.splat_project import rotation_matrices
+from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.look import Look
 from nerfloom.splats.spz import read_spz
 from nerfloom.training.trained import load_trained

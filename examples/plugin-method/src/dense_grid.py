@@ -13,9 +13,9 @@ from nerfloom import Field, Method, Points, Scene
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.base import MLP
 from nerfloom.geometry.bounds import to_unit_box
-from nerfloom.kernels.contraction import contract_to_unit
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.kernels.math import truncated_exp
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
 from nerfloom.samplers import choice
 
 DIRECTION_LEVELS = 4

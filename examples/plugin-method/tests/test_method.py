@@ -8,8 +8,8 @@ import subprocess
 from pathlib import Path
 
 from nerfloom.base.child import python_command
-from nerfloom.base.registry import load_method
-from nerfloom.tools.testing import assert_method
+from nerfloom.registry import load_method
+from nerfloom.testing import assert_method
 
 
 def test_it_keeps_what_every_method_must() -> None:

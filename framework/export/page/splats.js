@@ -1,4 +1,4 @@
-// Gaussians drawn by WebGL 2 as framework/kernels/splat_project.py and splat_blend.py draw them: a quadrilateral each,
+// Gaussians drawn by WebGL 2 as framework/kernels/splats/project.py and splat_blend.py draw them: a quadrilateral each,
 // from back to front, over the background. An instance is a batch of quadrilaterals: one alone would leave most of a
 // GPU idle, and costs a call of its own where WebGL runs in software.
 

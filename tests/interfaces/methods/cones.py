@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 from nerfloom import Field, Method, Points, RayConfig, Sampler, Scene
 from nerfloom.fields.base import MLP
 from nerfloom.geometry.points import Footprint
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.samplers.uniform import UniformSampler
 
 

@@ -9,7 +9,7 @@ from torch.nn.functional import softplus
 
 from nerfloom import Field, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.fields.encoded import NUM_FEATURES
-from nerfloom.kernels.compositing import ray_sum
+from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.losses.terms import ColorError, SamplerLoss
 from nerfloom.methods import instant_ngp

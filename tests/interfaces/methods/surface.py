@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from nerfloom import Field, Method, Points, RayModel, Scene
 from nerfloom.fields.base import MLP
 from nerfloom.kernels import dispatch
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.samplers.choice import SamplingConfig, decide_sampler, make_sampler
 

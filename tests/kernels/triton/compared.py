@@ -8,10 +8,10 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from nerfloom.kernels import triton_kernels
+from nerfloom.kernels import triton_backend
 from nerfloom.kernels.dispatch import FEW_OPERATIONS, Operation
 
-DEVICE = torch.device("cpu" if triton_kernels.INTERPRETED else "cuda")
+DEVICE = torch.device("cpu" if triton_backend.INTERPRETED else "cuda")
 Function = Callable[..., Tensor | Sequence[Tensor]]
 
 

@@ -17,26 +17,20 @@ from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.fixed_march import share_out
-from nerfloom.kernels.hash_grid import HashGridLayout
-from nerfloom.kernels.planes import PlanesLayout
-from nerfloom.kernels.splat_project import SplatCamera, project_reference
-from nerfloom.kernels.splat_tiles import tile_lists_reference
-from nerfloom.kernels.triton_kernels import (
-    adam,
-    compositing,
-    encodings,
-    fixed_march,
-    hash_grid,
-    intervals,
-    launch,
-    march,
-    planes,
-    splat_blend,
-    splat_project,
-    splat_tiles,
-    ssim,
-)
+from nerfloom.kernels import triton_launch
+from nerfloom.kernels.adam import adam_triton
+from nerfloom.kernels.compositing import density_triton
+from nerfloom.kernels.encodings import encodings_triton
+from nerfloom.kernels.grids import hash_grid_triton, planes_triton
+from nerfloom.kernels.grids.hash_grid import HashGridLayout
+from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.histograms import intervals_triton
+from nerfloom.kernels.images import ssim_triton
+from nerfloom.kernels.march import fixed_slots, fixed_slots_triton, waves_triton
+from nerfloom.kernels.march.fixed_slots import share_out
+from nerfloom.kernels.splats import blend_triton, project_triton, tiles_triton
+from nerfloom.kernels.splats.project import SplatCamera, project_reference
+from nerfloom.kernels.splats.tiles import tile_lists_reference
 from tests.kernels.test_march import occupancy, random_rays
 
 
@@ -74,24 +68,24 @@ def back(*results: Tensor) -> None:
 def compile_all() -> None:
     offsets = torch.tensor([0, 3, 3, 8])
     samples = Samples(torch.rand(8), torch.rand(8), offsets)
-    back(*compositing.composite(samples, learned(8), learned(8, 3), torch.rand(3, 3), torch.rand(3)))
-    compositing.composite(replace(samples, points=torch.rand(8)), learned(8), torch.rand(8, 3), torch.rand(3, 3),
+    back(*density_triton.composite(samples, learned(8), learned(8, 3), torch.rand(3, 3), torch.rand(3)))
+    density_triton.composite(replace(samples, points=torch.rand(8)), learned(8), torch.rand(8, 3), torch.rand(3, 3),
                           torch.rand(3))  # fmt: skip
-    back(compositing.distortion(learned(8), samples))
+    back(density_triton.distortion(learned(8), samples))
     grid = HashGridLayout.build(2, 4, 40, 8)
     for features in (1, 2):
-        back(hash_grid.hash_grid(learned(9, 3), learned(grid.num_entries, features), grid, None))
+        back(hash_grid_triton.hash_grid(learned(9, 3), learned(grid.num_entries, features), grid, None))
     layout = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
-    back(planes.planes(learned(9, 3), learned(layout.num_entries, 6), layout, None))
-    encodings.spherical_harmonics(torch.rand(9, 3), 4)
-    back(encodings.frequency_encoding(learned(9, 3), 4, True))
-    back(encodings.contract_to_unit(learned(9, 3), torch.rand(2, 3)))
-    back(intervals.interval_weights(learned(5, 9), torch.rand(5, 10)))
-    intervals.resample(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5), 7, 0.5, 0.01)
-    back(intervals.proposal_excess(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5, 8), learned(5, 7)))
+    back(planes_triton.planes(learned(9, 3), learned(layout.num_entries, 6), layout, None))
+    encodings_triton.spherical_harmonics(torch.rand(9, 3), 4)
+    back(encodings_triton.frequency_encoding(learned(9, 3), 4, True))
+    back(encodings_triton.contract_to_unit(learned(9, 3), torch.rand(2, 3)))
+    back(intervals_triton.interval_weights(learned(5, 9), torch.rand(5, 10)))
+    intervals_triton.resample(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5), 7, 0.5, 0.01)
+    back(intervals_triton.proposal_excess(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5, 8), learned(5, 7)))
     for found_inf in (None, torch.rand(())):
-        adam.sparse_adam(*torch.rand(4, 9, 2), torch.rand(9), 0.01, (0.9, 0.99), 1e-15, found_inf)
-    back(ssim.photometric_loss(learned(13, 15, 3), torch.rand(13, 15, 3), 0.2))
+        adam_triton.sparse_adam(*torch.rand(4, 9, 2), torch.rand(9), 0.01, (0.9, 0.99), 1e-15, found_inf)
+    back(ssim_triton.photometric_loss(learned(13, 15, 3), torch.rand(13, 15, 3), 0.2))
     gaussians()
     marching()
 
@@ -103,17 +97,17 @@ def gaussians() -> None:
         pose = torch.eye(3, 4, requires_grad=antialiased)
         view = replace(camera, pose=pose, antialiased=antialiased)
         leaves = [row.clone().requires_grad_() for row in (*rows, torch.rand(20, 3, count))]
-        back(splat_project.project_gaussians(*leaves, view, count)[0])
+        back(project_triton.project_gaussians(*leaves, view, count)[0])
     records = project_reference(*rows, torch.zeros(20, 3, 0), camera, 0)[0]
     lists = tile_lists_reference(records, 37, 30)
     for channels in (3, 4):
         shown = records.clone().requires_grad_()
-        back(*splat_blend.blend(shown, lists, 37, 30, torch.rand(3), channels, False)[:2])
-    splat_blend.blend(records, lists, 37, 30, torch.rand(3), 7, True)
+        back(*blend_triton.blend(shown, lists, 37, 30, torch.rand(3), channels, False)[:2])
+    blend_triton.blend(records, lists, 37, 30, torch.rand(3), 7, True)
     counts, keys = torch.zeros(20, dtype=torch.int32), torch.zeros(9, dtype=torch.int64)
     for given in ((counts, None, None, None), (None, keys, keys, counts)):
-        launch.launch(
-            splat_tiles._list, (1,), records, records[:, 0].contiguous(), *given, 20, 3, 2, BLOCK=32, num_warps=1
+        triton_launch.launch(
+            tiles_triton._list, (1,), records, records[:, 0].contiguous(), *given, 20, 3, 2, BLOCK=32, num_warps=1
         )
 
 
@@ -122,15 +116,15 @@ def marching() -> None:
         return torch.arange(len(counts) + 1) * 4
 
     for cone, shift in ((0.0, None), (1 / 64, torch.rand(33))):
-        marched = march.TritonMarch(random_rays(33), occupancy(8, 0.5), 0.1, cone, shift, 0.01)
-        with patch.object(march.functional, "pad", four_each):
+        marched = waves_triton.TritonMarch(random_rays(33), occupancy(8, 0.5), 0.1, cone, shift, 0.01)
+        with patch.object(waves_triton.functional, "pad", four_each):
             wave = marched.wave(4)
         assert wave is not None
         marched.advance(torch.ones(len(wave.owners)))
     nothing = partial(share_out, torch.zeros(33, dtype=torch.int64))
-    with patch.object(fixed_march, "share_out", lambda counts, capacity: nothing(capacity)):  # nothing was counted
-        filled = fixed_march.fill(random_rays(33), occupancy(8, 0.5), 0.1, 30, torch.rand(33), (0, 512))
-    fixed_march.reach(filled.placed, torch.rand(512), 4.6, 30)
+    with patch.object(fixed_slots, "share_out", lambda counts, capacity: nothing(capacity)):  # nothing was counted
+        filled = fixed_slots_triton.fill(random_rays(33), occupancy(8, 0.5), 0.1, 30, torch.rand(33), (0, 512))
+    fixed_slots_triton.reach(filled.placed, torch.rand(512), 4.6, 30)
 
 
 if __name__ == "__main__":

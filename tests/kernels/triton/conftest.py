@@ -4,10 +4,10 @@ import importlib.util
 
 import torch
 
-from nerfloom.kernels import triton_kernels
-from nerfloom.tools.benchmarks.kernel_errors import faster_interpreter
+from nerfloom.benchmarks.kernel_errors import faster_interpreter
+from nerfloom.kernels import triton_backend
 
-if importlib.util.find_spec("triton") is None or not (triton_kernels.INTERPRETED or torch.cuda.is_available()):
+if importlib.util.find_spec("triton") is None or not (triton_backend.INTERPRETED or torch.cuda.is_available()):
     collect_ignore_glob = ["test_*.py"]
-elif triton_kernels.INTERPRETED:
+elif triton_backend.INTERPRETED:
     faster_interpreter()

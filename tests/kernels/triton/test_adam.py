@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.adam import sparse_adam
+from nerfloom.kernels.adam.adam import sparse_adam
 from tests.kernels.triton.compared import compare
 
 

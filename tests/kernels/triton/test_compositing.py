@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.alpha import composite_alpha
-from nerfloom.kernels.compositing import composite, distortion
+from nerfloom.kernels.compositing.alpha import composite_alpha
+from nerfloom.kernels.compositing.density import composite, distortion
 from tests.kernels.triton.compared import compare
 
 

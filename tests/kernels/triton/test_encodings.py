@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from nerfloom.kernels.contraction import contract_to_unit
-from nerfloom.kernels.frequency import frequency_encoding
-from nerfloom.kernels.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.encodings.contraction import contract_to_unit
+from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from tests.kernels.triton.compared import compare
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

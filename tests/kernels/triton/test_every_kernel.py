@@ -1,7 +1,7 @@
 """Every operation that Triton has, at random, extreme and no inputs: what `ns-bench gpu` prints."""
 
-from nerfloom.tools.benchmarks.kernel_cases import KINDS
-from nerfloom.tools.benchmarks.kernel_errors import as_table, measured
+from nerfloom.benchmarks.kernel_cases import KINDS
+from nerfloom.benchmarks.kernel_errors import as_table, measured
 from tests.kernels.triton.compared import DEVICE
 
 LARGEST = 1e-5

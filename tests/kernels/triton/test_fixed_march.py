@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerfloom.kernels.fixed_march import Placed, Slots, fill, fill_reference, reach, reach_reference, share_out
+from nerfloom.kernels.march.fixed_slots import Placed, Slots, fill, fill_reference, reach, reach_reference, share_out
 from tests.kernels.test_fixed_march import ROOMY, SIZE, STEPS, of_rays
 from tests.kernels.test_march import occupancy, random_rays
 from tests.kernels.triton.compared import DEVICE, backends

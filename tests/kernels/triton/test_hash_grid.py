@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.hash_grid import HashGridLayout, hash_grid
+from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid
 from tests.kernels.triton.compared import compare
 
 GRID = HashGridLayout.build(2, 4, 40, 8)  # a dense level and a hashed one

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.intervals import interval_weights, proposal_excess, resample
+from nerfloom.kernels.histograms.intervals import interval_weights, proposal_excess, resample
 from tests.kernels.triton.compared import compare
 
 

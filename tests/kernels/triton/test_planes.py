@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerfloom.kernels.planes import PlanesLayout, planes
+from nerfloom.kernels.grids.planes import PlanesLayout, planes
 from tests.kernels.triton.compared import compare
 
 LAYOUTS = {

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splat_blend import blend
-from nerfloom.kernels.splat_project import CUT, REACH_X, RGB, SplatCamera, project_gaussians, project_reference
-from nerfloom.kernels.splat_tiles import TileLists, tile_lists, tile_lists_reference
+from nerfloom.kernels.splats.blend import blend
+from nerfloom.kernels.splats.project import CUT, REACH_X, RGB, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
 from tests.kernels.splat_truth import camera, growth_error, scene
 from tests.kernels.test_splat_lists import check, needed
 from tests.kernels.triton.compared import DEVICE, compare
@@ -162,7 +162,7 @@ def test_extremes_of_blending() -> None:
 @pytest.mark.parametrize("size", [(37, 41), (60, 20)])
 def test_growth_is_by_the_pixels_absolute_gradients(size: tuple[int, int]) -> None:
     """As on the other backends: tests/kernels/test_growth.py."""
-    from nerfloom.kernels.triton_kernels.splat_blend import blend as triton_blend
+    from nerfloom.kernels.splats.blend_triton import blend as triton_blend
 
     torch.manual_seed(5)
     assert growth_error(triton_blend, scene(80), camera(*size), DEVICE) < 1e-5

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from nerfloom.kernels.ssim import photometric_loss, ssim
+from nerfloom.kernels.images.ssim import photometric_loss, ssim
 from tests.kernels.triton.compared import compare
 
 

@@ -217,7 +217,7 @@ BUGS = (
     Bug(
         "written-lens-exchanged",
         "lenses",
-        "framework/tools/processing/transforms.py",
+        "framework/processing/transforms.py",
         '"OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")',
         '"OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "p1", "k2", "p2")',
         "ns-process-data writes COLMAP's second radial coefficient as the first tangential one",
@@ -225,7 +225,7 @@ BUGS = (
     Bug(
         "written-fisheye-loses-k4",
         "lenses",
-        "framework/tools/processing/transforms.py",
+        "framework/processing/transforms.py",
         'kind, distortion = model, ("k1", "k2", "k3", "k4")',
         'kind, distortion = model, ("k1", "k2", "k3")',
         "ns-process-data drops the last coefficient of a fisheye lens",
@@ -273,7 +273,7 @@ BUGS = (
     Bug(
         "crop-moves-nothing",
         "lenses",
-        "framework/tools/processing/phone.py",
+        "framework/processing/phone.py",
         '("cx", crop), ("cy", crop)',
         '("cx", 0), ("cy", 0)',
         "cropped images of ns-process-data polycam have a principal point that is off by the border",
@@ -445,7 +445,7 @@ BUGS = (
     Bug(
         "opaque-alpha-of-masks",
         "masks",
-        "framework/data/pixels.py",
+        "framework/data/pixels/batch.py",
         "torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)",
         "rgb, opaque * (1.0 if alpha is None else alpha)",
         "what masks cut away keeps its colour in training",
@@ -470,7 +470,7 @@ BUGS = (
     Bug(
         "premultiplied-composite",
         "colours",
-        "framework/data/pixels.py",
+        "framework/data/pixels/batch.py",
         "return rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:])",
         "return rgba[..., :3] + background * (1 - rgba[..., 3:])",
         "photographs with alpha are taken for premultiplied when judged",
@@ -486,7 +486,7 @@ BUGS = (
     Bug(
         "training-background-white",
         "colours",
-        "framework/data/pixels.py",
+        "framework/data/pixels/batch.py",
         'return "random" if has_alpha else "black"',
         'return "white" if has_alpha else "black"',
         "fog of the background's colour is never punished",
@@ -502,7 +502,7 @@ BUGS = (
     Bug(
         "cache-ignores-changes",
         "data",
-        "framework/data/pixel_cache.py",
+        "framework/data/pixels/cache.py",
         "identity = (str(file.resolve()), stat.st_size, stat.st_mtime_ns)",
         "identity = (str(file.resolve()),)",
         "photographs that were edited are read as they were when first decoded",

@@ -118,7 +118,7 @@ BUGS = (
     Bug(
         "contraction-slope",
         "contraction",
-        "framework/kernels/contraction.py",
+        "framework/kernels/encodings/contraction.py",
         "return contract((positions - centre) / half) / 4 + 0.5",
         "return contract((positions - centre) / half) / 2 + 0.5",
         "without compiled kernels, space outside the box falls out of the encoding",
@@ -126,7 +126,7 @@ BUGS = (
     Bug(
         "contraction-centre",
         "contraction",
-        "framework/kernels/contraction.py",
+        "framework/kernels/encodings/contraction.py",
         "centre, scale = (box[0] + box[1]) / 2, 2 / (box[1] - box[0])",
         "centre, scale = torch.zeros_like(box[0]), 2 / (box[1] - box[0])",
         "of a box that is not around the origin, space is contracted around the wrong place",
@@ -150,7 +150,7 @@ BUGS = (
     Bug(
         "first-shared-whole-steps",
         "sampling",
-        "framework/kernels/first_shared.py",
+        "framework/kernels/march/first_shared.py",
         "LEVELS, CELLS, STEPS, REACH, PARTS,",
         "LEVELS, CELLS, STEPS, REACH, 1,",
         "rays of captures start up to a step behind what images do show",
@@ -158,7 +158,7 @@ BUGS = (
     Bug(
         "disparity-of-far",
         "contraction",
-        "framework/kernels/spacing.py",
+        "framework/kernels/histograms/spacing.py",
         "return scale * from_disparity(torch.lerp(near, far, edges))",
         "return from_disparity(torch.lerp(near, far, edges))",
         "rays of a large or small box are sampled at other distances than their ends say",
@@ -174,7 +174,7 @@ BUGS = (
     Bug(
         "march-map-two-axes",
         "marching",
-        "framework/kernels/occupancy.py",
+        "framework/kernels/march/occupancy.py",
         "    for axis in range(1, 4):\n        out = grid.clone()",
         "    for axis in range(1, 3):\n        out = grid.clone()",
         "without compiled kernels, rays along z pass through thin things",
@@ -182,7 +182,7 @@ BUGS = (
     Bug(
         "march-run-too-short",
         "marching",
-        "framework/kernels/march.py",
+        "framework/kernels/march/waves.py",
         "reach = occupancy.near(math.ceil((RUN - 1) / 2 * step / occupancy.edge))",
         "reach = occupancy.near(int((RUN - 1) / 2 * step / occupancy.edge))",
         "without compiled kernels, rays pass over cells at the ends of runs",
@@ -190,7 +190,7 @@ BUGS = (
     Bug(
         "march-one-wave-unstopped",
         "marching",
-        "framework/kernels/march.py",
+        "framework/kernels/march/waves.py",
         "order, offsets, self.longest = _chosen(self.reached[0] > 0, self.owners, len(self.rays))",
         "order, offsets, self.longest = _chosen(self.reached[0] >= 0, self.owners, len(self.rays))",
         "on a GPU hidden samples are kept and learnt from, at several times the cost",
@@ -198,7 +198,7 @@ BUGS = (
     Bug(
         "padded-sum-inclusive",
         "compositing",
-        "framework/kernels/compositing.py",
+        "framework/kernels/compositing/density.py",
         ".index_copy_(0, slots + 1, values)",
         ".index_copy_(0, slots, values)",
         "on a GPU each sample hides itself: surfaces are dark",
@@ -206,7 +206,7 @@ BUGS = (
     Bug(
         "march-cell-order",
         "marching",
-        "framework/kernels/occupancy.py",
+        "framework/kernels/march/occupancy.py",
         "return (x * self.resolution + y) * self.resolution + z",
         "return (z * self.resolution + y) * self.resolution + x",
         "without compiled kernels, the grid is looked at with x and z exchanged",
@@ -214,7 +214,7 @@ BUGS = (
     Bug(
         "nested-middle-half-filled",
         "marching",
-        "framework/kernels/occupancy.py",
+        "framework/kernels/march/occupancy.py",
         "= any_y[..., 0::2] | any_y[..., 1::2]",
         "= any_y[..., 0::2]",
         "rays that come from larger boxes pass over things in the smaller ones",
@@ -222,7 +222,7 @@ BUGS = (
     Bug(
         "nested-rest-of-all",
         "marching",
-        "framework/kernels/march.py",
+        "framework/kernels/march/waves.py",
         "owners = (~(self.spent >= self.budget)).nonzero().squeeze(-1)",
         "owners = (~(self.spent > math.inf)).nonzero().squeeze(-1)",
         "the sky is evaluated behind walls",
@@ -238,7 +238,7 @@ BUGS = (
     Bug(
         "march-shift-outside",
         "marching",
-        "framework/kernels/march.py",
+        "framework/kernels/march/waves.py",
         "first = enter if shift is None else enter - shift * step",
         "first = enter if shift is None else enter + shift * step",
         "without compiled kernels, training never sees the first step behind the box's face",
@@ -318,7 +318,7 @@ BUGS = (
     Bug(
         "slices-late",
         "occupancy",
-        "framework/kernels/occupancy.py",
+        "framework/kernels/march/occupancy.py",
         "return (times * self.slices).long().clamp(0, self.slices - 1)",
         "return (times * self.slices).round().long().clamp(0, self.slices - 1)",
         "half of the rays of a moving scene skip what is empty at another time",
@@ -366,7 +366,7 @@ BUGS = (
     Bug(
         "grid-mean-of-nan",
         "occupancy",
-        "framework/kernels/occupancy.py",
+        "framework/kernels/march/occupancy.py",
         "occupied.copy_(~(alpha < least))",
         "occupied.copy_(alpha >= least)",
         "without compiled kernels, a broken field's cells are skipped, and NaN is hidden",
@@ -422,7 +422,7 @@ BUGS = (
     Bug(
         "median-of-first",
         "rendering",
-        "framework/kernels/compositing.py",
+        "framework/kernels/compositing/density.py",
         "crossing = torch.where(transmittance - weights <= 0.5",
         "crossing = torch.where(transmittance <= 0.5",
         "without compiled kernels, depth is a sample too far",
@@ -518,7 +518,7 @@ BUGS = (
     Bug(
         "blurred-twice-as-wide",
         "proposals",
-        "framework/kernels/step_functions.py",
+        "framework/kernels/histograms/step_functions.py",
         "second_integral(x + radius) - second_integral(x - radius)) / (2 * radius)",
         "second_integral(x + 2 * radius) - second_integral(x - 2 * radius)) / (4 * radius)",
         "proposals spread over what is empty",

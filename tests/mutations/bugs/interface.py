@@ -6,7 +6,7 @@ BUGS = (
     Bug(
         "opaque-alpha-learns-nothing",
         "interface",
-        "framework/kernels/alpha.py",
+        "framework/kernels/compositing/alpha.py",
         "alpha - (alpha - alpha.clamp(max=most)).detach()",
         "alpha.clamp(max=most)",
         "a surface that has become opaque can never become transparent again",
@@ -14,7 +14,7 @@ BUGS = (
     Bug(
         "alpha-without-distances",
         "interface",
-        "framework/kernels/alpha.py",
+        "framework/kernels/compositing/alpha.py",
         "t_ends=torch.ones_like(t), points=t)",
         "t_ends=torch.ones_like(t), points=None)",
         "the depth of every surface is 0.5",

@@ -118,7 +118,7 @@ BUGS = (
     Bug(
         "adam-no-bias-correction",
         "optimiser",
-        "framework/kernels/adam.py",
+        "framework/kernels/adam/adam.py",
         "values[rows] -= rate * unbias1 * mean[rows]",
         "values[rows] -= rate * mean[rows]",
         "without compiled kernels, entries that are seldom used hardly move",
@@ -142,7 +142,7 @@ BUGS = (
     Bug(
         "masked-adam-moves-all",
         "optimiser",
-        "framework/kernels/adam.py",
+        "framework/kernels/adam/adam.py",
         "values.addcdiv_(mean * (unbias1 * used) * -rate, torch.where",
         "values.addcdiv_(mean * unbias1 * -rate, torch.where",
         "on a GPU entries of tables move on in steps that do not use them",
@@ -166,7 +166,7 @@ BUGS = (
     Bug(
         "error-weights-lost",
         "drawing",
-        "framework/data/error_map.py",
+        "framework/data/pixels/error_map.py",
         "return selected, 1 / share[selected]",
         "return selected, torch.ones_like(share[selected])",
         "--draw-by-error minimises another loss than was asked for",
@@ -174,7 +174,7 @@ BUGS = (
     Bug(
         "drawn-from-all",
         "drawing",
-        "framework/data/pixels.py",
+        "framework/data/pixels/batch.py",
         "    if dataset.drawn is None:\n        return torch.randint(len(dataset.pixels)",
         "    if True:\n        return torch.randint(len(dataset.pixels)",
         "pixels that masks ignore are learnt from",
@@ -214,7 +214,7 @@ BUGS = (
     Bug(
         "last-pixel-never",
         "drawing",
-        "framework/data/pixels.py",
+        "framework/data/pixels/batch.py",
         "return dataset.drawn.at(torch.randint(len(dataset.drawn), (count,), device=device))",
         "return dataset.drawn.at(torch.randint(max(len(dataset.drawn) // 2, 1), (count,), device=device))",
         "of masked photographs only the first half is learnt from",

@@ -7,7 +7,7 @@ BUGS = (
     Bug(
         "less-is-better-turned",
         "comparison",
-        "framework/tools/comparison/report.py",
+        "framework/comparison/report.py",
         'Column("rendering, s/image", "render_seconds", "{:.2f}".format, min)',
         'Column("rendering, s/image", "render_seconds", "{:.2f}".format, max)',
         "the slowest renderer is shown in bold",
@@ -15,7 +15,7 @@ BUGS = (
     Bug(
         "lpips-more-is-better",
         "comparison",
-        "framework/tools/comparison/report.py",
+        "framework/comparison/report.py",
         'Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min)',
         'Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, max)',
         "the worst LPIPS is shown in bold",
@@ -23,7 +23,7 @@ BUGS = (
     Bug(
         "memory-more-is-better",
         "comparison",
-        "framework/tools/comparison/report.py",
+        "framework/comparison/report.py",
         'f"{value / 2**30:.2f}", min)',
         'f"{value / 2**30:.2f}", max)',
         "the hungriest method is shown in bold",
@@ -31,7 +31,7 @@ BUGS = (
     Bug(
         "repeats-repeat-nothing",
         "comparison",
-        "framework/tools/comparison/plan.py",
+        "framework/comparison/plan.py",
         '"--machine.seed", str(self.seed)]\n        flags += ["--output-dir"',
         '"--machine.seed", str(FIRST_SEED)]\n        flags += ["--output-dir"',
         "all repeats have one seed: their deviation is noise of the clock",
@@ -39,7 +39,7 @@ BUGS = (
     Bug(
         "seeds-of-one",
         "comparison",
-        "framework/tools/comparison/plan.py",
+        "framework/comparison/plan.py",
         "seeds = range(FIRST_SEED, FIRST_SEED + self.repeats)",
         "seeds = range(FIRST_SEED, FIRST_SEED + 1)",
         "--repeats 3 runs once",
@@ -47,7 +47,7 @@ BUGS = (
     Bug(
         "contender-flags-first",
         "comparison",
-        "framework/tools/comparison/plan.py",
+        "framework/comparison/plan.py",
         "return [*start, self.contender.method, *flags, *self.contender.flags, *c.data_flags]",
         "return [*start, self.contender.method, *self.contender.flags, *flags, *c.data_flags]",
         "a contender's own flags do not count where the comparison says something, too",
@@ -55,7 +55,7 @@ BUGS = (
     Bug(
         "deviation-of-mean",
         "comparison",
-        "framework/tools/comparison/measures.py",
+        "framework/comparison/measures.py",
         "return None if len(values) < 2 or None in values else stdev(values)",
         "return None if len(values) < 2 or None in values else stdev(values) / len(values)",
         "the deviation of a run is shown smaller than it is",
@@ -63,7 +63,7 @@ BUGS = (
     Bug(
         "pareto-costly",
         "comparison",
-        "framework/tools/comparison/measures.py",
+        "framework/comparison/measures.py",
         "no_costlier = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]",
         "no_costlier = [(c, q) for c, q in points if c >= cost * (1 - SAME_TIME)]",
         "what is beaten by something cheaper and better is starred",
@@ -71,7 +71,7 @@ BUGS = (
     Bug(
         "levels-from-last-point",
         "comparison",
-        "framework/tools/comparison/measures.py",
+        "framework/comparison/measures.py",
         "reached[level] = t0 + (t1 - t0) * (level - p0) / (p1 - p0)",
         "reached[level] = t1",
         "seconds to a PSNR are those of the next evaluation",
@@ -79,7 +79,7 @@ BUGS = (
     Bug(
         "fps-as-seconds",
         "comparison",
-        "framework/tools/comparison/measures.py",
+        "framework/comparison/measures.py",
         'render_seconds=1 / results["fps"],',
         'render_seconds=results["fps"],',
         "images a second are shown as seconds an image",
@@ -87,7 +87,7 @@ BUGS = (
     Bug(
         "eval-on-other-views",
         "comparison",
-        "framework/tools/comparison/plan.py",
+        "framework/comparison/plan.py",
         "if conditions.max_eval_images is not None:\n            command +=",
         "if conditions.curve_images is not None:\n            command +=",
         "ns-compare's final evaluation fails or is over other views than asked for",
@@ -95,7 +95,7 @@ BUGS = (
     Bug(
         "interrupted-counts-as-done",
         "comparison",
-        "framework/tools/comparison/runner.py",
+        "framework/comparison/runner.py",
         'or summary.get("interrupted") is not False or',
         "or",
         "a run that was stopped half way is compared with whole ones",
@@ -103,7 +103,7 @@ BUGS = (
     Bug(
         "crop-least-wrong",
         "comparison",
-        "framework/tools/comparison/crops.py",
+        "framework/comparison/crops.py",
         "inside.argmax()",
         "inside.argmin()",
         "the report shows crops where nothing is wrong",
@@ -524,7 +524,7 @@ BUGS = (
     Bug(
         "colmap-frame-twice",
         "process-data",
-        "framework/tools/processing/pipeline.py",
+        "framework/processing/pipeline.py",
         "points = model.points @ transforms.Z_UP[:, :3].T",
         "points = model.points",
         "sparse points lie in another frame than the cameras",
@@ -532,7 +532,7 @@ BUGS = (
     Bug(
         "opengl-axes-written",
         "process-data",
-        "framework/tools/processing/transforms.py",
+        "framework/processing/transforms.py",
         "pose[:3, :3] = rotation.T * [1, -1, -1]",
         "pose[:3, :3] = rotation.T",
         "cameras of ns-process-data look backwards",
@@ -540,7 +540,7 @@ BUGS = (
     Bug(
         "applied-transform-identity",
         "process-data",
-        "framework/tools/processing/polycam.py",
+        "framework/processing/polycam.py",
         "write_folder(images, chosen, output, num_downscales, Z_UP, crop)",
         "write_folder(images, chosen, output, num_downscales, np.eye(4)[:3], crop)",
         "exports of a Polycam capture come out in another frame than Polycam's",
@@ -548,7 +548,7 @@ BUGS = (
     Bug(
         "record3d-own-intrinsics",
         "process-data",
-        "framework/tools/processing/record3d.py",
+        "framework/processing/record3d.py",
         "each = [(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])] * count",
         "each = [(matrix[0, 0], matrix[1, 1], matrix[2, 0], matrix[2, 1])] * count",
         "Record3D's principal point is written as 0, 0",
@@ -556,7 +556,7 @@ BUGS = (
     Bug(
         "record3d-transposed-rotation",
         "process-data",
-        "framework/tools/processing/record3d.py",
+        "framework/processing/record3d.py",
         "return np.array(rows).transpose(2, 0, 1)",
         "return np.array(rows).transpose(2, 1, 0)",
         "Record3D's cameras are turned the other way",
@@ -564,7 +564,7 @@ BUGS = (
     Bug(
         "exif-turn-inverted",
         "process-data",
-        "framework/tools/processing/images.py",
+        "framework/processing/images.py",
         "6: Image.Transpose.ROTATE_270",
         "6: Image.Transpose.ROTATE_90",
         "upright photographs of phones come out head down",
@@ -572,7 +572,7 @@ BUGS = (
     Bug(
         "pyramid-masks-grey",
         "process-data",
-        "framework/tools/processing/pyramid.py",
+        "framework/processing/pyramid.py",
         "lambda value: 255 if value == 255 else 0",
         "lambda value: 255 if value > 0 else 0",
         "reduced masks keep pixels that are partly hidden",
@@ -580,7 +580,7 @@ BUGS = (
     Bug(
         "blurred-frames-chosen",
         "process-data",
-        "framework/tools/processing/frame_choice.py",
+        "framework/processing/frame_choice.py",
         "order = np.lexsort((np.arange(len(groups)), -sharpnesses, groups))",
         "order = np.lexsort((np.arange(len(groups)), sharpnesses, groups))",
         "the most blurred frame of each interval is taken",
@@ -588,7 +588,7 @@ BUGS = (
     Bug(
         "frames-resampled",
         "process-data",
-        "framework/tools/processing/ffmpeg.py",
+        "framework/processing/ffmpeg.py",
         'return ["-fps_mode" if b"fps_mode" in known else "-vsync", "passthrough"]',
         'return ["-fps_mode" if b"fps_mode" in known else "-vsync", "cfr"]',
         "frames of a video with uneven times are repeated and left out",
@@ -596,7 +596,7 @@ BUGS = (
     Bug(
         "frames-by-number",
         "process-data",
-        "framework/tools/processing/video.py",
+        "framework/processing/video.py",
         "frame_choice.intervals(times[fresh], target)",
         "frame_choice.intervals(fresh, target)",
         "slow parts of a video with uneven times have too few frames",
@@ -604,7 +604,7 @@ BUGS = (
     Bug(
         "dark-photographs-as-they-are",
         "process-data",
-        "framework/tools/processing/contrast.py",
+        "framework/processing/contrast.py",
         "return images\n    middle",
         "return images\n    target = images\n    middle",
         "photographs that are stretched for features are what is trained on",
@@ -612,7 +612,7 @@ BUGS = (
     Bug(
         "turned-cameras-unseen",
         "process-data",
-        "framework/tools/processing/parallax.py",
+        "framework/processing/parallax.py",
         "turned[:, :2] / ahead * focal - second",
         "turned[:, :2] / ahead - second",
         "a panorama passes for a capture",
@@ -620,7 +620,7 @@ BUGS = (
     Bug(
         "resumed-with-other-photographs",
         "process-data",
-        "framework/tools/processing/unfinished.py",
+        "framework/processing/unfinished.py",
         "[stat.st_size, stat.st_mtime_ns]",
         "[stat.st_size]",
         "features of photographs that were exchanged are kept",
@@ -628,7 +628,7 @@ BUGS = (
     Bug(
         "mask-of-other-name-written",
         "process-data",
-        "framework/tools/processing/transforms.py",
+        "framework/processing/transforms.py",
         'entry["mask_path"] = f"masks/{frame.mask}"',
         'entry["mask_path"] = f"images/{frame.mask}"',
         "masks named in transforms.json are not there",
@@ -636,7 +636,7 @@ BUGS = (
     Bug(
         "crop-size-only-once",
         "process-data",
-        "framework/tools/processing/phone.py",
+        "framework/processing/phone.py",
         '(("w", 2 * crop), ("h", 2 * crop)',
         '(("w", crop), ("h", crop)',
         "ns-process-data polycam refuses its own pictures",

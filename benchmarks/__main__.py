@@ -1,0 +1,258 @@
+"""The benchmarks behind the documents: python -m benchmarks WHAT, from the root of the repository."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from benchmarks.flags import (
+    AblationFlags,
+    CacheFlags,
+    ContentionFlags,
+    CurvesFlags,
+    MeshFlags,
+    OperationsFlags,
+    PoseRefinementFlags,
+    PosesFlags,
+    ProcessesFlags,
+    QuadratureFlags,
+    StartsFlags,
+    TablesFlags,
+    ViewerBenchFlags,
+)
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.base.extras import install_command
+from nerfloom.cli.bench_results import write_results
+from nerfloom.cli.common import check_weights, chosen_kind, make_room, run_command
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import check_data, trained_run
+
+USAGE = """\
+usage: python -m benchmarks WHAT [flags]
+
+  quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
+  curves           PSNR against seconds of every method: a run for each of several budgets and seeds, in one picture
+  tables           rows of published tables, each a run judged on every held-out image; goes on where it was stopped
+  ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
+  starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
+  processes        time to each PSNR with one process and with several, started by torchrun, on the same cores
+  operations       operations of torch and waits for the device in a training step without compiled kernels
+  contention       speed of training and rendering beside other programs
+  cache            memory and speed with a large image set under --cache-limit, and with a small one in memory
+  poses            differences between poses from ns-process-data and from a COLMAP model of the same images
+  pose-refinement  effect of refining camera poses, on the embedded scene with disturbed training poses
+  meshes           distance of exported meshes from the exact surface or from sparse points; their time and memory
+  viewer           times of the viewer's first picture, of pictures of a moving camera, and of the finished picture
+
+python -m benchmarks WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or
+to --output-dir or --output; poses prints them.
+"""
+
+
+def main() -> None:
+    """Run a benchmark on the arguments of the process."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
+        return
+    name, (flags, run), rest = chosen
+    settings = read_flags(flags, f"python -m benchmarks {name}", rest)
+    if getattr(settings, "data", None) is not None:
+        check_data(settings.data)
+    run(settings)
+
+
+def _quadrature(flags: QuadratureFlags) -> None:
+    from benchmarks.quadrature import main as quadrature
+
+    flags.output_dir.mkdir(parents=True, exist_ok=True)
+    quadrature(flags.output_dir / "quadrature.json", flags.plot_dir, flags.quick, flags.seed)
+
+
+def _curves(flags: CurvesFlags) -> None:
+    from benchmarks import curves
+    from nerfloom.base.console import console
+    from nerfloom.comparison import plots
+
+    name = "procedural" if flags.data is None else flags.data.resolve().name
+    folder = flags.run_dir or Path("outputs") / f"curves-{name}"
+    path, picture = flags.output_dir / f"curves-{name}.json", flags.plot_dir / f"curves-{name}.svg"
+    plans = curves.plans(flags.methods, flags.data, flags.budgets, flags.seeds, flags.views, folder)
+    make_room(path)
+    make_room(picture)
+    found: list[curves.Budget] = []
+    for plan in plans:  # results and picture after every budget, so that there is something to look at early
+        found.append(curves.run(plan))
+        write_results(path, curves.published(plan, found))
+        if plots.available():
+            picture.write_text(curves.draw(plan, found), encoding="utf-8")
+        console.print(curves.table(plan, found))
+    say(f"picture: {picture}" if plots.available() else plots.MISSING)
+    failed = sorted({row.label for budget in found for row in budget.rows if row.failures})
+    if failed:
+        raise ConfigError(f"runs of these methods failed: {', '.join(failed)}; {path} says why")
+
+
+def _tables(flags: TablesFlags) -> None:
+    """Run what is missing, or list or print what there is.
+
+    Args:
+        flags: the flags of the command.
+
+    Raises:
+        ConfigError: if a table cannot be read, or a row failed.
+    """
+    from benchmarks.table_text import listing, markdown
+    from benchmarks.tables import read_table, run_rows
+
+    if not flags.seconds_scale > 0:
+        raise FlagError(f"--seconds-scale is {flags.seconds_scale}; it must be more than 0")
+    try:
+        wanted = re.compile(flags.only)
+    except re.error as error:
+        raise FlagError(f"--only {shown(flags.only)} is no regular expression: {error}") from error
+    check_weights(flags.lpips_weights)
+    tables = [
+        read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale, flags.lpips_weights)
+        for path in flags.tables
+    ]
+    if flags.show == "markdown":
+        print("\n\n".join(markdown(table, flags.output_dir, wanted) for table in tables))
+        return
+    named = {row.name: row for table in tables for row in table.rows}  # tables may share rows
+    rows = [row for row in named.values() if wanted.search(row.name)]
+    if not rows:
+        raise FlagError(f"--only {shown(flags.only)}: no row has such a name; --show rows lists them")
+    if flags.show == "rows":
+        print(listing(rows, flags.output_dir))
+        return
+    make_room(flags.output_dir / f"{rows[0].name}.json")
+    failures = run_rows(rows, flags.data_root, flags.output_dir)
+    say(f"{len(rows) - len(failures)} of {len(rows)} rows are in {flags.output_dir}")
+    if failures:
+        raise ConfigError(f"{len(failures)} rows failed, first {next(iter(failures))}: {next(iter(failures.values()))}")
+
+
+def _ablation(flags: AblationFlags) -> None:
+    from benchmarks.ablation import measure
+
+    path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
+    make_room(path)
+    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+
+
+def _starts(flags: StartsFlags) -> None:
+    from benchmarks.starts import measure
+
+    path = flags.output_dir / f"starts-{flags.data.resolve().name}.json"
+    make_room(path)
+    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
+
+
+def _processes(flags: ProcessesFlags) -> None:
+    """Measure, and write the results.
+
+    Args:
+        flags: the flags of the command.
+    """
+    from benchmarks.processes import measure
+
+    path = flags.output_dir / f"processes-{flags.data.resolve().name}.json"
+    make_room(path)
+    write_results(path, measure(flags.data, flags.processes, flags.seconds, flags.seeds, flags.samples, flags.targets))
+
+
+def _operations(flags: OperationsFlags) -> None:
+    os.environ["NERFLOOM_KERNELS"] = "reference"  # which is read when kernels are first asked for
+    from benchmarks.operations import METHODS, measure
+
+    make_room(flags.output)
+    write_results(flags.output, measure(flags.methods or METHODS, flags.before, flags.steps))
+
+
+def _contention(flags: ContentionFlags) -> None:
+    from benchmarks.contention import WORK, measure
+
+    make_room(flags.output)
+    write_results(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
+
+
+def _cache(flags: CacheFlags) -> None:
+    from benchmarks.cache import measure
+
+    make_room(flags.output)
+    size = (flags.width, flags.height)
+    write_results(flags.output, measure(flags.images, size, flags.seconds, flags.limit, flags.folder))
+
+
+def _poses(flags: PosesFlags) -> None:
+    from benchmarks.poses import compare
+
+    print(json.dumps(compare(flags.processed, flags.model), indent=2))
+
+
+def _pose_refinement(flags: PoseRefinementFlags) -> None:
+    from benchmarks.pose_refinement import measure
+
+    path = flags.output_dir / "pose-refinement.json"
+    make_room(path)
+    write_results(path, measure(flags.method, flags.seconds, flags.degrees, flags.percent))
+
+
+def _meshes(flags: MeshFlags) -> None:
+    if (advice := install_command("export")) is not None:
+        raise ConfigError(f"python -m benchmarks meshes needs packages that are not installed: {advice}")
+    from benchmarks.meshes import measure
+
+    make_room(flags.output)
+    run = None if flags.load_config is None else trained_run(flags.load_config).parent
+    write_results(flags.output, measure(run, flags.seconds, flags.exports, flags.resolutions))
+
+
+def _viewer(flags: ViewerBenchFlags) -> None:
+    import dataclasses
+
+    import torch
+
+    from benchmarks.viewer import measured
+    from nerfloom.training.machine import machine
+
+    if not flags.runs or not all(width >= 8 for width in flags.widths):
+        raise FlagError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
+    make_room(flags.output_dir / "viewer.json")
+    rows = [measured(run, width, width, flags.pictures) for run in flags.runs for width in flags.widths]
+    for row in rows:
+        say(
+            f"{row.method} {row.width}x{row.height}: first {row.first:.3f} s, moving {1e3 * row.coarse:.0f} ms "
+            f"(at most {1e3 * row.slowest:.0f}, stride {row.stride}, {row.per_second:.1f} a second), "
+            f"finished {row.finished:.2f} s"
+        )
+    content = {"machine": machine(torch.device("cpu")), "pictures": [dataclasses.asdict(row) for row in rows]}
+    write_results(flags.output_dir / "viewer.json", content)
+
+
+KINDS: dict[str, tuple[type, Any]] = {
+    "quadrature": (QuadratureFlags, _quadrature),
+    "curves": (CurvesFlags, _curves),
+    "tables": (TablesFlags, _tables),
+    "ablation": (AblationFlags, _ablation),
+    "starts": (StartsFlags, _starts),
+    "processes": (ProcessesFlags, _processes),
+    "operations": (OperationsFlags, _operations),
+    "contention": (ContentionFlags, _contention),
+    "cache": (CacheFlags, _cache),
+    "poses": (PosesFlags, _poses),
+    "pose-refinement": (PoseRefinementFlags, _pose_refinement),
+    "meshes": (MeshFlags, _meshes),
+    "viewer": (ViewerBenchFlags, _viewer),
+}
+
+
+if __name__ == "__main__":
+    main()

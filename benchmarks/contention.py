@@ -1,0 +1,244 @@
+"""Speed of training and rendering beside other programs.
+
+instant-ngp runs alone, beside busy loops of several kinds, and beside itself. Reported are its speed as a fraction of
+that alone, and its fair share of the cores. A fraction above the fair share means that the loops got less than theirs.
+No other programs should run meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.children import own_command
+from nerfloom.base.console import say
+from nerfloom.base.errors import FlagError, NerfloomError
+from nerfloom.benchmarks.workload import default_run, endless_trainer
+from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.kernels import native
+from nerfloom.training.data_folder import find_data
+from nerfloom.training.datasets import load_split
+from nerfloom.training.machine import machine
+from nerfloom.training.trainer import Trainer
+
+LOOP = "import time\nend = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
+"""Program of a busy loop."""
+WORK = ("training", "rendering")
+"""Kinds of work that are measured."""
+SETTINGS_FOR = 45.0
+"""Time budget, seconds, for which the method chooses its settings."""
+STEPS_BEFORE_RENDERING = 300
+"""Training steps before rendering is measured."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A condition under which speed is measured."""
+
+    name: str
+    """Name of the condition."""
+    loops: int = 0
+    """Number of busy loops beside the training, each of one thread."""
+    nice: int = 0
+    """Niceness of the loops."""
+    own_group: bool = False
+    """Whether the loops have a session of their own, which the scheduler treats as one process."""
+    trainings: int = 1
+    """Number of simultaneous trainings."""
+    environment: tuple[tuple[str, str], ...] = ()
+    """Environment variables of the trainings."""
+
+    def fair_share(self, cores: int) -> float:
+        """Return the fair share of the cores for one training with a thread on each core.
+
+        Args:
+            cores: number of cores of the machine.
+        """
+        if self.own_group:
+            return 0.5
+        weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's weight of nice 19
+        return cores / (cores * self.trainings + self.loops * weight)
+
+
+PASSIVE = (("OMP_WAIT_POLICY", "PASSIVE"),)
+ALONE = Row("nothing")
+"""The condition without other programs."""
+ROWS = (
+    ALONE,
+    Row("two loops, nice 19", loops=2, nice=19),
+    Row("one loop", loops=1),
+    Row("two loops", loops=2),
+    Row("two loops in a session of their own", loops=2, own_group=True),
+    Row("the same once more", trainings=2),
+    Row("nothing, OMP_WAIT_POLICY=PASSIVE", environment=PASSIVE),
+    Row("one loop, OMP_WAIT_POLICY=PASSIVE", loops=1, environment=PASSIVE),
+    Row("nothing, one thread", environment=(("OMP_NUM_THREADS", "1"),)),
+)
+
+
+def measure(data: Path, seconds: float, parts: Sequence[str] = (), works: Sequence[str] = WORK) -> dict[str, Any]:
+    """Measure training and rendering under every condition, and print a line for each.
+
+    Args:
+        data: folder of the data set.
+        seconds: seconds of each measurement.
+        parts: names of conditions, or parts of names; all conditions if empty. `ALONE` is always measured.
+        works: work to measure: training, rendering or both.
+
+    Returns:
+        A row for each condition, as plain data.
+
+    Raises:
+        ConfigError: if no condition has such a name.
+        DataError: if no format recognises the data.
+    """
+    find_data(data)
+    rows, cores = chosen(parts), os.cpu_count() or 1
+    table: dict[str, list[dict[str, Any]]] = {}
+    for work in works:
+        table[work] = []
+        for row in rows:
+            measured = beside(row, work, data, seconds, cores)
+            alone = (table[work] or [measured])[0]["a second"][0]
+            measured["share"] = [round(speed / alone, 2) for speed in measured["a second"]]
+            table[work].append(measured)
+            figures = {key: value for key, value in measured.items() if key != "beside"}
+            say(f"{work:10s} {row.name:38s} {json.dumps(figures)}")
+    return {"machine": machine(), "cores": cores, "seconds": seconds, **table}
+
+
+def chosen(parts: Sequence[str]) -> list[Row]:
+    """Return the conditions with given names; `ALONE` is always among them, as speeds are fractions of its speed.
+
+    Args:
+        parts: names or parts of names; all conditions if empty.
+
+    Raises:
+        ConfigError: if one is not part of any name.
+    """
+    for part in parts:
+        if not any(part in row.name for row in ROWS):
+            raise FlagError(f"--rows: no condition is called '{part}'; known: {'; '.join(row.name for row in ROWS)}")
+    return [row for row in ROWS if row is ALONE or not parts or any(part in row.name for part in parts)]
+
+
+def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[str, Any]:
+    """Measure all trainings or renderings of a condition, each in its own process.
+
+    Args:
+        row: the condition.
+        work: training or rendering.
+        data: folder of the data set.
+        seconds: seconds of the measurement.
+        cores: number of cores of the machine.
+
+    Returns:
+        The fair share, and each figure of `child` as a list over the processes.
+    """
+    command = own_command("contention", work, data, seconds)
+    environment = {**os.environ, **dict(row.environment)}
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with ExitStack() as stack:
+
+        def started(words: list[str], **options: Any) -> subprocess.Popen[str]:
+            process = stack.enter_context(subprocess.Popen(words, **options))
+            stack.callback(process.kill)  # runs before the context manager waits for the process
+            return process
+
+        children = [started(command, env=environment, **pipes) for _ in range(row.trainings)]
+        for process in children:
+            wait_for(process, "ready")
+        loop = [sys.executable, "-c", LOOP.format(seconds=20 * seconds)]  # it ends by itself if this process is killed
+        for _ in range(row.loops):
+            started(["nice", "-n", str(row.nice), *loop], start_new_session=row.own_group)
+        time.sleep(0.5)
+        for process in children:
+            print("go", file=process.stdin, flush=True)
+        results = [json.loads(wait_for(process, "{")) for process in children]
+    figures = {key: [result[key] for result in results] for key in results[0]}
+    return {"beside": row.name, "fair share": round(row.fair_share(cores), 2), **figures}
+
+
+def wait_for(process: subprocess.Popen[str], start: str) -> str:
+    """Read a process's output up to the next line with a given start.
+
+    Args:
+        process: process with a pipe for its output.
+        start: start of the line.
+
+    Returns:
+        The line.
+
+    Raises:
+        NerfloomError: if the process ends before.
+    """
+    for line in process.stdout or ():
+        if line.startswith(start):
+            return line
+    raise NerfloomError(f"a process of the benchmark ended too early, with status {process.wait()}")
+
+
+def child(work: str, data: Path, seconds: float) -> dict[str, float]:
+    """Wait for a line on standard input, then train or render and measure the speed.
+
+    Args:
+        work: training or rendering.
+        data: folder of the data set.
+        seconds: seconds of the measurement.
+
+    Returns:
+        Steps or images per second, and the seconds of the first, the longest and the median one.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = endless_trainer(default_run("instant-ngp", data), SETTINGS_FOR, Path(folder))
+        once = rendering(trainer) if work == "rendering" else lambda _: trainer.train_step()
+        print("ready", native.variant(), flush=True)
+        sys.stdin.readline()
+        first = timed(once, 0)  # the first training step includes silhouettes
+        times: list[float] = []
+        while sum(times) < seconds:
+            times.append(timed(once, len(times) + 1))
+    return {
+        "a second": round(len(times) / sum(times), 3),
+        "first, s": round(first, 2),
+        "longest, s": round(max(times), 3),
+        "median, s": round(sorted(times)[len(times) // 2], 4),
+    }
+
+
+def rendering(trainer: Trainer) -> Callable[[int], object]:
+    """Train for a few steps, and return a function that renders a test view by its number.
+
+    Args:
+        trainer: trainer of a run whose data has test images.
+    """
+    views = load_split(trainer.run, "test")
+    for _ in range(STEPS_BEFORE_RENDERING):
+        trainer.train_step()
+    background = evaluation_background(trainer.model)
+    return lambda number: trainer.model.render_view(views.view(number % len(views)), background)
+
+
+def timed(function: Callable[[int], object], number: int) -> float:
+    """Return the seconds of a call.
+
+    Args:
+        function: function to call.
+        number: its argument.
+    """
+    start = time.perf_counter()
+    function(number)
+    return time.perf_counter() - start
+
+
+if __name__ == "__main__":
+    print(json.dumps(child(sys.argv[1], Path(sys.argv[2]), float(sys.argv[3]))), flush=True)

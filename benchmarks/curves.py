@@ -1,0 +1,201 @@
+"""PSNR against seconds of training, of several methods: a run from the start for every budget and every seed.
+
+Schedules and sizes follow the budget, so the curve of one long run would show less at each of its times than a method
+can do in that time. Runs are those of a comparison (`nerfloom.comparison`), in a folder for each budget: what is
+there is kept, so that a stopped benchmark goes on, and methods, budgets and seeds can be added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from nerfloom.base.errors import FlagError
+from nerfloom.benchmarks.methods import STANDARD
+from nerfloom.comparison import plots
+from nerfloom.comparison.measures import Row, measure, rows_of
+from nerfloom.comparison.plan import Conditions, Contender, Plan
+from nerfloom.comparison.runner import run_jobs
+from nerfloom.registry import registered
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Results of all methods with one budget."""
+
+    seconds: float
+    """Seconds of training that each run was given."""
+    rows: tuple[Row, ...]
+    """Results of each method, in the order of the methods."""
+
+
+def all_methods() -> tuple[str, ...]:
+    """Return all installed methods, with the flags with which they are meant to be used on a CPU."""
+    with_flags = {text.split()[0]: text for text in STANDARD}
+    return tuple(with_flags.get(name, name) for name in registered("methods"))
+
+
+def plans(
+    methods: Sequence[str], data: Path | None, budgets: Sequence[float], seeds: int, views: int, folder: Path
+) -> list[Plan]:
+    """Return the runs as a comparison for each budget, the shortest first.
+
+    Args:
+        methods: methods, each with its own flags; `all_methods` if there are none.
+        data: folder of the data set; the embedded scene if None.
+        budgets: seconds of training.
+        seeds: number of runs of each method with each budget.
+        views: maximum number of held-out views that are evaluated.
+        folder: folder of the runs.
+
+    Raises:
+        ConfigError: if a method is unknown, there is no budget, or a number is out of range.
+    """
+    if not budgets:
+        raise FlagError("--budgets is empty; list seconds of training, as in --budgets 10 45 150")
+    contenders = tuple(map(Contender.of, methods or all_methods()))
+    root = None if data is None else str(data.resolve())
+    return [
+        Plan(contenders, _conditions(root, seconds, views), seeds, folder.resolve() / f"{seconds:g}s")
+        for seconds in sorted(set(budgets))
+    ]
+
+
+def _conditions(data: str | None, seconds: float, views: int) -> Conditions:
+    return Conditions(
+        data=data,
+        data_flags=(),
+        max_seconds=seconds,
+        max_num_iterations=None,
+        target_psnr=None,
+        num_threads=None,
+        device_type="auto",
+        curve_images=0,
+        max_eval_images=views,
+    )
+
+
+def run(plan: Plan) -> Budget:
+    """Train and evaluate what is missing of a budget.
+
+    Args:
+        plan: the runs of the budget.
+
+    Returns:
+        What was measured, with the reasons of failures.
+
+    Raises:
+        ConfigError: if the folder holds runs under other conditions, or cannot be written.
+        Stopped: on a signal; the runs that are done are kept.
+    """
+    plan.claim_folder()
+    failures: dict[str, list[str]] = {}
+    for job, failure in run_jobs(plan).items():
+        failures.setdefault(job.contender.label, []).append(f"seed {job.seed}: {failure.reason}")
+    done = [measured for measured in (measure(job, plan.conditions) for job in plan.jobs()) if measured is not None]
+    assert plan.conditions.max_seconds is not None
+    return Budget(plan.conditions.max_seconds, tuple(rows_of([c.label for c in plan.contenders], done, failures)))
+
+
+def published(plan: Plan, found: Sequence[Budget]) -> dict[str, Any]:
+    """Return the results of all budgets as plain data, without paths of the machine.
+
+    Args:
+        plan: the runs of any budget.
+        found: what was measured with each budget.
+    """
+    runs = [run for budget in found for row in budget.rows for run in row.runs]
+    machines: list[dict[str, Any]] = []
+    for run in runs:
+        machines += [] if run.machine in machines else [run.machine]
+    return {
+        "data": "procedural" if plan.conditions.data is None else Path(plan.conditions.data).name,
+        "held-out views": sorted({run.views for run in runs}),
+        "seeds": plan.repeats,
+        "machines": machines,
+        "methods": [
+            {"method": label, "points": [_point(budget, budget.rows[index]) for budget in found]}
+            for index, label in enumerate(contender.label for contender in plan.contenders)
+        ],
+    }
+
+
+def _point(budget: Budget, row: Row) -> dict[str, Any]:
+    """Return the results of one method with one budget."""
+
+    def mean(name: str, digits: int) -> float | None:
+        value = row.mean(name)
+        return None if value is None else round(value, digits)
+
+    spread = row.deviation("psnr")
+    return {
+        "budget, s": budget.seconds,
+        "training, s": mean("seconds", 2),
+        "PSNR, dB": mean("psnr", 3),
+        "standard deviation of a run, dB": None if spread is None else round(spread, 3),
+        "PSNR of each seed, dB": {str(run.seed): round(run.psnr, 3) for run in row.runs},
+        "SSIM": mean("ssim", 4),
+        "steps": mean("steps", 0),
+        "rendering, s/image": mean("render_seconds", 4),
+        "memory, GiB": None if not row.runs else round(max(run.peak_memory_bytes for run in row.runs) / 2**30, 2),
+        "failures": list(row.failures),
+    }
+
+
+def table(plan: Plan, found: Sequence[Budget]) -> Table:
+    """Return PSNR by method and budget for a terminal, with the standard deviation of a run if there are several seeds.
+
+    Args:
+        plan: the runs of any budget.
+        found: what was measured with each budget.
+    """
+    result = Table("PSNR, dB, after", *(f"{budget.seconds:g} s" for budget in found))
+    for index, contender in enumerate(plan.contenders):
+        result.add_row(contender.label, *(_cell(budget.rows[index]) for budget in found))
+    return result
+
+
+def _cell(row: Row) -> str:
+    if not row.runs:
+        return "failed" if row.failures else "–"
+    spread = row.deviation("psnr")
+    return f"{row.mean('psnr'):.2f}" + ("" if spread is None else f" ± {spread:.2f}")
+
+
+def draw(plan: Plan, found: Sequence[Budget]) -> str:
+    """Plot PSNR against seconds of training: means over seeds, and a band from the worst seed to the best.
+
+    Args:
+        plan: the runs of any budget.
+        found: what was measured with each budget.
+
+    Returns:
+        The plot as an SVG element.
+    """
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.subplots()
+    for index, contender in enumerate(plan.contenders):
+        rows = [budget.rows[index] for budget in found if budget.rows[index].runs]
+        seconds = [row.mean("seconds") or 0.0 for row in rows]
+        seeds = [[run.psnr for run in row.runs] for row in rows]
+        color, dashes = plots.color_of(index), "-" if index < len(plots.COLORS) else "--"
+        psnrs = [row.mean("psnr") or 0.0 for row in rows]
+        axes.plot(seconds, psnrs, dashes, color=color, marker="o", markersize=4, label=contender.label)
+        axes.fill_between(seconds, list(map(min, seeds)), list(map(max, seeds)), color=color, alpha=0.2, linewidth=0)
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
+    axes.set(xlabel="training, s", ylabel="PSNR, dB")
+    axes.legend(fontsize="small", loc="best")
+    return plots.as_svg(figure)

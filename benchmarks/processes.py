@@ -1,0 +1,88 @@
+"""Seconds to a PSNR, and final PSNR, of instant-ngp with one process and with several on the same cores.
+
+Several processes take a step with batches of their own, and with the mean of their gradients. So the batch of all
+together is larger, unless it is divided among them. The kinds alternate, so that a drift of the machine's speed affects
+all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.ablation import VIEWS, crossing
+from benchmarks.children import output_of
+from nerfloom.base.child import python_command
+from nerfloom.base.console import say
+from nerfloom.training.machine import machine
+
+
+def measure(
+    data: Path, count: int, seconds: float, seeds: int, samples: int, targets: Sequence[float]
+) -> dict[str, Any]:
+    """Train with one process and with several, and print a line for each run.
+
+    Args:
+        data: folder of the data set.
+        count: number of processes.
+        seconds: seconds of training of each run.
+        seeds: number of runs of each kind.
+        samples: samples of a training step of one process.
+        targets: PSNRs of validation views, dB, to which the time is reported.
+
+    Returns:
+        The machine, the arguments and a row for each run, as plain data.
+    """
+    kinds = {
+        "one process": (1, samples),
+        f"{count} processes, each with such a batch": (count, samples),
+        f"{count} processes, which divide the batch": (count, samples // count),
+    }
+    rows = []
+    for seed in range(seeds):
+        for name, (processes, batch) in kinds.items():
+            row = {"kind": name, "seed": seed, **trained(data, processes, seconds, seed, batch, targets)}
+            say(str({key: value for key, value in row.items() if key != "curve"}))
+            rows.append(row)
+    arguments = {"processes": count, "seconds": seconds, "samples a step": samples, "test views": VIEWS}
+    return {"machine": machine(), **arguments, "runs": rows}
+
+
+def trained(
+    data: Path, processes: int, seconds: float, seed: int, samples: int, targets: Sequence[float]
+) -> dict[str, Any]:
+    """Train once, by torchrun if with several processes, and return the learning curve and what follows from it.
+
+    Args:
+        data: folder of the data set.
+        processes: number of processes.
+        seconds: seconds of training.
+        seed: random seed.
+        samples: samples of a training step of each process.
+        targets: PSNRs, dB.
+    """
+    flags = ("instant-ngp", "--data", data, "--max-seconds", seconds)
+    command = python_command("nerfloom.cli.train", *flags)
+    if processes > 1:
+        launch = ("--standalone", "--nproc-per-node", processes, "-m", "nerfloom.cli.train")
+        command = python_command("torch.distributed.run", *launch, *flags)
+    with tempfile.TemporaryDirectory() as folder:
+        command += ["--machine.seed", str(seed), "--samples-per-batch", str(samples), "--vis", "none"]
+        command += ["--eval", "all", "--max-eval-images", str(VIEWS)]
+        output_of([*command, "--output-dir", folder])
+        run = next(Path(folder).rglob("config.yml")).parent
+        points = json.loads((run / "learning_curve.json").read_text())
+        curve = [(round(point["seconds"], 1), round(point["psnr"], 2)) for point in points]
+        summary = json.loads((run / "summary.json").read_text())
+        times = {f"seconds to {target:g} dB": crossing([(0.0, 0.0), *curve], target) for target in targets}
+        final = json.loads((run / "eval.json").read_text())["results"]["psnr"]
+        return {
+            "steps": summary["steps"],
+            "rays": summary["rays"],
+            **times,
+            "PSNR of test views, dB": final,
+            "curve": curve,
+        }

@@ -1,0 +1,122 @@
+"""Tables of results as text: Markdown with means over seeds, and a list of rows with the time that they will take."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import fmean, stdev
+
+from benchmarks.tables import Result, Row, Table, kept
+from nerfloom.evaluation.lpips import NETWORK
+
+LOADING, EVALUATION = 20.0, 60.0
+"""Seconds before a row's training, and after it where nothing is known of its data, in estimates of a row's time."""
+Column = tuple[str, Callable[[Result], float | None], str]
+"""Heading of a column, what it shows of a result, and how."""
+
+
+def columns(table: Table, found: Sequence[Result]) -> list[Column]:
+    """Return the columns of a table of which anything is known.
+
+    Args:
+        table: the table.
+        found: all results.
+    """
+
+    def of_run(name: str) -> Callable[[Result], float | None]:
+        return lambda result: result.get("run", {}).get(name)
+
+    def of_size(size: str) -> Callable[[Result], float | None]:
+        return lambda result: result["results"].get("by_size", {}).get(size, {}).get("psnr")
+
+    def of_image(name: str) -> Callable[[Result], float | None]:
+        return lambda result: next((image["psnr"] for image in result["per_image"] if image["name"] == name), None)
+
+    def memory(result: Result) -> float | None:
+        return None if (used := of_run("peak_memory_bytes")(result)) is None else used / 2**30
+
+    sizes = sorted({size for result in found for size in result["results"].get("by_size", {})}, key=len)
+    every: list[Column] = [
+        ("test PSNR", lambda result: result["results"]["psnr"], "{:.2f} dB"),
+        ("SSIM", lambda result: result["results"]["ssim"], "{:.3f}"),
+        ("MS-SSIM", lambda result: result["results"].get("ms_ssim"), "{:.3f}"),
+        (f"LPIPS ({NETWORK})", lambda result: result["results"]["lpips"], "{:.3f}"),
+        *((f"size {size}", of_size(size), "{:.2f} dB") for size in sizes),
+        *((heading, of_image(name), "{:.2f} dB") for heading, name in table.images.items()),
+        ("floaters", lambda result: result["results"].get("floaters"), "{:.1f} %"),
+        ("steps", of_run("steps"), "{:,.0f}"),
+        ("training rays/s", of_run("rays_per_second"), "{:,.0f}"),
+        ("samples a ray", of_run("samples_per_ray"), "{:.1f}"),
+        ("peak memory", memory, "{:.1f} GiB"),
+        ("render", lambda result: 1 / result["results"]["fps"], "{:.2g} s/image"),
+    ]
+    return [column for column in every if any(column[1](result) is not None for result in found)]
+
+
+def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
+    """Return a table as Markdown: a line for each data set, method and budget, with the mean over seeds.
+
+    PSNRs of several seeds have the standard deviation of a single run behind them. Lines without a run are left empty.
+
+    Args:
+        table: the table.
+        results: folder of the results.
+        wanted: what is found in the names of the rows that are shown.
+    """
+    lines: dict[tuple[str, str, float], list[tuple[Row, Result]]] = {}
+    for row in filter(lambda row: wanted.search(row.name), table.rows):
+        runs = lines.setdefault((row.data, row.method, row.seconds), [])
+        runs += [] if (found := kept(row, results)) is None else [(row, found)]
+    shows = columns(table, [found for runs in lines.values() for _, found in runs])
+    headings = ["run", *(heading for heading, *_ in shows), "file"]
+    text = ["| " + " | ".join(headings) + " |", "|---" * len(headings) + "|"]
+    for (data, method, seconds), runs in lines.items():
+        cells = [_cell(show, [found for _, found in runs]) for show in shows]
+        files = ", ".join(f"`{row.name}.json`" for row, _ in runs)
+        text.append("| " + " | ".join([f"{data}, {method}, {seconds:g} s", *cells, files]) + " |")
+    return "\n".join(text)
+
+
+def _cell(column: Column, found: Sequence[Result]) -> str:
+    """Return the mean of a column over the seeds, with the spread of PSNRs; nothing if a run lacks it."""
+    _, value_of, shape = column
+    values = [value for value in map(value_of, found) if value is not None]
+    if not values or len(values) < len(found):
+        return ""
+    text = shape.format(fmean(values))
+    return text.replace(" dB", f" ± {stdev(values):.2f} dB") if len(values) > 1 else text
+
+
+def listing(rows: Sequence[Row], results: Path) -> str:
+    """Return a line for each row: its name, and its PSNR or the time that it will take; then the time of all.
+
+    Args:
+        rows: the rows.
+        results: folder of the results.
+    """
+    found = [(row, kept(row, results)) for row in rows]
+    done = [(row, result) for row, result in found if result is not None]
+    missing = {row.name: estimate(row, done) for row, result in found if result is None}
+    width = max(len(row.name) for row in rows)
+    lines = [
+        f"{row.name:<{width}}  "
+        + (f"{missing[row.name] / 60:6.1f} min" if result is None else f"{result['results']['psnr']:7.2f} dB")
+        + f"  {row.job.contender.label}"
+        for row, result in found
+    ]
+    hours = sum(missing.values()) / 3600
+    return "\n".join([*lines, f"{len(missing)} of {len(rows)} rows are to be run: {hours:.1f} h"])
+
+
+def estimate(row: Row, done: Sequence[tuple[Row, Result]]) -> float:
+    """Return the seconds that a row will take: loading, training, and evaluation as of rows that are done.
+
+    Args:
+        row: the row.
+        done: rows that are done; the same method on the same data counts, else any on the same data.
+    """
+    near = [(other, found) for other, found in done if other.data == row.data]
+    same = [(other, found) for other, found in near if other.method == row.method] or near
+    known = [found["results"]["num_images"] / found["results"]["fps"] for _, found in same]
+    return LOADING + row.seconds + (fmean(known) if known else EVALUATION)

@@ -1,0 +1,230 @@
+"""Tables of results: each row a run in a process of its own, judged on every held-out image and kept as a JSON file.
+
+A table is a YAML file. Its `rows` are blocks: every data set of a block with every method, budget and seed of it is a
+row. Rows whose file is there are not run again, so that a table of many hours grows over days. A row that was stopped
+goes on where it was.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, shown
+from nerfloom.comparison import runner
+from nerfloom.comparison.measures import measure, read_json
+from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, Job, split_words
+from nerfloom.training.report import SUMMARY
+from nerfloom.training.run import write_json
+
+TRIED = 3
+"""Number of held-out images on which a trial, with other budgets than the table's, is judged."""
+Result = dict[str, Any]
+"""The content of a row's file: what ns-eval writes, and how it was made, as `run`."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Numbers of a block's rows."""
+
+    seconds: tuple[float, ...] = ()
+    """Seconds of training."""
+    seeds: int = 1
+    """Number of seeds."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A run of a table.
+
+    Args:
+        data: short name of its data, as in the table.
+        method: short name of its method.
+    """
+
+    data: str
+    method: str
+    job: Job
+    """The run."""
+    conditions: Conditions
+    """Its data and budget."""
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of training."""
+        assert self.conditions.max_seconds is not None
+        return self.conditions.max_seconds
+
+    @property
+    def name(self) -> str:
+        """Name of the row, and of its file."""
+        seed = "" if self.job.seed == FIRST_SEED else f"-seed{self.job.seed}"
+        return f"{self.data}-{self.method}-{self.seconds:g}s{seed}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """The rows of a file.
+
+    Args:
+        rows: the rows, seed by seed.
+        images: heading of a column -> name of the held-out image whose PSNR it shows.
+    """
+
+    rows: tuple[Row, ...]
+    images: Mapping[str, str]
+
+
+def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_weights: Path | None = None) -> Table:
+    """Read a table.
+
+    Args:
+        path: its YAML file.
+        root: folder of the folders of all data.
+        runs: folder in which runs are kept.
+        scale: factor of all budgets; if not 1, the rows are trials.
+        lpips_weights: file of LPIPS's weights, for the rows that are run; None to look for the lpips package.
+
+    Raises:
+        ConfigError: if the file is not a table, or names an unknown method.
+    """
+    content = read_yaml(path)
+    images, blocks = _texts(content.get("images", {}), f"{path}: images"), content.get("rows")
+    if not isinstance(blocks, list) or content.keys() - {"images", "rows"}:
+        raise ConfigError(f"{path}: a table has a list of 'rows', and perhaps 'images', and nothing else")
+    rows: dict[str, Row] = {}
+    weights = None if lpips_weights is None else str(lpips_weights.resolve())
+    for number, block in enumerate(blocks):
+        for row in _rows(block, f"{path}: rows {number + 1}", root.resolve(), runs.resolve(), scale):
+            row = replace(row, conditions=replace(row.conditions, lpips_weights=weights))
+            if not re.fullmatch(r"[\w.-]+", row.name):
+                raise ConfigError(
+                    f"{path}: {shown(row.name)} names no file; take letters, digits and hyphens for names"
+                )
+            if row.name in rows:
+                raise ConfigError(f"{path}: two rows are called {row.name}; give one's data or method another name")
+            rows[row.name] = row
+    return Table(tuple(rows.values()), images)
+
+
+def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Iterator[Row]:
+    """Yield the rows of a block."""
+    if not isinstance(block, dict):
+        raise ConfigError(f"{where} is {shown(block)}; it must have data, methods, seconds, and perhaps seeds")
+    data, methods = (_texts(block.get(name), f"{where}: {name}") for name in ("data", "methods"))
+    others = {name: value for name, value in block.items() if name not in ("data", "methods")}
+    numbers = from_plain(Block(), others, where)
+    if not data or not methods or not numbers.seconds or numbers.seeds < 1:
+        raise ConfigError(f"{where} has no rows; it must have data, methods, seconds, and at least one seed")
+    for seed in range(FIRST_SEED, FIRST_SEED + numbers.seeds):
+        for data_name, place in data.items():
+            for seconds in numbers.seconds:
+                for method_name, method in methods.items():
+                    conditions = _conditions(place, root, seconds * scale, None if scale == 1 else TRIED)
+                    # Its label makes the folder of a run another one if flags of the method or of the data differ.
+                    contender = replace(Contender.of(method), label=f"{method} on {place or 'the embedded scene'}")
+                    job = Job(contender, seed, runs / f"{seconds * scale:g}s")
+                    yield Row(data_name, method_name, job, conditions)
+
+
+def _texts(value: Any, where: str) -> dict[str, str]:
+    """Return a mapping of names to texts as it is, or raise ConfigError."""
+    if isinstance(value, dict) and all(isinstance(item, str) for item in (*value, *value.values())):
+        return value
+    raise ConfigError(f"{where} is {shown(value)}; it must have names with a text each")
+
+
+def _conditions(place: str, root: Path, seconds: float, views: int | None) -> Conditions:
+    """Return the conditions of a row: all cores, and no learning curve."""
+    words = split_words(place, "data")
+    folder = words[0] if words and not words[0].startswith("--") else None
+    return Conditions(
+        data=None if folder is None else str(root / folder),
+        data_flags=words if folder is None else words[1:],
+        max_seconds=seconds,
+        max_num_iterations=None,
+        target_psnr=None,
+        num_threads=None,
+        device_type="auto",
+        curve_images=0,
+        max_eval_images=views,
+    )
+
+
+def kept(row: Row, results: Path) -> Result | None:
+    """Return the result of a row, or None if it is not there.
+
+    Args:
+        row: the row.
+        results: folder of the results.
+
+    Raises:
+        ConfigError: if the file is of another command.
+    """
+    found = read_json(path := results / f"{row.name}.json")
+    if not isinstance(found, dict) or "results" not in found:
+        return None
+    made_by = found.get("run", {}).get("label", row.job.contender.label)
+    if made_by != row.job.contender.label:
+        raise ConfigError(f"{path} is of '{made_by}', not of '{row.job.contender.label}'; remove it, or rename the row")
+    return found
+
+
+def run_rows(rows: Sequence[Row], root: Path, results: Path) -> dict[str, str]:
+    """Train and judge the rows that are missing, one after the other, and write a file for each.
+
+    Args:
+        rows: the rows.
+        root: folder of the folders of all data, which is left out of the files.
+        results: folder of the results.
+
+    Returns:
+        Name of each row that failed -> why.
+
+    Raises:
+        Stopped: on a signal, after the running row has saved.
+    """
+    failures = {}
+    with runner.stoppable() as stopped:
+        for number, row in enumerate(rows, 1):
+            if stopped.is_set() or kept(row, results) is not None:
+                continue
+            say(f"[{number}/{len(rows)}] {row.name}: {row.conditions.budget()}, {time.strftime('%H:%M')}")
+            failure = None if runner.is_done(row.job) else runner.run_job(row.job, row.conditions, None, stopped)
+            if failure is None:
+                results.mkdir(parents=True, exist_ok=True)
+                write_json(results / f"{row.name}.json", found := result_of(row, root))
+                say(f"  PSNR {found['results']['psnr']:.2f} dB, {found['run']['steps']:,} steps")
+            elif not stopped.is_set():
+                failures[row.name] = f"{failure.reason} (full output: {failure.log})"
+                say(f"  {row.name} failed: {failures[row.name]}")
+    return failures
+
+
+def result_of(row: Row, root: Path) -> Result:
+    """Return the content of a finished row's file, without paths of the machine.
+
+    Args:
+        row: the row.
+        root: folder of the folders of all data.
+    """
+    measured, evaluation = measure(row.job, row.conditions), read_json(row.job.evaluation)
+    summary = read_json(row.job.folder / SUMMARY)
+    assert measured is not None
+    run = {
+        "label": row.job.contender.label,
+        "command": measured.command.replace(f"{root.resolve()}/", ""),
+        "seed": row.job.seed,
+        "date": datetime.now(timezone.utc).date().isoformat(),
+        **{name: value for name, value in summary.items() if name != "method"},
+        "decisions": list(measured.decisions),
+    }
+    images = evaluation.pop("per_image")
+    return {**evaluation, "experiment_name": row.data, "run": run, "per_image": images}

@@ -1,0 +1,127 @@
+"""Times of the viewer: first picture, pictures of a moving camera, finished picture.
+
+There is no browser and no socket: what is measured is from a request to the JPEG file.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from nerfloom.training.trained import load_trained
+from nerfloom.viewer.browser import FINE_QUALITY, Browser
+from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.request import Pose, Request
+from nerfloom.viewer.viewed import of_trained
+
+WARM_UP = 12
+"""Pictures of a moving camera before those that are measured."""
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of a viewer's pictures of one run."""
+
+    method: str
+    """Name of the method."""
+    width: int
+    """Width of the finished picture, pixels."""
+    height: int
+    """Height of the finished picture, pixels."""
+    first: float
+    """From the first request to the first picture, with the JPEG file."""
+    coarse: float
+    """Median of the pictures of a moving camera."""
+    slowest: float
+    """Longest of them."""
+    stride: int
+    """Stride of the last of them, pixels."""
+    per_second: float
+    """Pictures per second of a moving camera."""
+    finished: float
+    """From the last request to the finished picture, with the time in which the camera rests."""
+    rays_per_pixel: int
+    """Rays per pixel of the finished picture."""
+
+
+def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
+    """Measure the pictures of a trained run for one browser whose camera turns, rests, and is waited for.
+
+    Args:
+        run: the run's folder.
+        width, height: size of the browser's picture, pixels.
+        count: number of pictures of the moving camera.
+    """
+    trained = load_trained(run, device_type="cpu")
+    studio = Studio(of_trained(trained))
+    shown: list[tuple[float, int]] = []
+
+    def show(image: np.ndarray, quality: int) -> None:
+        _jpeg(image, quality)
+        shown.append((time.perf_counter(), quality))
+
+    browser = Browser(show)
+    studio.enter(0, browser)
+    begun = time.perf_counter()
+    studio.ask(0, _always(_request(trained.model.scene, 0, width, height)))
+    studio.work()
+    first = shown[-1][0] - begun
+    seconds = []
+    for index in range(WARM_UP + count):
+        begun = time.perf_counter()
+        studio.ask(0, _always(_request(trained.model.scene, index + 1, width, height)))
+        studio.work()
+        seconds.append(shown[-1][0] - begun)
+    moving = seconds[WARM_UP:]
+    while browser.pieces:
+        if studio.work() is None:
+            threading.Event().wait(0.005)
+    assert shown[-1][1] == FINE_QUALITY
+    return Times(
+        trained.run.method,
+        width,
+        height,
+        first,
+        median(moving),
+        max(moving),
+        browser.stride or 0,
+        len(moving) / sum(moving),
+        shown[-1][0] - begun,
+        trained.model.rays_per_pixel,
+    )
+
+
+def _always(request: Request) -> Callable[[Request | None], Request]:
+    return lambda _: request
+
+
+def _jpeg(image: np.ndarray, quality: int) -> bytes:
+    import imageio.v3 as iio
+
+    return iio.imwrite("<bytes>", image, extension=".jpeg", quality=quality)
+
+
+def _request(scene: Any, index: int, width: int, height: int) -> Request:
+    """Return what a camera sees that circles the scene at the distance of the first training camera."""
+    center = scene.box.mean(0).double()
+    position = scene.camera_to_worlds[0, :, 3].double() - center
+    radius, angle = float(position.norm()), 0.02 * index
+    place = (radius * 0.9 * math.cos(angle), radius * 0.9 * math.sin(angle), radius * 0.436)
+    back = [value / radius for value in place]
+    right = (-math.sin(angle), math.cos(angle), 0.0)
+    up = (
+        back[1] * right[2] - back[2] * right[1],
+        back[2] * right[0] - back[0] * right[2],
+        back[0] * right[1] - back[1] * right[0],
+    )
+    rows = [(right[axis], up[axis], back[axis], float(center[axis]) + place[axis]) for axis in range(3)]
+    matrix = tuple(value for row in rows for value in row)
+    return Request(Pose(matrix, 0.7), width, height, time=0.5 if scene.moving else None)

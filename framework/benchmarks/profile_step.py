@@ -1,0 +1,60 @@
+"""Time of a training step: of each compiled kernel of the CPU, and of Python and torch."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from nerfloom.base.console import say
+from nerfloom.base.device import wait_for
+from nerfloom.benchmarks.workload import endless_trainer
+from nerfloom.kernels import native
+from nerfloom.training.machine import kernels, machine
+from nerfloom.training.run import Run
+
+MEASURED, FEWEST, LONGEST = 200, 8, 30.0
+"""Number of steps over which times are averaged; fewer, but not fewer than the second, where they take longer than the
+third, seconds."""
+
+
+def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
+    """Train a method, measure `MEASURED` further steps at most, and print a line for each kernel of the CPU.
+
+    Args:
+        run: what to train.
+        steps: training steps before the measurement, in which the occupancy grid finds empty space.
+        max_seconds: time budget, seconds, for which the method chooses its settings.
+
+    Returns:
+        Milliseconds per step, in total and by kernel, as plain data.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        trainer = endless_trainer(run, max_seconds, Path(folder))
+        for _ in range(steps):
+            trainer.train_step()
+        wait_for(trainer.device)
+        native.spent, rays = {}, trainer.state.rays
+        start, count = time.perf_counter(), 0
+        while count < FEWEST or (count < MEASURED and time.perf_counter() - start < LONGEST):
+            trainer.train_step()
+            count += 1
+        wait_for(trainer.device)
+        step = (time.perf_counter() - start) / count * 1e3
+        rays = (trainer.state.rays - rays) // count
+    spent_in = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}
+    native.spent, used = None, kernels(trainer.device)
+    spent_in["Python and torch"] = step - sum(spent_in.values())
+    parts = dict(sorted(spent_in.items(), key=lambda item: -item[1]))
+    for name, spent in parts.items():
+        say(f"{name:28s} {spent:6.2f} ms  {spent / step:6.1%}")
+    say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {used}")
+    return {
+        "machine": machine(trainer.device),
+        "kernels": used,
+        "steps": count,
+        "rays per step": rays,
+        "ms per step": round(step, 2),
+        "ms": {name: round(spent, 3) for name, spent in parts.items()},
+    }

@@ -1,0 +1,48 @@
+"""The trainer of benchmarks of speed."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from nerfloom.registry import load_dataparser, load_method
+from nerfloom.training.data_folder import find_data
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
+
+
+def default_run(method: str, data: Path) -> Run:
+    """Return a run of a method with its default settings.
+
+    Args:
+        method: name of the method.
+        data: folder of the data set, whose format is recognised.
+
+    Raises:
+        DataError: if no format recognises the data.
+    """
+    data_folder, name = find_data(data)
+    config = dataclasses.replace(load_method(method).config, data=data_folder)
+    return Run(method, config, name, load_dataparser(name)(), Path())
+
+
+def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:
+    """Return a trainer with the settings for a time budget, but without the budget.
+
+    With a budget, the learning rate would fall over time, and a run that reached its end would not be typical.
+
+    Args:
+        run: what to train; its own budget and folder are not used.
+        seconds: time budget, seconds, for which the method chooses its settings.
+        folder: folder in which the run's folder is created.
+    """
+    config = dataclasses.replace(run.config, vis="none", max_seconds=seconds)
+    run = dataclasses.replace(run, config=config, folder=folder / "run")
+    train_set = load_split(run, "train")
+    config, _ = load_method(run.method).decided(config, train_set.scene)
+    run = dataclasses.replace(run, config=dataclasses.replace(config, max_seconds=None))
+    create_folder(run)
+    trainer = Trainer(run, train_set, None)
+    trainer.prepare()
+    return trainer

@@ -1,0 +1,239 @@
+"""Measurements of finished runs, read from their folders, and their statistics over several seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any
+
+from nerfloom.comparison.plan import Conditions, Job
+
+SAME_TIME = 0.01
+"""Relative difference below which two times count as equal: runs end with the step in which their time is up."""
+Curve = tuple[tuple[float, float], ...]
+"""Pairs (seconds of training, PSNR on the validation views), in order."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measurements of one run.
+
+    Args:
+        method: name of the method.
+        seed: seed of the run.
+        ssim: mean SSIM over all evaluated views.
+        ms_ssim: mean SSIM at five scales; None of small images.
+        lpips: mean LPIPS over all evaluated views; None if it was not computed.
+        floaters: mean share, in per cent, of sparse points with something before them; None without sparse points.
+        steps: steps of training.
+        parameters: number of parameters.
+        skipped_steps: steps dropped because of non-finite values.
+        curve: the learning curve.
+        machine: description of the machine.
+        folder: folder of the run.
+        lpips_note: how LPIPS was computed, or why not.
+        masks_note: what was measured of masked images; None if all pixels count.
+    """
+
+    label: str
+    """Label of the contender."""
+    method: str
+    seed: int
+    psnr: float
+    """Mean PSNR of the final model over all evaluated views, dB."""
+    ssim: float | None
+    ms_ssim: float | None
+    lpips: float | None
+    floaters: float | None
+    views: int
+    """Number of evaluated views."""
+    steps: int
+    seconds: float
+    """Seconds of training."""
+    rays_per_second: float
+    """Rays per second of training."""
+    render_seconds: float
+    """Seconds per rendered image."""
+    peak_memory_bytes: int
+    """Peak memory in training, bytes."""
+    parameters: int
+    skipped_steps: int
+    curve: Curve
+    seconds_to: dict[int, float]
+    """Integer PSNR, dB -> seconds after which the curve reached it."""
+    decisions: tuple[str, ...]
+    """Decisions of the scene's profile."""
+    skipped: tuple[str, ...]
+    """Work that the run skipped."""
+    machine: dict[str, Any]
+    command: str
+    """The training command."""
+    folder: str
+    lpips_note: str
+    masks_note: str | None
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return the measurements as a dictionary for JSON."""
+        return {**asdict(self), "seconds_to": {str(level): s for level, s in self.seconds_to.items()}}
+
+
+def measure(job: Job, conditions: Conditions) -> Measured | None:
+    """Return the measurements of a job, or None if it is not finished, or its images are not finite.
+
+    Args:
+        job: the job.
+        conditions: the conditions of the comparison.
+    """
+    summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)
+    if not isinstance(summary, dict) or not isinstance(evaluation, dict):
+        return None
+    results = evaluation["results"]
+    if results["psnr"] is None:
+        return None
+    points = read_json(job.folder / "learning_curve.json") or []
+    full = [
+        p for p in points if p.get("full", True) and p["psnr"] is not None
+    ]  # evaluations of a few images are not comparable
+    curve = tuple((float(p["seconds"]), float(p["psnr"])) for p in full)
+    profile, skips = (
+        read_json(job.folder / "scene_profile.json") or {},
+        read_json(job.folder / "skip_report.json") or [],
+    )
+    return Measured(
+        label=job.contender.label,
+        method=job.contender.method,
+        seed=job.seed,
+        psnr=results["psnr"],
+        ssim=results["ssim"],
+        ms_ssim=results.get("ms_ssim"),
+        lpips=results["lpips"],
+        floaters=results.get("floaters"),
+        views=results["num_images"],
+        steps=summary["steps"],
+        seconds=summary["seconds"],
+        rays_per_second=summary["rays_per_second"],
+        render_seconds=1 / results["fps"],
+        peak_memory_bytes=summary["peak_memory_bytes"],
+        parameters=summary["parameters"],
+        skipped_steps=summary["skipped_steps"],
+        curve=curve,
+        seconds_to=whole_levels(curve),
+        decisions=tuple(f"{d['option']}: {d['choice']}, as {d['reason']}" for d in profile.get("decisions", [])),
+        skipped=tuple(f"{skip['skipped']:.1%} of {skip['name']}" for skip in skips),
+        machine=summary["machine"],
+        command=shlex.join(["ns-train", job.contender.method, *_user_flags(job, conditions)]),
+        folder=str(job.folder),
+        lpips_note=evaluation["lpips"],
+        masks_note=evaluation.get("masks"),
+    )
+
+
+def _user_flags(job: Job, conditions: Conditions) -> list[str]:
+    """Return the flags with which a user gets the same training, without those that name the comparison's folders."""
+    flags = [*job.contender.flags, *conditions.data_flags, "--machine.seed", str(job.seed)]
+    for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
+        value = getattr(conditions, name)
+        flags += [] if value is None else ["--" + name.replace("_", "-"), str(value)]
+    return flags
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of the JSON file `path`, or None if it is missing or invalid."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def whole_levels(curve: Curve) -> dict[int, float]:
+    """Return when a curve first reached each integer PSNR, interpolated linearly between its points.
+
+    The level of the first point counts as reached there, as nothing was measured before.
+
+    Args:
+        curve: the learning curve.
+
+    Returns:
+        Integer PSNR, dB -> seconds.
+    """
+    reached: dict[int, float] = {}
+    if not curve:
+        return reached
+    seconds, psnr = curve[0]
+    reached[math.floor(psnr)] = seconds
+    best = psnr
+    for (t0, p0), (t1, p1) in pairwise(curve):
+        for level in range(math.floor(best) + 1, math.floor(p1) + 1):
+            reached[level] = t0 + (t1 - t0) * (level - p0) / (p1 - p0)
+        best = max(best, p1)
+    return reached
+
+
+@dataclass(frozen=True)
+class Row:
+    """Measurements of a contender over its seeds: means, and the standard deviation of a single run.
+
+    Args:
+        label: label of the contender.
+        runs: its finished runs.
+    """
+
+    label: str
+    runs: tuple[Measured, ...]
+    failures: tuple[str, ...]
+    """Reasons of failures of its other runs."""
+
+    def mean(self, name: str) -> float | None:
+        """Return the mean of the measurement `name` of `Measured`, or None if a run lacks it."""
+        values = [getattr(run, name) for run in self.runs]
+        return None if not values or None in values else fmean(values)
+
+    def deviation(self, name: str) -> float | None:
+        """Return the standard deviation of the measurement `name`, or None for fewer than two runs."""
+        values = [getattr(run, name) for run in self.runs]
+        return None if len(values) < 2 or None in values else stdev(values)
+
+    def seconds_to(self, level: int) -> float | None:
+        """Return the mean seconds to the PSNR `level`, or None if a run did not reach it or started above it."""
+        values = [run.seconds_to.get(level) for run in self.runs]
+        reached = [value for value in values if value is not None]
+        return fmean(reached) if reached and len(reached) == len(values) else None
+
+    def seconds_before(self, level: int) -> float | None:
+        """Return the seconds of the first evaluation, the latest of the runs, if all had more than `level` there."""
+        firsts = [min(run.seconds_to.items(), default=(-math.inf, 0.0)) for run in self.runs]
+        return max((s for _, s in firsts), default=None) if all(level < first for first, _ in firsts) else None
+
+
+def rows_of(labels: Sequence[str], runs: Sequence[Measured], failures: dict[str, list[str]]) -> list[Row]:
+    """Return a row for each contender.
+
+    Args:
+        labels: labels of the contenders, in the order of the rows.
+        runs: measurements of all finished runs.
+        failures: label -> reasons of failures.
+    """
+    return [
+        Row(label, tuple(run for run in runs if run.label == label), tuple(failures.get(label, ()))) for label in labels
+    ]
+
+
+def pareto(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return which points are on the Pareto front: no other has at most the cost and at least the quality.
+
+    Args:
+        points: pairs (cost, quality): lower cost is better, and costs within `SAME_TIME` are equal; higher quality is
+            better. Another point must be strictly better in one of the two.
+    """
+
+    def dominated(cost: float, quality: float) -> bool:
+        no_costlier = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]
+        return any(q > quality or (q == quality and c < cost * (1 - SAME_TIME)) for c, q in no_costlier)
+
+    return [not dominated(*point) for point in points]

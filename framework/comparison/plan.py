@@ -1,0 +1,275 @@
+"""The plan of a comparison: contenders, conditions, and the commands of each run."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import zlib
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfloom.base.child import python_command
+from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.registry import entry_of
+from nerfloom.training.run import write_json
+
+FIRST_SEED = 42
+"""Seed of the first run of each contender; the others follow it."""
+CURVE_POINTS = 8
+"""Number of evaluations during a run, the points of its learning curve."""
+LEAST_VIEWS = 25
+"""Minimum number of held-out views of a final evaluation whose number follows the budget."""
+PICTURES = 3
+"""Number of views of which pictures are written, those that a report shows."""
+
+
+def split_words(text: str, flag: str) -> tuple[str, ...]:
+    """Split the value of a flag into words as a shell does.
+
+    Args:
+        text: the value.
+        flag: name of the flag, for messages.
+
+    Raises:
+        ConfigError: if a quote is not closed.
+    """
+    try:
+        return tuple(shlex.split(text))
+    except ValueError as error:
+        raise ConfigError(f"{flag}: {shown(text)} is invalid: {error}") from error
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method with its own flags.
+
+    Args:
+        method: name of the method.
+        flags: its flags.
+    """
+
+    label: str
+    """The method's name and its flags, as the user wrote them."""
+    method: str
+    flags: tuple[str, ...]
+
+    @classmethod
+    def of(cls, text: str) -> Contender:
+        """Construct from `text`: a name, or a name and flags, such as "vanilla-nerf --sampler occupancy".
+
+        Raises:
+            ConfigError: for an unknown method, or a quote that is not closed.
+        """
+        words = split_words(text, "--methods")
+        if not words:
+            raise FlagError("--methods holds an empty name")
+        entry_of("methods", words[0])
+        return cls(" ".join(text.split()), words[0], words[1:])
+
+    @property
+    def slug(self) -> str:
+        """Name of the contender's folder: readable, and different for different labels."""
+        readable = re.sub(r"[^a-z0-9]+", "-", self.label.lower()).strip("-")[:48]
+        return readable if readable == self.label else f"{readable}-{zlib.crc32(self.label.encode()):08x}"
+
+
+def views_for(max_seconds: float | None) -> int | None:
+    """Return how many held-out views a final evaluation is over, if the user does not say: one a second of training.
+
+    So an evaluation takes no longer than the training whose result it is, which over all views it does after short
+    runs. Views are evenly spaced, and the same for all methods.
+
+    Args:
+        max_seconds: seconds of training; None if it does not end by the clock.
+
+    Returns:
+        A number of views; None for all.
+    """
+    return None if max_seconds is None else max(LEAST_VIEWS, round(max_seconds))
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Settings shared by all runs of a comparison."""
+
+    data: str | None
+    """Absolute path of the data folder; None for the embedded scene."""
+    data_flags: tuple[str, ...]
+    """Flags of the data format."""
+    max_seconds: float | None
+    """Seconds of training."""
+    max_num_iterations: int | None
+    """Steps of training."""
+    target_psnr: float | None
+    """PSNR on the validation views at which training stops, dB."""
+    num_threads: int | None
+    """CPU threads; None for all."""
+    device_type: str
+    """Device of training and evaluation."""
+    curve_images: int
+    """Maximum number of views of the learning curve; 0 for no curve."""
+    max_eval_images: int | None
+    """Maximum number of views of the final evaluation; None for all."""
+    lpips_weights: str | None = None
+    """Absolute path of the file of LPIPS's weights; None to look for the lpips package."""
+
+    def __post_init__(self) -> None:
+        if self.max_seconds is None and self.max_num_iterations is None and self.target_psnr is None:
+            raise FlagError(
+                "set how long each method trains: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
+            )
+        for name in ("max_seconds", "max_num_iterations", "target_psnr"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise FlagError(f"--{name.replace('_', '-')} is {value}; it must be more than 0")
+        if self.curve_images < 0 or (self.max_eval_images is not None and self.max_eval_images < 1):
+            raise FlagError("--curve-images must be at least 0, --max-eval-images at least 1")
+
+    def budget(self) -> str:
+        """Return a description of how long each method trains."""
+        parts = [
+            (self.max_seconds, f"{self.max_seconds:g} s of training" if self.max_seconds else ""),
+            (self.max_num_iterations, f"{self.max_num_iterations} steps"),
+            (self.target_psnr, f"until {self.target_psnr} dB on the validation views"),
+        ]
+        return ", ".join(text for value, text in parts if value is not None)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One contender with one seed.
+
+    Args:
+        contender: the contender.
+        seed: the seed.
+    """
+
+    contender: Contender
+    seed: int
+    runs: Path
+    """Folder of all runs."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of this run."""
+        return self.runs / self.contender.slug / self.contender.method / f"seed-{self.seed}"
+
+    @property
+    def log(self) -> Path:
+        """File of the output of the run's commands."""
+        return self.runs / self.contender.slug / f"seed-{self.seed}.log"
+
+    @property
+    def evaluation(self) -> Path:
+        """File of the results of the final model on all views."""
+        return self.folder / "eval_all.json"
+
+    @property
+    def pictures(self) -> Path:
+        """Folder of renders and comparisons of all views."""
+        return self.folder / "views"
+
+    @property
+    def title(self) -> str:
+        """Description of the job for messages."""
+        return f"{self.contender.label}, seed {self.seed}"
+
+    def train_command(self, conditions: Conditions) -> list[str]:
+        """Return the command that trains under `conditions`, or resumes training if the run has started."""
+        start = python_command("nerfloom.cli.train")
+        if (self.folder / "config.yml").exists():
+            return [*start, "--resume", str(self.folder)]
+        c, flags = conditions, ["--vis", "none", "--eval", "all", "--max-eval-images", str(conditions.curve_images)]
+        for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
+            if getattr(c, name) is not None:
+                flags += ["--" + name.replace("_", "-"), str(getattr(c, name))]
+        if c.curve_images and c.max_seconds is not None:
+            flags += ["--seconds-per-eval-all-images", str(c.max_seconds / CURVE_POINTS)]
+        elif c.curve_images and c.max_num_iterations is not None:
+            flags += ["--steps-per-eval-all-images", str(max(c.max_num_iterations // CURVE_POINTS, 1))]
+        if c.num_threads is not None:
+            flags += ["--machine.num-threads", str(c.num_threads)]
+        flags += ["--machine.device-type", c.device_type, "--machine.seed", str(self.seed)]
+        flags += ["--output-dir", str(self.runs), "--experiment-name", self.contender.slug]
+        flags += ["--timestamp", self.folder.name]
+        # A contender's own flags come last, so that they take precedence.
+        return [*start, self.contender.method, *flags, *self.contender.flags, *c.data_flags]
+
+    def eval_command(self, conditions: Conditions) -> list[str]:
+        """Return the command that evaluates the trained model under `conditions`."""
+        command = python_command("nerfloom.cli.evaluate", "--load-config", self.folder / "config.yml")
+        command += ["--output-path", str(self.evaluation), "--render-output-path", str(self.pictures)]
+        command += ["--max-pictures", str(PICTURES), "--device-type", conditions.device_type]
+        if conditions.max_eval_images is not None:
+            command += ["--max-images", str(conditions.max_eval_images)]
+        if conditions.lpips_weights is not None:
+            command += ["--lpips-weights", conditions.lpips_weights]
+        return command
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A comparison.
+
+    Args:
+        contenders: the contenders.
+        conditions: the conditions shared by all runs.
+    """
+
+    contenders: tuple[Contender, ...]
+    conditions: Conditions
+    repeats: int
+    """Number of seeds for each contender."""
+    folder: Path
+    """Output folder."""
+
+    def __post_init__(self) -> None:
+        labels = [contender.label for contender in self.contenders]
+        if not labels:
+            raise FlagError("--methods is empty; list methods, as in --methods instant-ngp kplanes")
+        duplicates = sorted({label for label in labels if labels.count(label) > 1})
+        if duplicates:
+            raise FlagError(f"--methods has {', '.join(map(repr, duplicates))} twice; use --repeats for several runs")
+        if self.repeats < 1:
+            raise FlagError(f"--repeats is {self.repeats}; it must be at least 1")
+
+    def jobs(self) -> list[Job]:
+        """Return all runs, seed by seed, so that every contender has a first result early."""
+        seeds = range(FIRST_SEED, FIRST_SEED + self.repeats)
+        return [Job(contender, seed, self.folder / "runs") for seed in seeds for contender in self.contenders]
+
+    def claim_folder(self) -> None:
+        """Write the conditions, so that a later call continues under the same ones.
+
+        Raises:
+            ConfigError: if the folder holds a comparison under other conditions, or cannot be written.
+        """
+        path, conditions = self.folder / "conditions.json", json.loads(json.dumps(asdict(self.conditions)))
+        if path.exists():
+            differing = _differences(_read(path), conditions)
+            if differing:
+                raise ConfigError(
+                    f"{self.folder} holds a comparison under other conditions ({differing}); "
+                    "choose another --output-dir"
+                )
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(path, conditions)
+        except OSError as error:
+            raise ConfigError(f"cannot write {self.folder}: {error.strerror}") from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}; remove it, or choose another --output-dir") from error
+    return content if isinstance(content, dict) else {}
+
+
+def _differences(previous: dict[str, Any], conditions: dict[str, Any]) -> str:
+    names = [name for name in conditions if previous.get(name) != conditions[name]]
+    return ", ".join(f"{name} {previous.get(name)}, not {conditions[name]}" for name in names)

@@ -1,0 +1,310 @@
+"""Batches of training pixels; rays are computed only for the pixels drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from nerfloom.cameras.cameras import CENTER
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.depths import ray_distances
+from nerfloom.data.pixels.error_map import ErrorMap
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.argument_checks import check_indices
+from nerfloom.kernels.dispatch import CPP, Operation
+
+Background = Literal["random", "white", "black"]
+"""Kind of background."""
+LookUp = Callable[[Tensor], Tensor]
+"""Function from pixels (R,) int64 to their stored colours (R, 3 or 4) uint8."""
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """R pixels to train on."""
+
+    pixels: Tensor
+    """(R,) int64 numbers of the pixels, counted through all images."""
+    rays: Rays
+    """R * K rays, those of a pixel consecutive; if K is 1, through the pixel's centre."""
+    rgb: Tensor
+    """(R, 3) colours over `background`."""
+    background: Tensor
+    """(R, 3) colours behind transparent pixels."""
+    alpha: Tensor | None
+    """(R,) opacity, if the images have alpha."""
+    distances: Tensor | None = None
+    """(R,) known distance along the pixel's ray, 0 where unknown; None if no pixel has one."""
+    deviations: Tensor | None = None
+    """(R,) standard deviation of `distances`, if they are those of a reconstruction's points; None if they were
+    measured, by depth images."""
+    clear: Tensor | None = None
+    """(R,) distance before which the pixel's image shows nothing; None if that is not known."""
+    weights: Tensor | None = None
+    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly or differ in size."""
+
+    def __len__(self) -> int:
+        return self.pixels.shape[0]
+
+    def __getitem__(self, chosen: Tensor) -> PixelBatch:
+        """Return the pixels of a mask (R,) bool, or of indices (Q,) int64, with their rays."""
+        index = chosen.nonzero().squeeze(-1) if chosen.dtype is torch.bool else chosen
+        of_pixels = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rays"}
+        some: dict[str, Any] = {name: value[index] for name, value in of_pixels.items() if value is not None}
+        per_pixel = self.rays_per_pixel
+        rays = (index[:, None] * per_pixel + torch.arange(per_pixel, device=index.device)).view(-1)
+        return replace(self, rays=self.rays[rays], **some)
+
+    @property
+    def rays_per_pixel(self) -> int:
+        """K, rays of a pixel."""
+        return max(len(self.rays) // max(len(self), 1), 1)
+
+
+def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
+    """Return a batch without some of its transparent pixels, and which pixels (Q,) int64 are left.
+
+    Those that are left count as many times more as there were, so that the mean of a loss has the same expectation.
+
+    Args:
+        batch: pixels with alpha.
+        share: probability with which a pixel of alpha 0 is kept.
+    """
+    assert batch.alpha is not None
+    transparent = batch.alpha == 0
+    kept = (~transparent | (torch.rand(len(batch), device=transparent.device) < share)).nonzero().squeeze(-1)
+    left = batch[kept]
+    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(left) / max(len(batch), 1))
+    return replace(left, weights=weights if left.weights is None else weights * left.weights), kept
+
+
+@dataclass(frozen=True)
+class ViewBatch:
+    """One whole image to learn from."""
+
+    index: int
+    """Which training image."""
+    view: View
+    """Its camera."""
+    rgb: Tensor
+    """(H, W, 3) colours over `background`."""
+    background: Tensor
+    """(3,) what shows where the image is transparent."""
+    alpha: Tensor | None = None
+    """(H, W) opacity, where the images have it."""
+    kept: Tensor | None = None
+    """(H, W) bool, pixels that count; None for all."""
+    distances: Tensor | None = None
+    """(H, W) distance along each pixel's ray, 0 where unknown: measured, or that of a reconstruction's point; None if
+    none is known."""
+
+    def __len__(self) -> int:
+        return self.rgb.shape[0] * self.rgb.shape[1]
+
+
+def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
+    """Return the background behind transparent pixels in training.
+
+    Args:
+        asked: the configured background; "auto" is random for images with alpha, else black.
+        has_alpha: whether the images have alpha.
+    """
+    if asked != "auto":
+        return asked
+    return "random" if has_alpha else "black"
+
+
+def background_colors(kind: Background, count: int, device: torch.device) -> Tensor:
+    """Return background colours (count, 3) in [0, 1].
+
+    Args:
+        kind: "random" is another colour for each pixel, so that no fixed background can be learnt.
+        count: number of pixels.
+        device: device of the result.
+    """
+    if kind == "random":
+        return torch.rand(count, 3, device=device)
+    return torch.full((count, 3), 1.0 if kind == "white" else 0.0, device=device)
+
+
+def composite(rgba: Tensor, background: Tensor) -> Tensor:
+    """Composite straight-alpha colours `rgba` (R, 4) over `background` (R, 3); colours (R, 3) stay unchanged."""
+    if rgba.shape[-1] == 3:
+        return rgba
+    return rgba[..., :3] * rgba[..., 3:] + background * (1 - rgba[..., 3:])
+
+
+def draw_pixels(dataset: Dataset, count: int) -> Tensor:
+    """Draw `count` pixels of `dataset` uniformly from those to be drawn, with replacement, by PyTorch's generator."""
+    device = dataset.pixels.device
+    if dataset.drawn is None:
+        return torch.randint(len(dataset.pixels), (count,), device=device)
+    return dataset.drawn.at(torch.randint(len(dataset.drawn), (count,), device=device))
+
+
+def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
+    """Draw `count` pixels of `num_images` images only, which are drawn too, by PyTorch's generator.
+
+    Args:
+        dataset: the images.
+        count: number of pixels.
+        num_images: number of images, each of which has about as many of the pixels; one may be drawn twice.
+    """
+    drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
+    ranks = ends if drawn is None else drawn.ranks(ends)
+    sizes = ranks.diff()
+    some = sizes.nonzero()[:, 0]
+    images = some[torch.randint(len(some), (min(num_images, count),), device=some.device)]
+    images = images.repeat(-(-count // len(images)))[:count].sort().values
+    place = torch.randint(2**62, (count,), device=some.device)  # so large that the remainder has no bias
+    chosen = ranks[images] + place % sizes[images]
+    return chosen if drawn is None else drawn.at(chosen)
+
+
+def draw_batch(
+    dataset: Dataset,
+    count: int,
+    background: Background,
+    errors: ErrorMap | None = None,
+    subpixels: Tensor = CENTER,
+    look_up: LookUp | None = None,
+    keypoints: int = 0,
+    num_images: int | None = None,
+) -> PixelBatch:
+    """Draw a batch of pixels.
+
+    Of pixels with a sparse depth, some are drawn besides: they are few, and each tells where its surface is, and that
+    the space before it is empty. Their colours count as those of all others.
+
+    Args:
+        dataset: the training images.
+        count: number of pixels R.
+        background: kind of background.
+        errors: draw in proportion to these errors; uniformly if None.
+        subpixels: (K, 2) positions in a pixel through which its rays pass, as in `Cameras.pixel_rays`.
+        look_up: for pixels in a file, returns the stored colours of all drawn pixels, in the order of drawing
+            (`PixelStream.look_up`).
+        keypoints: number of these pixels that are drawn from `dataset.sparse_depth`; they stand last.
+        num_images: number of images of which the other pixels are; None for all.
+    """
+    uniform, sparse = count - keypoints, dataset.sparse_depth
+    # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
+    drawn = uniform if errors is None else 2 * uniform
+    flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
+    stored = None
+    if not dataset.resident:
+        stored = dataset.stored(flat) if look_up is None else look_up(flat).to(dataset.device)
+        flat = flat.to(dataset.device)
+    behind, weights = background_colors(background, count, dataset.device), None
+    if errors is not None:
+        selected, weights = errors.choose(flat, uniform)
+        flat, stored = flat[selected], None if stored is None else stored[selected]
+        weights = torch.cat([weights, weights.new_ones(keypoints)])
+    if not keypoints or sparse is None:
+        batch = gather_batch(dataset, flat, behind, subpixels, stored)
+    else:
+        chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
+        if stored is not None:
+            stored = torch.cat([stored, dataset.stored(sparse.pixels[chosen])])
+        batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
+        distances, deviations = (
+            torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)
+        )
+        batch = replace(batch, distances=distances, deviations=deviations)
+    if weights is None:
+        return batch
+    return replace(batch, weights=weights if batch.weights is None else weights * batch.weights)
+
+
+def gather_batch(
+    dataset: Dataset, flat: Tensor, behind: Tensor, subpixels: Tensor = CENTER, stored: Tensor | None = None
+) -> PixelBatch:
+    """Construct a batch of given pixels.
+
+    Args:
+        dataset: the images.
+        flat: (R,) numbers of the pixels, counted through all images.
+        behind: (R, 3) background colours.
+        subpixels: (K, 2) positions in a pixel through which its rays pass.
+        stored: (R, 3 or 4) uint8 stored colours; looked up if None.
+    """
+    scene = dataset.scene
+    rays = dataset.cameras.pixel_rays(flat, scene.near, scene.far, dataset.times, subpixels)
+    if stored is None and not dataset.resident:
+        stored = dataset.stored(flat)
+    if stored is None:
+        rgb, alpha = gather_colors(dataset.pixels, flat, behind)
+    else:
+        rgb, alpha = gather_colors(stored, torch.arange(len(flat), device=flat.device), behind)
+    if dataset.opaque is not None:
+        opaque = dataset.opaque.contains(flat)
+        rgb, alpha = torch.where(opaque[:, None], rgb, behind), opaque * (1.0 if alpha is None else alpha)
+    weights = None
+    if dataset.image_weights is not None and rays.camera_indices is not None:
+        weights = dataset.image_weights[rays.camera_indices[:: len(subpixels)]]
+    return PixelBatch(flat, rays, rgb, behind, alpha, known_distances(dataset, flat, rays), weights=weights)
+
+
+def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None:
+    """Return the measured distance (R,) along the rays of pixels, 0 where unknown; None without depth images.
+
+    Args:
+        dataset: the images.
+        flat: (R,) numbers of the pixels, counted through all images.
+        rays: R * K rays through them, those of a pixel consecutive.
+    """
+    if dataset.depths is None or rays.camera_indices is None:
+        return None
+    per_pixel = len(rays) // max(len(flat), 1)
+    cameras = rays.camera_indices[::per_pixel] if len(flat) else rays.camera_indices
+    directions = rays.directions.view(len(flat), per_pixel, 3).mean(1)
+    poses = dataset.cameras.camera_to_worlds[cameras]
+    return ray_distances(dataset.depths[flat], torch.nn.functional.normalize(directions, dim=-1), poses)
+
+
+def gather_colors_reference(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Compute `gather_colors` of `pixels`, `flat` and `behind` in PyTorch, on any device."""
+    check_indices(flat, len(pixels), "pixels")
+    rgba = pixels[flat].float() / 255
+    return composite(rgba, behind), rgba[:, 3] if rgba.shape[-1] == 4 else None
+
+
+def gather_colors(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Return the colours of pixels over a background.
+
+    Args:
+        pixels: (P, 3 or 4) uint8 stored pixels; the fourth channel is straight alpha.
+        flat: (R,) numbers of the pixels.
+        behind: (R, 3) background colours.
+
+    Returns:
+        Colours (R, 3), and opacities (R,), or None for three channels.
+
+    Raises:
+        IndexError: if a number exceeds the number of pixels.
+    """
+    return GATHER_COLORS((behind,), pixels, flat, behind)
+
+
+GATHER_COLORS = Operation("gather_colors", gather_colors_reference)
+
+
+@GATHER_COLORS.implementation(CPP, order=0)
+def _compiled(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    count, channels = len(flat), pixels.shape[1]
+    rgb, alpha = torch.empty(count, 3), torch.empty(count)
+    _gather_colors(
+        native.pointer(flat, "pixel indices", (count,), torch.int64), count,
+        native.pointer(pixels, "pixels", (len(pixels), channels), torch.uint8), len(pixels), channels,
+        native.pointer(behind, "the background", (count, 3)), rgb.data_ptr(), alpha.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return rgb, alpha if channels == 4 else None
+
+
+_gather_colors = native.Function("gather_colors", "pqpqipppi")

@@ -1,0 +1,197 @@
+"""Installation of a public data set: archives are fetched and unpacked, and scenes put where ns-train finds them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError, nearest
+from nerfloom.downloads.catalogue import Archive, Dataset, Source
+from nerfloom.downloads.fetch import SourceError, fetch
+from nerfloom.downloads.unpack import Place, names_of, unpack
+from nerfloom.training.data_folder import find_data
+from nerfloom.training.lock import sole_user
+
+UNFINISHED = ".downloads"
+"""Folder, beside the data sets, of archives and of scenes that are not yet complete."""
+IGNORED = ("__MACOSX", ".DS_Store")
+"""Names in zip files that macOS adds to them."""
+NOTES = ("readme", "license", "licence")
+"""Starts of the names of files about all scenes, which are put beside them."""
+
+
+def install(
+    name: str,
+    dataset: Dataset,
+    save_dir: Path,
+    scenes: Sequence[str] = (),
+    archive: Path | None = None,
+    keep_archives: bool = False,
+) -> list[Path]:
+    """Download the scenes of a data set that are not there yet.
+
+    Args:
+        name: name of the data set, and of its folder.
+        dataset: the data set.
+        save_dir: folder of the data sets, created if missing.
+        scenes: names of the scenes; all if empty.
+        archive: an archive that is there already, downloaded by hand; None to download what is needed.
+        keep_archives: keep archives after they are unpacked.
+
+    Returns:
+        The scenes' folders, `save_dir / name / scene`, each of which a data format recognises.
+
+    Raises:
+        ConfigError: if the data set has no such scene, or the folder cannot be written.
+        DataError: if an archive cannot be had, is unsafe or does not hold the scenes. Scenes that were complete stay.
+    """
+    chosen = _chosen(name, dataset, scenes)
+    folder, unfinished = save_dir / name, save_dir / UNFINISHED
+    _make_writable(unfinished)
+    with sole_user(unfinished):
+        for wanted in _archives(dataset, archive):
+            missing = [scene for scene in wanted.scenes if scene in chosen and not (folder / scene).exists()]
+            if not missing:
+                continue
+            file = archive or unfinished / wanted.name
+            if archive is None and not file.exists():
+                _fetch_from_any(wanted, dataset, file)
+            _put_in_place(wanted, file, missing, folder, unfinished / f"{wanted.name}.unpacked")
+            if archive is None and not keep_archives:
+                file.unlink()
+    absent = [scene for scene in chosen if not (folder / scene).exists()]
+    if absent:
+        raise DataError(f"{archive} does not hold {', '.join(absent)}; name what it holds by --scenes")
+    return [folder / scene for scene in chosen]
+
+
+def announce(name: str, dataset: Dataset, save_dir: Path, scenes: Sequence[str] = ()) -> None:
+    """Say what will be downloaded: its licence, its size, from where and whether the address was ever tried.
+
+    Args:
+        name: name of the data set.
+        dataset: the data set.
+        save_dir: folder of the data sets.
+        scenes: names of the scenes; all if empty.
+
+    Raises:
+        ConfigError: if the data set has no such scene.
+    """
+    chosen = _chosen(name, dataset, scenes)
+    say(f"{dataset.title}: {dataset.page}")
+    say(f"licence: {dataset.licence}")
+    for archive in dataset.archives:
+        missing = [scene for scene in archive.scenes if scene in chosen and not (save_dir / name / scene).exists()]
+        if missing:
+            hosts = ", else ".join(f"{_host(source)} ({_tried(source)})" for source in archive.sources)
+            say(f"to download: {archive.name}, {size_of(archive)}, from {hosts}, for {', '.join(missing)}")
+
+
+def size_of(archive: Archive) -> str:
+    """Return the size of an `archive` in words."""
+    return "of unknown size" if archive.gigabytes is None else f"about {archive.gigabytes:g} GB"
+
+
+def _host(source: Source) -> str:
+    return urlsplit(source.url).hostname or source.url
+
+
+def _tried(source: Source) -> str:
+    return f"tried on {source.tried}" if source.tried else "an address that nerfloom's authors have not tried"
+
+
+def _chosen(name: str, dataset: Dataset, scenes: Sequence[str]) -> list[str]:
+    for scene in scenes:
+        if scene not in dataset.scenes:
+            raise ConfigError(f"--scenes: {name} has no scene '{scene}'. {nearest(scene, dataset.scenes)}")
+    return list(dict.fromkeys(scenes)) or list(dataset.scenes)
+
+
+def _make_writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot write {folder.parent}: {error.strerror}; name another --save-dir") from error
+    if not os.access(folder, os.W_OK):
+        raise ConfigError(f"cannot write {folder}; name another --save-dir")
+
+
+def _archives(dataset: Dataset, given: Path | None) -> tuple[Archive, ...]:
+    """Return the archives of a data set; of one that is given, only that of its name, or all if there is none."""
+    if given is None:
+        return dataset.archives
+    if not given.is_file():
+        raise ConfigError(f"--archive {given}: there is no such file")
+    return tuple(archive for archive in dataset.archives if archive.name == given.name) or dataset.archives
+
+
+def _fetch_from_any(archive: Archive, dataset: Dataset, file: Path) -> None:
+    """Fetch an archive from the first of its sources that has it."""
+    problems = []
+    for source in archive.sources:
+        try:
+            fetch(source, file)
+            return
+        except SourceError as error:
+            problems.append(str(error))
+            if source is not archive.sources[-1]:
+                say(f"warning: {error}; the next source is tried")
+    by_hand = f"download {archive.name} in a browser, see {dataset.page}, and pass it by --archive FILE"
+    raise DataError(f"{'; '.join(problems)}. If it does not go away: {by_hand}")
+
+
+def _put_in_place(archive: Archive, file: Path, scenes: list[str], folder: Path, unpacked: Path) -> None:
+    """Unpack some scenes of an archive, check that each is recognised, and rename them into `folder`."""
+    shutil.rmtree(unpacked, ignore_errors=True)  # of a process that was killed
+    try:
+        place = _placement(archive, scenes, names_of(file))
+        unpack(file, unpacked, place)
+        for scene in scenes:
+            if not (unpacked / scene).is_dir():
+                continue
+            try:
+                find_data(unpacked / scene)
+            except DataError as error:
+                raise DataError(f"{file}: {scene} is in no known data format; the archive has changed") from error
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in sorted(unpacked.iterdir()):
+            if not (folder / path.name).exists():
+                os.replace(path, folder / path.name)
+    finally:
+        shutil.rmtree(unpacked, ignore_errors=True)
+
+
+def _placement(archive: Archive, scenes: Sequence[str], names: Sequence[tuple[str, ...]]) -> Place:
+    """Return where the files of an archive go: those below a scene's folder into a folder of its name.
+
+    Args:
+        archive: the archive.
+        scenes: the scenes to unpack.
+        names: paths of all its files, in parts.
+    """
+    only = archive.scenes[0] if len(archive.scenes) == 1 else None
+    # The folder of a single scene may have another name, or none.
+    renamed = only is not None and not any(only in parts[:-1] for parts in names)
+    kept = [parts for parts in names if not _is_ignored(parts)]
+    top = 1 if renamed and len({parts[0] for parts in kept}) == 1 and all(len(parts) > 1 for parts in kept) else 0
+
+    def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
+        if _is_ignored(parts):
+            return None
+        if renamed and only is not None:
+            return (only, *parts[top:]) if only in scenes else None
+        for index, part in enumerate(parts[:-1]):
+            if part in archive.scenes:  # the outermost: a scene may hold a folder of another one's name
+                return parts[index:] if part in scenes else None
+        is_note = len(parts) <= 2 and parts[-1].lower().startswith(NOTES)
+        return parts[-1:] if is_note else None
+
+    return place
+
+
+def _is_ignored(parts: tuple[str, ...]) -> bool:
+    return any(part in IGNORED or part.startswith("._") for part in parts)

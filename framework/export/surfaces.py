@@ -1,0 +1,83 @@
+"""Points on the surfaces of a scene, found by a short run of a field: where Gaussians may start."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.console import track
+from nerfloom.data.dataset import Dataset
+
+PASSES = 16
+"""Maximum number of times that rays are drawn, of which some end on no surface."""
+
+
+@dataclass(frozen=True)
+class FoundSurfaces:
+    """N points on surfaces, and the pixels of training images that show them."""
+
+    positions: Tensor
+    """(N, 3) scene coordinates."""
+    colors: Tensor
+    """(N, 3) colours in [0, 1]."""
+    images: Tensor
+    """(N,) int64 which image shows the point."""
+    pixels: Tensor
+    """(N,) int64 number of the pixel in that image, row by row."""
+    distances: Tensor
+    """(N,) distance from that image's camera, scene units."""
+
+
+def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: float, count: int) -> FoundSurfaces:
+    """Train a field for a few steps, and return points on the surfaces that it has found.
+
+    The field is that of instant-ngp, or that of nerfacto where there may be something outside the scene's box, which
+    instant-ngp does not see.
+
+    Args:
+        dataset: the images.
+        config: settings of the run that asks; machine and background are taken from it.
+        steps: maximum number of training steps of the field.
+        seconds: maximum time of its training, seconds; infinity for no maximum.
+        count: maximum number of points.
+
+    Returns:
+        The points; there are fewer than `count` where rays end on no surface, and possibly none.
+    """
+    from nerfloom.export.points import SurfacePoints, joined, surface_points
+    from nerfloom.registry import load_method
+    from nerfloom.training.run import Run
+    from nerfloom.training.trainer import Trainer
+
+    method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
+    # instant-ngp's settings and rates are those of its few seconds; nerfacto's are not (docs/notes/splatting.md).
+    limit = seconds if method == "instant-ngp" and seconds < math.inf else None
+    settings = replace(
+        load_method(method).config,
+        max_num_iterations=steps,
+        max_seconds=limit,
+        vis="none",
+        machine=config.machine,
+        background=config.background,
+    )
+    trainer = Trainer(Run(method, settings, "", cast("Any", None), Path()), dataset, None)
+    for _ in track(range(steps), "Looking for surfaces", total=steps):
+        trainer.train_step()
+        if trainer.state.seconds >= seconds:
+            break
+    model = trainer.model.eval()
+    parts: list[SurfacePoints] = []
+    while (left := count - sum(len(part.positions) for part in parts)) > 0 and len(parts) < PASSES:
+        found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
+        parts.append(found[torch.arange(len(found.positions)) < left])
+    found, cameras = joined(iter(parts)), dataset.cameras.to("cpu")
+    images = torch.searchsorted(cameras.offsets, found.pixels, right=True) - 1
+    distances = (found.positions - cameras.camera_to_worlds[images, :, 3]).norm(dim=-1)
+    columns = (found.positions, found.colors, images, found.pixels - cameras.offsets[images], distances)
+    return FoundSurfaces(*(column.to(dataset.device) for column in columns))

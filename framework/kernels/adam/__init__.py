@@ -1,0 +1,1 @@
+"""Adam, and gradients that wait for it."""

@@ -1,0 +1,214 @@
+// Adam on entries of a table: what adam.cpp and hash_grid.cpp share. See ../adam.py for what is computed.
+#pragma once
+
+#include "runtime/common.h"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+#include <vector>
+
+namespace adam {
+
+// 1 / (1 - beta^k) for k = 1, 2, ... until it is 1 in float32.
+inline std::vector<float> corrections(double beta) {
+    std::vector<float> out{1.0f};
+    double power = beta;
+    while (power > 1e-8 && out.size() < (1u << 24)) {
+        out.push_back(float(1 / (1 - power)));
+        power *= beta;
+    }
+    out.push_back(1.0f);
+    return out;
+}
+
+inline bool all_zero(const float* values) {
+    int32_t bits[LANES], any = 0;
+    std::memcpy(bits, values, sizeof bits);
+    for (int i = 0; i < LANES; i++) any |= bits[i];
+    return (any & 0x7fffffff) == 0;
+}
+
+struct Settings {
+    float keep1, add1, keep2, add2, rate, eps;
+    std::vector<float> unbias1, unbias2;  // by how often an entry has been updated
+    std::vector<uint64_t> unbias;         // the bits of both, those of the first moment below
+    float settled;                        // updates from which on both are 1: the last index of each table
+
+    Settings(float rate, double beta1, double beta2, float eps)
+        : keep1(float(beta1)), add1(float(1 - beta1)), keep2(float(beta2)), add2(float(1 - beta2)), rate(rate),
+          eps(eps), unbias1(corrections(beta1)), unbias2(corrections(beta2)) {
+        const size_t size = std::max(unbias1.size(), unbias2.size());
+        unbias1.resize(size, 1.0f), unbias2.resize(size, 1.0f);
+        settled = float(size - 1);
+        for (size_t k = 0; k < size; k++) {
+            uint32_t first, second;
+            std::memcpy(&first, &unbias1[k], sizeof first);
+            std::memcpy(&second, &unbias2[k], sizeof second);
+            unbias.push_back(uint64_t(second) << 32 | first);
+        }
+    }
+    size_t index(float updates) const { return size_t(updates < settled ? updates : settled); }
+};
+
+// Moves LANES values where `mask` is set; the gradient is cleared. Corrections may be 1 or vectors.
+template <typename Factor>
+inline void move(float* values, float* mean, float* square, float* grad, Ints mask, Factor unbias1, Factor unbias2,
+                 const Settings& s) {
+    const Floats g = load(grad), m0 = load(mean), v0 = load(square);
+    const Floats m = s.keep1 * m0 + s.add1 * g, v = s.keep2 * v0 + s.add2 * g * g;
+    alignas(64) float root[LANES];
+    store(root, unbias2 * v);
+    for (int i = 0; i < LANES; i++) root[i] = std::sqrt(root[i]);
+    const Floats p = load(values), moved = p - s.rate * unbias1 * m / (load(root) + s.eps);
+    store(values, mask ? moved : p);
+    store(mean, mask ? m : m0);
+    store(square, mask ? v : v0);
+    store(grad, splat(0));
+}
+
+// As many 64-bit integers as there are pairs of lanes, and one number for each pair.
+typedef uint64_t Longs __attribute__((vector_size(LANES * 4)));
+typedef int32_t PairInts __attribute__((vector_size(LANES * 2)));
+typedef float PairFloats __attribute__((vector_size(LANES * 2)));
+constexpr int PAIRS = LANES / 2;
+
+// value(0), value(1), ... in a vector that is put together in registers: a load would wait for many small stores.
+template <typename Vector, size_t... I, typename Value>
+inline Vector each(std::index_sequence<I...>, const Value& value) { return Vector{value(I)...}; }
+
+template <typename To, typename From>
+inline To same_bits(From from) {
+    static_assert(sizeof(To) == sizeof(From));
+    To to;
+    std::memcpy(&to, &from, sizeof to);
+    return to;
+}
+
+// Which of LANES values belong to an entry of F values with a gradient.
+template <int F>
+inline Ints with_gradient(const float* grad) {
+    if constexpr (F == 1) {
+        return (same_bits<Ints>(load(grad)) & 0x7fffffff) != 0;
+    } else if constexpr (F == 2) {
+        return same_bits<Ints>((same_bits<Longs>(load(grad)) & 0x7fffffff7fffffff) != 0);
+    } else {
+        uint64_t any[LANES / F];
+        for (int e = 0; e < LANES / F; e++) {
+            uint64_t bits[F / 2], all = 0;
+            std::memcpy(bits, grad + e * F, sizeof bits);
+            for (int i = 0; i < F / 2; i++) all |= bits[i];
+            any[e] = 0 - uint64_t((all & 0x7fffffff7fffffff) != 0);
+        }
+        return same_bits<Ints>(each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return any[i * 2 / F]; }));
+    }
+}
+
+// Counts the updates of LANES / F entries, and looks up their corrections, which each of their values gets.
+template <int F>
+inline void count(Ints any, float* seen, Floats& unbias1, Floats& unbias2, const Settings& s) {
+    if constexpr (F == 1) {
+        const Floats updates = load(seen) - __builtin_convertvector(any, Floats);
+        store(seen, updates);
+        const Ints k = __builtin_convertvector(smaller(updates, splat(s.settled)), Ints);
+        unbias1 = each<Floats>(std::make_index_sequence<LANES>(), [&](size_t i) { return s.unbias1[size_t(k[i])]; });
+        unbias2 = each<Floats>(std::make_index_sequence<LANES>(), [&](size_t i) { return s.unbias2[size_t(k[i])]; });
+    } else {
+        const Longs used = same_bits<Longs>(any);
+        Longs both;
+        if constexpr (F == 2) {
+            PairFloats updates;
+            std::memcpy(&updates, seen, sizeof updates);
+            updates -= __builtin_convertvector(__builtin_convertvector(used, PairInts), PairFloats);
+            std::memcpy(seen, &updates, sizeof updates);
+            const PairFloats last = PairFloats{} + s.settled;
+            const PairInts k = __builtin_convertvector(updates < last ? updates : last, PairInts);
+            both = each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return s.unbias[size_t(k[i])]; });
+        } else {
+            uint64_t found[LANES / F];
+            for (int e = 0; e < LANES / F; e++) found[e] = s.unbias[s.index(seen[e] += float(int(used[e * F / 2] & 1)))];
+            both = each<Longs>(std::make_index_sequence<PAIRS>(), [&](size_t i) { return found[i * 2 / F]; });
+        }
+        const Longs low = both & 0xffffffff, high = both ^ low;
+        unbias1 = same_bits<Floats>(low | low << 32);
+        unbias2 = same_bits<Floats>(high | high >> 32);
+    }
+}
+
+// Whether all of LANES / F entries are past the correction: then they need no look at each by itself.
+template <int F>
+inline bool all_settled(const float* seen, const Settings& s) {
+    bool settled = true;
+    for (int e = 0; e < LANES / F; e++) settled &= seen[e] >= s.settled;
+    return settled;
+}
+
+// LANES values, LANES / F entries; settled ones are counted no more. Returns which of them had a gradient.
+template <int F>
+inline Ints update(float* values, float* mean, float* square, float* grad, float* seen, const Settings& s) {
+    const Ints any = with_gradient<F>(grad);
+    if (all_settled<F>(seen, s)) {
+        move(values, mean, square, grad, any, 1.0f, 1.0f, s);
+    } else {
+        Floats unbias1, unbias2;
+        count<F>(any, seen, unbias1, unbias2, s);
+        move(values, mean, square, grad, any, unbias1, unbias2, s);
+    }
+    return any;
+}
+
+// A single entry, where fewer than LANES values are left or an entry has an odd number of features.
+inline int update_entry(float* values, float* mean, float* square, float* grad, float* seen, int features,
+                        const Settings& s) {
+    bool any = false;
+    for (int f = 0; f < features; f++) any |= grad[f] != 0;
+    if (!any) return 0;
+    const size_t k = s.index(seen[0] += 1);
+    const float unbias1 = s.unbias1[k], unbias2 = s.unbias2[k];
+    for (int f = 0; f < features; f++) {
+        mean[f] = s.keep1 * mean[f] + s.add1 * grad[f];
+        square[f] = s.keep2 * square[f] + s.add2 * grad[f] * grad[f];
+        values[f] -= s.rate * unbias1 * mean[f] / (std::sqrt(unbias2 * square[f]) + s.eps);
+        grad[f] = 0;
+    }
+    return 1;
+}
+
+// A single entry of whole vectors.
+inline int update_row(float* values, float* mean, float* square, float* grad, float* seen, int features,
+                      const Settings& s) {
+    bool none = true;
+    for (int i = 0; i < features; i += LANES) none &= all_zero(grad + i);
+    if (none) return 0;
+    const size_t k = s.index(seen[0] += 1);
+    const float unbias1 = s.unbias1[k], unbias2 = s.unbias2[k];
+    for (int i = 0; i < features; i += LANES)
+        move(values + i, mean + i, square + i, grad + i, Ints{} - 1, unbias1, unbias2, s);
+    return 1;
+}
+
+// Entries [begin, end) in order. Returns how many had a gradient.
+template <int F>
+int64_t update_range(float* values, float* mean, float* square, float* grad, float* seen, int64_t begin, int64_t end,
+                     int features, const Settings& s) {
+    int64_t touched = 0, e = begin;
+    if constexpr (F > 0 && F <= LANES) {
+        Ints updates{};  // of each lane
+        for (; e + LANES / F <= end; e += LANES / F) {
+            const int64_t i = e * F;
+            if (!all_zero(grad + i)) updates -= update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
+        }
+        for (int lane = 0; lane < LANES; lane += F) touched += updates[lane];
+    }
+    for (; F == 0 && features % LANES == 0 && e < end; e++) {
+        const int64_t i = e * features;
+        touched += update_row(values + i, mean + i, square + i, grad + i, seen + e, features, s);
+    }
+    for (; e < end; e++) {
+        const int64_t i = e * features;
+        touched += update_entry(values + i, mean + i, square + i, grad + i, seen + e, features, s);
+    }
+    return touched;
+}
+
+}  // namespace adam

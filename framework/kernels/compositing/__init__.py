@@ -1,0 +1,1 @@
+"""Compositing of samples along rays."""

@@ -1,0 +1,1 @@
+"""Encodings without parameters, and the contraction of space."""

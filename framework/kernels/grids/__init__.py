@@ -1,0 +1,1 @@
+"""Hash grids, and planes and lines of features."""

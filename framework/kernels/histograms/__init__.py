@@ -1,0 +1,1 @@
+"""Histograms along rays: intervals, step functions, sampling by them, and spacing."""

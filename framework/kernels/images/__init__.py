@@ -1,0 +1,1 @@
+"""Whole images: similarity, and what silhouettes show."""

@@ -1,0 +1,1 @@
+"""Marching of rays through an occupancy grid."""

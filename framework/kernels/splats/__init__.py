@@ -1,0 +1,1 @@
+"""Gaussians on images: projection, tiles and blending."""

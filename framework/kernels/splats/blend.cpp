@@ -1,0 +1,394 @@
+// Blending the Gaussians of each tile from front to back, forward and backward. See ../splat_blend.py.
+//
+// A tile of TILE x TILE pixels consists of blocks of LANES pixels, 4 across: a vector holds a block. For each Gaussian
+// of the tile's list, the blocks that its box meets are evaluated, so most of what is computed is used.
+#include "splats/splat.h"
+
+#include <vector>
+
+namespace {
+
+constexpr int ACROSS = 4, DOWN = LANES / ACROSS;  // pixels of a block
+constexpr int COLUMNS = TILE / ACROSS, ROWS = TILE / DOWN, BLOCKS = COLUMNS * ROWS;
+
+#if defined(__AVX512F__)
+// 2^x for x in [-126, 0], to 2 units in the last place: 2^(k / 16) of the nearest sixteenth from a table in a register,
+// times a polynomial of what is left.
+inline Floats power_of_two(Floats x) {
+    const __m512 table = _mm512_setr_ps(1.0f, 1.04427378f, 1.09050773f, 1.13878863f, 1.18920712f, 1.24185781f, 1.29683955f,
+                                        1.35425555f, 1.41421356f, 1.47682615f, 1.54221083f, 1.61049033f, 1.68179283f,
+                                        1.75625216f, 1.83400809f, 1.91520656f);
+    const Floats shift = splat(786432.0f), shifted = x + shift;  // 1.5 * 2^19: its last bits count sixteenths
+    const Floats nearest = shifted - shift, f = x - nearest;
+    Floats p = splat(5.550410866e-2f);
+    p = p * f + 2.402265070e-1f;
+    p = p * f + 6.931471806e-1f;
+    p = p * f + 1.0f;
+    p *= (Floats)_mm512_permutexvar_ps(_mm512_castps_si512((__m512)shifted), table);
+    return (Floats)_mm512_scalef_ps((__m512)p, (__m512)nearest);  // rounds `nearest` down
+}
+#else
+// 2^x for x in [-126, 0], to 2 units in the last place; Cephes' exp2f.
+inline Floats power_of_two(Floats x) {
+    const Ints n = __builtin_convertvector(x - 0.5f, Ints);  // rounds towards 0, which is up
+    const Floats f = x - __builtin_convertvector(n, Floats);
+    Floats p = splat(1.535336188319500e-4f);
+    p = p * f + 1.339887440266574e-3f;
+    p = p * f + 9.618437357674640e-3f;
+    p = p * f + 5.550332471162809e-2f;
+    p = p * f + 2.402264791363012e-1f;
+    p = p * f + 6.931472028550421e-1f;
+    p = p * f + 1.0f;
+    Ints bits;
+    std::memcpy(&bits, &p, sizeof bits);
+    bits += n << 23;
+    std::memcpy(&p, &bits, sizeof p);
+    return p;
+}
+#endif
+
+// The lanes of a mask that are set, as bits.
+inline uint64_t bits(Ints mask) {
+#if defined(__AVX512DQ__)
+    return _mm512_movepi32_mask((__m512i)mask);
+#elif defined(__AVX512F__)
+    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask);
+#elif defined(__AVX__)
+    return uint32_t(_mm256_movemask_ps((__m256)mask));
+#elif defined(__SSE2__)
+    return uint32_t(_mm_movemask_ps((__m128)mask));
+#else
+    uint64_t set = 0;
+    for (int i = 0; i < LANES; i++) set |= uint64_t(mask[i] & 1) << i;
+    return set;
+#endif
+}
+
+// Whether a pixel of a block lets light through.
+inline bool lets_through(Floats through) {
+#if defined(__AVX512F__)
+    return _mm512_cmp_ps_mask((__m512)through, _mm512_set1_ps(OPAQUE), _CMP_GE_OQ) != 0;
+#else
+    return bits(through >= OPAQUE) != 0;
+#endif
+}
+
+// Blocks of a tile: bit TILE c + r is set for the block in column c whose first row of pixels is r.
+typedef uint64_t Blocks;
+static_assert(COLUMNS * TILE == 64, "a tile's blocks have a bit each");
+constexpr Blocks FIRST_ROWS = ~Blocks(0) / ((Blocks(1) << DOWN) - 1);
+
+// Whose block `b` is that of bit b * DOWN: its column is b / ROWS, and its first row of pixels b % ROWS * DOWN.
+inline int first_of(Blocks blocks) { return __builtin_ctzll(blocks) / DOWN; }
+inline Blocks only(int b) { return Blocks(1) << (b * DOWN); }
+
+struct Offsets {  // of a block's pixels from its first
+    Floats x, y;
+    Offsets() {
+        float across[LANES], down[LANES];
+        for (int i = 0; i < LANES; i++) across[i] = float(i % ACROSS), down[i] = float(i / ACROSS);
+        x = load(across), y = load(down);
+    }
+};
+
+// The blocks in which a Gaussian reaches the centre of a pixel, and perhaps some next to them.
+struct Reach {
+    Floats rows[TILE / LANES];  // of the tile's pixels
+    Reach() {
+        float numbers[TILE];
+        for (int i = 0; i < TILE; i++) numbers[i] = float(i);
+        for (int v = 0; v < TILE / LANES; v++) rows[v] = load(numbers + v * LANES);
+    }
+    // x, y: the tile's first pixel's centre, from the Gaussian's.
+    Blocks blocks(const float* g, float x, float y) const {
+        const float width = 1 / g[U_X], lean = g[U_Y] * width;
+        Blocks met = 0;
+        for (int v = 0; v < TILE / LANES; v++) {
+            // A row meets the ellipse from `first` to `last`, which are counted in pixels from the tile's first.
+            const Floats dy = rows[v] + y, of_v = g[V_Y] * dy, rest = g[CUT] - of_v * of_v;
+            const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
+            const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
+            const Floats first = middle - half, last = middle + half;
+            for (int c = 0; c < COLUMNS; c++)
+                met |= bits((rest > 0.0f) & (first <= float(c * ACROSS + ACROSS - 1)) & (last >= float(c * ACROSS)))
+                       << (c * TILE + v * LANES);
+        }
+        for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
+        return met & FIRST_ROWS;
+    }
+};
+
+// What one Gaussian is at the pixels of a tile.
+struct Shape {
+    Floats u, v;  // at the offsets within a block, less its first pixel's
+    float u_x, u_y, v_y, cut, opacity;
+    Shape(const float* g, const Offsets& offset)
+        : u(g[U_X] * offset.x + g[U_Y] * offset.y), v(g[V_Y] * offset.y), u_x(g[U_X]), u_y(g[U_Y]), v_y(g[V_Y]),
+          cut(g[CUT]), opacity(g[OPACITY]) {}
+    // u^2 + v^2 at a block whose first pixel's centre is at (dx, dy) from the Gaussian's.
+    Floats squared(float dx, float dy) const {
+        const Floats a = u + (u_x * dx + u_y * dy), b = v + v_y * dy;
+        return a * a + b * b;
+    }
+};
+
+constexpr float LOG2_E = 1.44269504f;
+
+struct Tile {
+    int left, top, width, height;  // of its first pixel, and of the image
+    Tile(int64_t tile, int columns, int width, int height)
+        : left(int(tile % columns) * TILE), top(int(tile / columns) * TILE), width(width), height(height) {}
+
+    // Calls `body` with each block's number, lane and pixel of the image.
+    template <typename Body>
+    void for_pixels(const Body& body) const {
+        const bool whole = left + TILE <= width && top + TILE <= height;
+        for (int b = 0; b < BLOCKS; b++) {
+            const int x = left + b / ROWS * ACROSS, y = top + b % ROWS * DOWN;
+            const int64_t first = int64_t(y) * width + x;
+            for (int i = 0; i < LANES; i++)
+                if (whole || (x + i % ACROSS < width && y + i / ACROSS < height))
+                    body(b, i, first + i / ACROSS * int64_t(width) + i % ACROSS);
+        }
+    }
+    // Copies between planes of blocks and an image (height, width, CHANNELS).
+    template <int CHANNELS>
+    void read(const float* image, Floats (*planes)[BLOCKS]) const {
+        alignas(64) float lanes[CHANNELS][BLOCKS][LANES] = {};
+        for_pixels([&](int b, int i, int64_t pixel) {
+            for (int c = 0; c < CHANNELS; c++) lanes[c][b][i] = image[pixel * CHANNELS + c];
+        });
+        std::memcpy(planes, lanes, sizeof lanes);
+    }
+    template <int CHANNELS>
+    void write(float* image, const Floats (*planes)[BLOCKS]) const {
+        alignas(64) float lanes[CHANNELS][BLOCKS][LANES];
+        std::memcpy(lanes, planes, sizeof lanes);
+        for_pixels([&](int b, int i, int64_t pixel) {
+            for (int c = 0; c < CHANNELS; c++) image[pixel * CHANNELS + c] = lanes[c][b][i];
+        });
+    }
+    // Sets transmittance at the start, where pixels beyond the image's edge are opaque; returns the blocks that are not.
+    Blocks clear(Floats* through) const {
+        alignas(64) float lanes[BLOCKS][LANES] = {};
+        for_pixels([&](int b, int i, int64_t) { lanes[b][i] = 1; });
+        std::memcpy(through, lanes, sizeof lanes);
+        Blocks alive = 0;
+        for (int b = 0; b < BLOCKS; b++)
+            if (bits(through[b] > 0.0f)) alive |= only(b);
+        return alive;
+    }
+};
+
+template <int CHANNELS>
+void forward_tile(const Tile& tile, const float* records, const int32_t* ids, int64_t entries, const float* background,
+                  float* image, float* through_image, float* median_image, int32_t* used) {
+    alignas(64) Floats sum[CHANNELS][BLOCKS] = {}, through[BLOCKS], median[BLOCKS] = {};
+    const Offsets offset;
+    const Reach reach;
+    Blocks alive = tile.clear(through);
+    int64_t n = 0;
+    for (; n < entries && alive; n++) {
+        const float* g = records + int64_t(ids[n]) * RECORD;
+        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
+        const Shape shape(g, offset);
+        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
+            const int b = first_of(rest);
+            const Floats q = shape.squared(x + b / ROWS * ACROSS, y + b % ROWS * DOWN), before = through[b];
+            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+            const Floats alpha = smaller(shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E), splat(MAX_ALPHA));
+            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+            for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
+            if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
+            through[b] = after;
+            if (!lets_through(after)) alive &= ~only(b);
+        }
+    }
+    *used = int32_t(n);
+    for (int c = 0; c < 3; c++)
+        for (int b = 0; b < BLOCKS; b++) sum[c][b] += through[b] * background[c];
+    tile.write<CHANNELS>(image, sum);
+    tile.write<1>(through_image, &through);
+    if (median_image) tile.write<1>(median_image, &median);
+}
+
+#if defined(__clang__)
+#define SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define SHUFFLE(a, b, ...) __builtin_shuffle(a, b, Ints{__VA_ARGS__})
+#endif
+
+// The sums of the lanes of each of RECORD vectors: halves of the vectors, of their halves, and so on.
+inline void sum_lanes(const Floats* v, float* out) {
+#if defined(__AVX512F__)
+    Floats w[8];
+    for (int i = 0; i < 8; i++)
+        w[i] = SHUFFLE(v[i], v[i + 8], 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23) +
+               SHUFFLE(v[i], v[i + 8], 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+    for (int i = 0; i < 4; i++)
+        w[i] = SHUFFLE(w[i], w[i + 4], 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27) +
+               SHUFFLE(w[i], w[i + 4], 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+    for (int i = 0; i < 2; i++)
+        w[i] = SHUFFLE(w[i], w[i + 2], 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29) +
+               SHUFFLE(w[i], w[i + 2], 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    const Floats last = SHUFFLE(w[0], w[1], 0, 16, 2, 18, 4, 20, 6, 22, 8, 24, 10, 26, 12, 28, 14, 30) +
+                        SHUFFLE(w[0], w[1], 1, 17, 3, 19, 5, 21, 7, 23, 9, 25, 11, 27, 13, 29, 15, 31);
+    // Lane 8 i + 4 j + 2 k + l holds the sum of vector 8 i + 4 j + 2 k + l.
+    store(out, last);
+#elif defined(__AVX2__)
+    for (int half = 0; half < RECORD; half += 8, v += 8) {
+        Floats w[4];
+        for (int i = 0; i < 4; i++)
+            w[i] = SHUFFLE(v[i], v[i + 4], 0, 1, 2, 3, 8, 9, 10, 11) + SHUFFLE(v[i], v[i + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+        for (int i = 0; i < 2; i++)
+            w[i] = SHUFFLE(w[i], w[i + 2], 0, 1, 8, 9, 4, 5, 12, 13) + SHUFFLE(w[i], w[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+        store(out + half, SHUFFLE(w[0], w[1], 0, 8, 2, 10, 4, 12, 6, 14) + SHUFFLE(w[0], w[1], 1, 9, 3, 11, 5, 13, 7, 15));
+    }
+#else
+    for (int k = 0; k < RECORD; k++) {
+        float lanes[LANES], sum = 0;
+        store(lanes, v[k]);
+        for (int i = 0; i < LANES; i++) sum += lanes[i];
+        out[k] = sum;
+    }
+#endif
+}
+
+// Slots of the sums over a Gaussian's pixels that have no name among the record's.
+enum Sums { SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY, SUM_G, ABSOLUTE_X, ABSOLUTE_Y };
+
+template <int CHANNELS>
+void backward_tile(const Tile& tile, const float* records, const int32_t* ids, const int32_t* slots, int64_t entries,
+                   int64_t used, const float* image, const float* through_image, const float* image_grad,
+                   const float* through_grad, float* parts) {
+    alignas(64) Floats of_image[CHANNELS][BLOCKS], shown[CHANNELS][BLOCKS], through[BLOCKS], behind[BLOCKS], last[BLOCKS];
+    const Offsets offset;
+    const Reach reach;
+    if (through_grad) {
+        tile.read<1>(through_image, &last), tile.read<1>(through_grad, &behind);
+        for (int b = 0; b < BLOCKS; b++) behind[b] *= last[b];
+    } else
+        for (int b = 0; b < BLOCKS; b++) behind[b] = splat(0);
+    // What is behind a Gaussian is all that is seen, less what is in front of it and itself.
+    tile.read<CHANNELS>(image, shown), tile.read<CHANNELS>(image_grad, of_image);
+    for (int c = 0; c < CHANNELS; c++)
+        for (int b = 0; b < BLOCKS; b++) behind[b] += shown[c][b] * of_image[c][b];
+    Blocks alive = tile.clear(through);
+    for (int64_t n = 0; n < used; n++) {
+        const float* g = records + int64_t(ids[n]) * RECORD;
+        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
+        const Shape shape(g, offset);
+        Floats sums[RECORD] = {};
+        // Rows of the inverse covariance, for the absolute gradient of the centre.
+        const float xx = 2 * g[U_X] * g[U_X], xy = 2 * g[U_X] * g[U_Y], yy = 2 * (g[U_Y] * g[U_Y] + g[V_Y] * g[V_Y]);
+        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
+            const int b = first_of(rest);
+            const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
+            const Floats q = shape.squared(block_x, block_y), before = through[b];
+            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+            const Floats raw = shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E);
+            const Floats alpha = smaller(raw, splat(MAX_ALPHA));
+            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+            Floats own = splat(0);
+            for (int c = 0; c < CHANNELS; c++) {
+                own += g[RED + c] * of_image[c][b];
+                sums[RED + c] += weight * of_image[c][b];
+            }
+            behind[b] -= weight * own;
+            through[b] = after;
+            // The gradient of the exponent: alpha times that of alpha; none where alpha is at its bound.
+            const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
+            const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
+            const Floats dx = offset.x + block_x, dy = offset.y + block_y;
+            const Floats by_x = of_exponent * dx, by_y = of_exponent * dy;
+            sums[SUM_G] += of_exponent;
+            sums[SUM_X] += by_x, sums[SUM_Y] += by_y;
+            sums[SUM_XX] += by_x * dx, sums[SUM_XY] += by_x * dy, sums[SUM_YY] += by_y * dy;
+            const Floats of_x = xx * by_x + xy * by_y, of_y = xy * by_x + yy * by_y;
+            sums[ABSOLUTE_X] += magnitude(of_x), sums[ABSOLUTE_Y] += magnitude(of_y);
+            if (!lets_through(after)) alive &= ~only(b);
+        }
+        sum_lanes(sums, parts + int64_t(slots[n]) * RECORD);
+    }
+    for (int64_t n = used; n < entries; n++) std::memset(parts + int64_t(slots[n]) * RECORD, 0, RECORD * sizeof(float));
+}
+
+void check_tile(const int32_t* offsets, int64_t tile, int64_t entries, const int32_t* ids, int64_t count) {
+    if (offsets[tile] < 0 || offsets[tile + 1] < offsets[tile] || offsets[tile + 1] > entries)
+        bad_index(offsets[tile + 1], entries, "offsets");
+    for (int64_t n = offsets[tile]; n < offsets[tile + 1]; n++) check_index(ids[n], count, "Gaussians");
+}
+
+}  // namespace
+
+// The image (height, width, channels): colours over the background (3), then, of 4 channels, the sum of weight times
+// distance, and of 7 the sum of the normals. The transmittance (height, width). If median is not null, the distance at
+// which half of the light is gone, or 0. How many entries of each tile's list were used.
+EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids, int64_t entries,
+                       int width, int height, int channels, const float* background, float* image, float* through,
+                       float* median, int32_t* used, int threads) {
+    return guarded([&] {
+        const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
+        for_chunks(threads, int64_t(columns) * rows, [&](int64_t t, int) {
+            check_tile(offsets, t, entries, ids, count);
+            const Tile tile(t, columns, width, height);
+            const auto run = [&](auto forward) {
+                forward(tile, records, ids + offsets[t], offsets[t + 1] - offsets[t], background, image, through, median,
+                        used + t);
+            };
+            if (channels == 3) run(forward_tile<3>);
+            else if (channels == 4) run(forward_tile<4>);
+            else if (channels == 7) run(forward_tile<7>);
+            else throw std::invalid_argument("an image has 3, 4 or 7 channels");
+        });
+    });
+}
+
+// From the gradients of image and transmittance (the latter may be null) the sums of each entry, by slot.
+EXPORT int splat_blend_backward(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids,
+                                const int32_t* slots, int64_t entries, int width, int height, int channels,
+                                const float* image, const float* through, const int32_t* used, const float* image_grad,
+                                const float* through_grad, float* parts, int threads) {
+    return guarded([&] {
+        const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
+        for_chunks(threads, int64_t(columns) * rows, [&](int64_t t, int) {
+            check_tile(offsets, t, entries, ids, count);
+            for (int64_t n = offsets[t]; n < offsets[t + 1]; n++) check_index(slots[n], entries, "entries");
+            if (used[t] > offsets[t + 1] - offsets[t]) bad_index(used[t], offsets[t + 1] - offsets[t], "entries used");
+            const Tile tile(t, columns, width, height);
+            const auto run = [&](auto backward) {
+                backward(tile, records, ids + offsets[t], slots + offsets[t], offsets[t + 1] - offsets[t], used[t],
+                         image, through, image_grad, through_grad, parts);
+            };
+            if (channels == 3) run(backward_tile<3>);
+            else if (channels == 4) run(backward_tile<4>);
+            else throw std::invalid_argument("an image with a gradient has 3 or 4 channels");
+        });
+    });
+}
+
+// The gradient of each record (count, RECORD) from the sums of its entries, which are added in the order of the tiles.
+// In CUT and REACH_X it gives the sum over pixels of the absolute gradients of X and Y; REACH_Y is 0.
+EXPORT int splat_gather(const float* records, int64_t count, const int32_t* firsts, int64_t entries, const float* parts,
+                        float* gradient, int threads) {
+    return guarded([&] {
+        for_each(threads, count, 1024, [&](int64_t g) {
+            const int64_t begin = firsts[g], end = firsts[g + 1];
+            if (begin < 0 || end < begin || end > entries) bad_index(end, entries, "slots");
+            float s[RECORD] = {};
+            for (int64_t slot = begin; slot < end; slot++)
+                for (int k = 0; k < RECORD; k++) s[k] += parts[slot * RECORD + k];
+            const float* r = records + g * RECORD;
+            float* out = gradient + g * RECORD;
+            std::memcpy(out, s, sizeof s);
+            const float by_u = r[U_X] * s[SUM_X] + r[U_Y] * s[SUM_Y];
+            out[X] = 2 * r[U_X] * by_u;
+            out[Y] = 2 * (r[U_Y] * by_u + r[V_Y] * r[V_Y] * s[SUM_Y]);
+            out[U_X] = -2 * (r[U_X] * s[SUM_XX] + r[U_Y] * s[SUM_XY]);
+            out[U_Y] = -2 * (r[U_X] * s[SUM_XY] + r[U_Y] * s[SUM_YY]);
+            out[V_Y] = -2 * r[V_Y] * s[SUM_YY];
+            out[OPACITY] = r[OPACITY] > 0 ? s[SUM_G] / r[OPACITY] : 0;
+            out[CUT] = s[ABSOLUTE_X], out[REACH_X] = s[ABSOLUTE_Y], out[REACH_Y] = 0;
+        });
+    });
+}

@@ -1,0 +1,33 @@
+// What the splatting kernels share: how a Gaussian on the image is laid out. See ../splat_project.py.
+#pragma once
+
+#include "runtime/common.h"
+
+#include <cmath>
+
+// A Gaussian on the image. Its alpha at an offset (dx, dy) from the centre is opacity exp(-(u^2 + v^2)) with
+// u = U_X dx + U_Y dy and v = V_Y dy: half of the inverse covariance as a product of triangular matrices, whose squares
+// cannot cancel.
+enum Record {
+    X, Y,            // centre, pixels
+    U_X, U_Y, V_Y,   // 1 / pixels
+    OPACITY,
+    CUT,             // u^2 + v^2 from which alpha is below MIN_ALPHA; 0 or less of one that is not visible
+    REACH_X,         // half the width of what is within CUT, pixels
+    RED, GREEN, BLUE,
+    DISTANCE,        // of the centre from the camera
+    NORMAL_X, NORMAL_Y, NORMAL_Z,
+    REACH_Y,         // half the height
+    RECORD           // values of a record
+};
+
+constexpr float MIN_ALPHA = 1.0f / 255, MAX_ALPHA = 0.999f;
+constexpr float OPAQUE = 1e-4f;  // transmittance behind which nothing counts
+constexpr int TILE = 16;         // pixels along a tile's edge
+
+static inline Floats square_root(Floats x) {
+    float values[LANES];
+    store(values, x);
+    for (int i = 0; i < LANES; i++) values[i] = std::sqrt(values[i]);
+    return load(values);
+}

@@ -1,0 +1,129 @@
+"""Lists of the Gaussians that each tile of an image shows, in Triton; the reference: `nerfloom.kernels.splats.tiles`.
+
+Each entry's key is its tile, above the bits of the distance (or of what else is sorted by), which rise with it as those
+of all positive floats do. So one stable sort puts the entries in order, those of the same distance by Gaussian. The
+host waits once, for the number of entries, unless it says for how many there is room; keys of what is left of it come
+last.
+"""
+
+# mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
+# Triton gives the kernels' arguments their types.
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nerfloom.kernels.splats import project, tiles
+from nerfloom.kernels.splats.tiles import TileLists
+from nerfloom.kernels.triton_launch import blocks, launch
+
+BLOCK = 32
+"""Gaussians that are taken together, by one warp."""
+LAST = 2**63 - 1
+"""Key behind those of all entries."""
+RECORD, TILE = tl.constexpr(project.RECORD), tl.constexpr(tiles.TILE)
+CUT = tl.constexpr(project.CUT)
+REACH_X, REACH_Y = tl.constexpr(project.REACH_X), tl.constexpr(project.REACH_Y)
+
+
+@triton.jit
+def _span(centre, reach, count):
+    """Return the first tile along an axis in which a Gaussian's box has a pixel's centre, and that after the last."""
+    low = tl.ceil((centre - reach - (TILE - 0.5)) / TILE)
+    high = tl.floor((centre + reach - 0.5) / TILE) + 1
+    most = count * 1.0
+    low = tl.where(low > 0, low, 0.0)  # by comparisons that NaN fails
+    high = tl.where(high > 0, high, 0.0)
+    return tl.where(low < most, low, most).to(tl.int32), tl.where(high < most, high, most).to(tl.int32)
+
+
+@triton.jit
+def _touches(record, here, column, row):
+    """Return whether an ellipse comes within CUT on a tile: the least of a quadratic form over a rectangle."""
+    x0 = column.to(tl.float32) * TILE + 0.5 - tl.load(record, mask=here, other=0.0)
+    y0 = row.to(tl.float32) * TILE + 0.5 - tl.load(record + 1, mask=here, other=0.0)
+    u_x = tl.load(record + 2, mask=here, other=1.0)
+    u_y = tl.load(record + 3, mask=here, other=0.0)
+    v_y = tl.load(record + 4, mask=here, other=1.0)
+    x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)
+    near_x = tl.where(x0 > 0, x0, tl.where(x1 < 0, x1, 0.0))
+    near_y = tl.where(y0 > 0, y0, tl.where(y1 < 0, y1, 0.0))
+    # Along the vertical edge that faces the centre, and along the horizontal one.
+    y = tl.minimum(tl.maximum(-u_x * u_y * near_x / (u_y * u_y + v_y * v_y), y0), y1)
+    u, v = u_x * near_x + u_y * y, v_y * y
+    by_x = tl.where(near_x != 0, u * u + v * v, 3e38)
+    x = tl.minimum(tl.maximum(-u_y * near_y / u_x, x0), x1)
+    u, v = u_x * x + u_y * near_y, v_y * near_y
+    by_y = tl.where(near_y != 0, u * u + v * v, 3e38)
+    within = tl.minimum(by_x, by_y) <= tl.load(record + CUT, mask=here, other=0.0) * 1.0001
+    return within | ((near_x == 0) & (near_y == 0))
+
+
+@triton.jit(do_not_specialize=["count"])
+def _list(records, distances, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl.constexpr):
+    """Count the tiles of each Gaussian, or, if there are `firsts`, write the keys and owners of the entries."""
+    g = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = g < count
+    record = records + g * RECORD
+    here = here & (tl.load(record + CUT, mask=here, other=0.0) > 0)
+    if firsts is not None:
+        first = tl.load(firsts + g, mask=here, other=0)
+        here = here & (tl.load(firsts + g + 1, mask=here, other=0) > first)  # else there is no room
+        distance = tl.load(distances + g, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
+    x = tl.load(record, mask=here, other=0.0)
+    y = tl.load(record + 1, mask=here, other=0.0)
+    left, right = _span(x, tl.load(record + REACH_X, mask=here, other=0.0), columns)
+    top, bottom = _span(y, tl.load(record + REACH_Y, mask=here, other=0.0), rows)
+    wide = tl.where(here, tl.maximum(right - left, 0), 0)
+    spanned = wide * tl.maximum(bottom - top, 0)
+    found = tl.zeros([BLOCK], tl.int32)
+    for k in range(tl.max(spanned, 0)):
+        inside = k < spanned
+        across = tl.maximum(wide, 1)
+        column, row = left + k % across, top + k // across
+        listed = inside & ((spanned == 1) | _touches(record, inside, column, row))
+        if firsts is not None:
+            tile = row.to(tl.int64) * columns + column
+            tl.store(keys + first + found, (tile << 32) + distance, mask=listed)
+            tl.store(owners + first + found, g.to(tl.int32), mask=listed)
+        found += listed.to(tl.int32)
+    if firsts is None:
+        tl.store(counts + g, found, mask=g < count)
+
+
+def tile_lists(
+    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    keys: Tensor | None = None,
+) -> TileLists:  # fmt: skip
+    """Compute `nerfloom.kernels.splats.tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
+
+    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
+    `room`. They are sorted by `keys`, if there are some.
+
+    Raises:
+        ValueError: if there are 2^31 entries or more.
+    """
+    records, count, device = records.contiguous(), len(records), records.device
+    columns, rows = blocks(width, tiles.TILE), blocks(height, tiles.TILE)
+    distances = (records[:, project.DISTANCE] if keys is None else keys).contiguous()
+    counts, programs = torch.empty(count, dtype=torch.int32, device=device), (blocks(count, BLOCK),)
+    shared = (count, columns, rows)
+    launch(_list, programs, records, distances, counts, None, None, None, *shared, BLOCK=BLOCK, num_warps=1)
+    needed = None if room is None else counts.sum()
+    if room is None:
+        room = int(counts.sum())
+    else:
+        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
+    if room >= 2**31:
+        raise ValueError("more than 2^31 Gaussians on the image's tiles")
+    firsts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    places = torch.full((room,), LAST, dtype=torch.int64, device=device)
+    owners = torch.zeros(room, dtype=torch.int32, device=device)
+    launch(_list, programs, records, distances, None, firsts, places, owners, *shared, BLOCK=BLOCK, num_warps=1)
+    places, slots = places.sort(stable=True)
+    first_keys = torch.arange(columns * rows + 1, device=device) << 32
+    offsets = torch.searchsorted(places, first_keys, out_int32=True)
+    return TileLists(offsets, owners.index_select(0, slots), slots.int(), firsts.int(), needed)

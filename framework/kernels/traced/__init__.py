@@ -1,0 +1,1 @@
+"""Marching, a hash grid, a network and compositing in one compiled call."""

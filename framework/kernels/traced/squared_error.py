@@ -1,0 +1,142 @@
+"""The squared error of what traced rays show, and its gradient, in one compiled call.
+
+The readable form (`traced_error_reference`) traces rays, evaluates the colour network, composites, and takes the mean
+of squares. Where the loss is this mean alone, its gradient is known as soon as the colours are. The compiled form takes
+a block of rays there and back while it is in cache, and keeps the networks' activations for the way back
+(`kernels/traced/squared_error.cpp`).
+
+Most samples have hardly a gradient: they lie in space that is empty already, or behind a surface. The compiled form can
+leave most of these out (`thin`): a sample whose gradient is a share p < 1 of a threshold takes part with the
+probability p, and then its gradient counts 1 / p times. The expectation of the sum stays, as in Russian roulette of
+light paths (Arvo and Kirk 1990, "Particle transport and image synthesis").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nerfloom.kernels import native, result_cache
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.grids.hash_grid import hash_grid
+from nerfloom.kernels.march.waves import March
+from nerfloom.kernels.networks.mlp import multiplies_bf16
+from nerfloom.kernels.traced.colors import GridColor, has_compiled_networks, traced_colors_reference
+from nerfloom.kernels.traced.trace import DENSITY, PATH, GridDensity, arguments, network_arguments
+
+MAX_RAYS = 256
+"""Maximum number of rays of a pixel in the compiled form."""
+
+
+class TracedError(NamedTuple):
+    """The error of P pixels."""
+
+    error: Tensor
+    """() mean of weight * (colour - target)^2, with its gradient."""
+    rgb: Tensor
+    """(P, 3) colours, without gradient."""
+    num_samples: int
+    """Number of samples that light reached."""
+
+
+class PixelTargets(NamedTuple):
+    """Colours of P pixels, each the mean of R / P consecutive rays."""
+
+    background: Tensor
+    """(R, 3) colour behind each ray."""
+    target: Tensor
+    """(P, 3) true colours."""
+    weights: Tensor | None = None
+    """(P,) factors of the pixels; None for 1."""
+
+
+def traced_error(
+    marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0
+) -> TracedError:
+    """Return the mean squared error of the colours of traced rays.
+
+    Args:
+        marched: the march of R rays, before its first wave; no gradient goes to these.
+        density: the density along the rays.
+        color: the colour along the rays.
+        pixels: what the rays should show.
+        thin: samples whose gradient is below this times the mean of some dozen rays' samples are left out at random;
+            0 for none. The reference leaves out none.
+    """
+    tensors = (marched.rays.origins, density.table, *density.weights, *color.weights, *pixels)
+    return TRACED_ERROR(tensors, marched, density, color, pixels, thin)
+
+
+def traced_error_reference(
+    marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0
+) -> TracedError:
+    """Compute `traced_error` in PyTorch and single operations, on any device.
+
+    `marched`, `density`, `color` and `pixels` are as in `traced_error`; `thin` is not used.
+    """
+    shown = traced_colors_reference(marched, density, color, pixels.background)
+    rendered = shown.color.view(len(pixels.target), -1, 3).mean(1)
+    squares = (rendered - pixels.target).square()
+    error = squares if pixels.weights is None else squares * pixels.weights[:, None]
+    return TracedError(error.mean(), rendered.detach(), shown.num_samples)
+
+
+TRACED_ERROR = Operation("traced_error", traced_error_reference)
+
+
+def _fits(marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0) -> bool:
+    """Return whether all single operations would run compiled, and gradients go to table and weights alone."""
+    if not torch.is_grad_enabled() or any(tensor is not None and tensor.requires_grad for tensor in pixels):
+        return False
+    if not 0 < len(marched.rays) <= MAX_RAYS * len(pixels.target):
+        return False
+    return has_compiled_networks(marched, density, color)
+
+
+@TRACED_ERROR.implementation(CPP, fits=_fits)
+def _compiled(
+    marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0
+) -> TracedError:
+    background, target, weights = (None if tensor is None else tensor.contiguous() for tensor in pixels)
+    assert background is not None
+    assert target is not None
+    rays, count = len(marched.rays), len(target)
+    rgb, error, samples = torch.empty(count, 3), torch.empty(()), torch.empty(1, dtype=torch.int64)
+    networks = [density.weights, color.weights]
+    grads = [[torch.empty_like(weight) for weight in each] for each in networks]
+    seed = int(torch.randint(2**62, ())) if thin else 0
+    total = _traced_error(
+        *arguments(marched, density), multiplies_bf16(), *network_arguments(color.weights), color.bands,
+        native.pointer(background, "the background", (rays, 3)), native.pointer(target, "the target", (count, 3)),
+        None if weights is None else native.pointer(weights, "the pixels' weights", (count,)), rays // count,
+        thin, seed, rgb.data_ptr(), error.data_ptr(),
+        *(native.pointers([grad.data_ptr() for grad in each]) for each in grads), samples.data_ptr(), native.threads(),
+    )  # fmt: skip
+    unit, by_encoded = torch.empty(total, 3), torch.empty(total, density.weights[0].shape[1])
+    _take(total, unit.data_ptr(), by_encoded.data_ptr(), native.threads())
+    with result_cache.given(hash_grid=by_encoded):  # its values do not matter: it is there for the table's gradient
+        encoded = hash_grid(unit, density.table, density.layout, density.deferred)
+    known = (by_encoded, *grads[0], *grads[1])
+    return TracedError(_Known.apply(error, known, encoded, *networks[0], *networks[1]), rgb, int(samples))
+
+
+class _Known(torch.autograd.Function):
+    """A value whose gradients are known already."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, grads: Sequence[Tensor], *inputs: Tensor) -> Tensor:
+        ctx.grads = grads
+        return value.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        factor = float(grad)
+        return None, None, *(each if factor == 1 else each * factor for each in ctx.grads)
+
+
+_traced_error: Callable[..., int] = native.Function("traced_error", PATH + DENSITY + "ipipipppqfqpppppi", "q")
+_take = native.Function("traced_error_take", "qppi")

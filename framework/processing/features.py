@@ -1,0 +1,65 @@
+"""Features of images, by COLMAP: those that are not in its database yet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.processing import colmap, database
+from nerfloom.processing.images import PreparedImage
+from nerfloom.processing.job import Job
+
+
+def camera_groups(prepared: list[PreparedImage], sharing: str) -> list[list[str]]:
+    """Return the names of images that share a camera, for each camera, in order.
+
+    Args:
+        prepared: the prepared images.
+        sharing: single: all share one. per-image: none do. auto: those in a folder with equal size, device and focal
+            length.
+
+    Raises:
+        DataError: if all are to share a camera but differ in size.
+    """
+    sizes = {(image.width, image.height) for image in prepared}
+    if sharing == "single" and len(sizes) > 1:
+        few = ", ".join(f"{w}x{h}" for w, h in sorted(sizes)[:3])
+        raise DataError(f"--camera-sharing single: the images have {len(sizes)} sizes ({few}); use auto")
+    groups: dict[tuple, list[str]] = {}
+    for image in prepared:
+        alike = (Path(image.name).parent, image.width, image.height, image.device)
+        key = {"single": (), "per-image": (image.name,), "auto": alike}[sharing]
+        groups.setdefault(key, []).append(image.name)
+    return list(groups.values())
+
+
+def extract(job: Job, prepared: list[PreparedImage], images: Path, masks: Path | None) -> None:
+    """Extract features.
+
+    Args:
+        job: the reconstruction.
+        prepared: the prepared images.
+        images: folder of the images as features are to be found in them.
+        masks: folder of masks, or None.
+    """
+    groups = camera_groups(prepared, job.flags.camera_sharing)
+    known = database.features(job.database)
+    cameras = [database.camera_of(job.database, group) for group in groups]
+    missing = [
+        ([name for name in group if name not in known], camera) for group, camera in zip(groups, cameras, strict=True)
+    ]
+    count = sum(len(names) for names, _ in missing)
+    if count:
+        with job.timed("features"):
+            arguments = (job.database, images, [entry for entry in missing if entry[0]], masks, job.flags)
+            extracted = lambda: database.rows(job.database, "descriptors") - len(known)  # noqa: E731
+            job.run(colmap.extract, arguments, "Finding features", count, extracted, "images")
+    found = database.features(job.database)
+    mean = sum(found.values()) / max(len(found), 1)
+    by = "1 camera" if len(groups) == 1 else f"{len(groups)} cameras"
+    kept = f", {len(known)} kept from before" if known else ""
+    say(
+        f"features: {mean:.0f} per image, {len(prepared)} images by {by}{kept}, "
+        f"in {job.seconds.get('features', 0.0):.1f} s"
+    )

@@ -1,0 +1,100 @@
+"""The files of a folder: images in natural order, and what else is there."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+
+READABLE = (*IMAGE_SUFFIXES, ".tga", ".ppm", ".pgm")
+"""Suffixes of image files that Pillow reads, HEIC with the package pillow-heif."""
+
+
+def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
+    """Return the image files in a folder and its subfolders, relative to it, in natural order: 'img2' before 'img10'.
+
+    Hidden files are ignored. Files of other kinds are counted and named in a line.
+
+    Args:
+        folder: the folder.
+        leave_out: folders inside it to ignore.
+
+    Raises:
+        DataError: if the folder does not exist or has no image.
+    """
+    if not folder.is_dir():
+        raise DataError(f"--data {folder}: there is no such folder")
+    images, others = _split(folder, leave_out)
+    if not images:
+        raise DataError(f"--data {folder} has no image (looked for {', '.join(READABLE)}){_listed(others)}")
+    if others:
+        files = "1 file that is no image" if len(others) == 1 else f"{len(others)} files that are no images"
+        say(f"left out: {files}{_listed(others)}")
+    return images
+
+
+def kind_of(kind: str, data: Path) -> tuple[str, Path]:
+    """Return what a path is, images or a video, where the other was named, and the path; a line says so.
+
+    Args:
+        kind: "images" or "video", as the user named it; it is returned if the path is that, or nothing of the two.
+        data: the path.
+
+    Returns:
+        The kind, and the path of the folder or of the video, which may be the only one of a folder without images.
+
+    Raises:
+        DataError: if a folder without images has several videos.
+    """
+    if data.is_file():
+        if kind == "images" and data.suffix.lower() in VIDEO_SUFFIXES:
+            say(f"{data} is a video: its frames are taken, as by ns-process-data video")
+            return "video", data
+        return kind, data
+    if not data.is_dir():
+        return kind, data
+    images, others = _split(data, ())
+    videos = [data / path for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
+    if images and kind == "video":
+        say(f"{data} is a folder of {len(images)} images: they are taken, as by ns-process-data images")
+        return "images", data
+    if not images and len(videos) > 1:
+        raise DataError(f"--data {data} has {len(videos)} videos and no image; name one of them: --data {videos[0]}")
+    if not images and videos:
+        say(f"{data} has no image, but a video: the frames of {videos[0].name} are taken")
+        return "video", videos[0]
+    return kind, data
+
+
+def natural_order(path: Path) -> list[tuple[int, int, str]]:
+    """Return a sorting key of `path` that compares numbers in names as numbers."""
+    parts = re.split(r"(\d+)", path.as_posix().lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
+
+
+def _split(folder: Path, leave_out: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the images and the other files of a folder, relative to it, in natural order."""
+    ignored = [path.resolve() for path in leave_out if not folder.resolve().is_relative_to(path.resolve())]
+    images: list[Path] = []
+    others: list[Path] = []
+    for path in folder.rglob("*"):
+        relative = path.relative_to(folder)
+        if any(part.startswith(".") for part in relative.parts) or not path.is_file():
+            continue
+        if not any(path.resolve().is_relative_to(entry) for entry in ignored):
+            (images if path.suffix.lower() in READABLE else others).append(relative)
+    return sorted(images, key=natural_order), sorted(others, key=natural_order)
+
+
+def _listed(paths: list[Path]) -> str:
+    """Return how many files there are of each suffix, and the first, as the end of a message."""
+    if not paths:
+        return ""
+    counts = Counter(path.suffix.lower() or "without suffix" for path in paths)
+    kinds = ", ".join(f"{count} {suffix}" for suffix, count in counts.most_common(5))
+    return f": {kinds}{', ...' if len(counts) > 5 else ''}; the first: {paths[0].as_posix()}"

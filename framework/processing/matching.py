@@ -1,0 +1,97 @@
+"""The choice of pairs of images to match, and the matching of those that are not in COLMAP's database yet."""
+
+from __future__ import annotations
+
+from nerfloom.base.console import say
+from nerfloom.processing import colmap, database, retrieval
+from nerfloom.processing.job import Job
+
+ADJACENT = 3
+"""Number of next images that retrieval matches with each image, besides similar ones."""
+LOOPS = 5
+"""Number of similar images, other than the next ones, that sequential matching matches with each: they close loops."""
+RULES = {
+    "exhaustive": "all",
+    "sequential": "each image with the next ones and with similar ones, to close loops",
+    "retrieval": "each image with similar ones",
+}
+"""What each rule matches, in words."""
+
+
+def choose_matching(method: str, count: int, exhaustive_limit: int, ordered: bool) -> str:
+    """Return the rule of matching: exhaustive, sequential or retrieval.
+
+    Args:
+        method: the user's choice, possibly auto.
+        count: number of images.
+        exhaustive_limit: maximum number of images for auto to match all pairs.
+        ordered: whether the images were taken one after the other, in the order of their names.
+    """
+    if method != "auto":
+        return method
+    if ordered:
+        return "sequential"
+    return "exhaustive" if count <= exhaustive_limit else "retrieval"
+
+
+def choose_pairs(matching: str, names: list[str], job: Job) -> list[tuple[str, str]]:
+    """Return the pairs of names of images to match.
+
+    Args:
+        matching: exhaustive, sequential or retrieval.
+        names: names of the images.
+        job: the reconstruction, with features.
+    """
+    count, flags = len(names), job.flags
+    if matching == "exhaustive":
+        chosen = retrieval.all_pairs(count)
+    else:
+        descriptors = retrieval.global_descriptors(retrieval.read_descriptors(job.database, names))
+        if matching == "sequential":
+            near = retrieval.sequential_pairs(count, flags.sequential_overlap)
+            alike = retrieval.similar_pairs(descriptors, LOOPS, apart=flags.sequential_overlap)
+        else:
+            near = retrieval.sequential_pairs(count, ADJACENT)
+            alike = retrieval.similar_pairs(descriptors, flags.num_neighbors)
+        chosen = sorted({*near, *alike})
+    return [(names[i], names[j]) for i, j in chosen]
+
+
+def pairs_of(left: list[str], names: list[str], job: Job) -> list[tuple[str, str]]:
+    """Return more pairs of images that stayed unregistered: with all images, or of many with similar ones.
+
+    Args:
+        left: names of the images that stayed unregistered.
+        names: names of all images.
+        job: the reconstruction, with features.
+    """
+    chosen = set(left)
+    if len(names) <= job.flags.exhaustive_limit:
+        every = retrieval.all_pairs(len(names))
+    else:
+        descriptors = retrieval.global_descriptors(retrieval.read_descriptors(job.database, names))
+        every = retrieval.similar_pairs(descriptors, job.flags.num_neighbors)
+    return [(names[i], names[j]) for i, j in every if names[i] in chosen or names[j] in chosen]
+
+
+def match(job: Job, pairs: list[tuple[str, str]], count: int, rule: str) -> None:
+    """Match pairs of images.
+
+    Args:
+        job: the reconstruction, with features.
+        pairs: pairs of names; those in the database are not matched again.
+        count: number of images.
+        rule: what the pairs are, for people.
+    """
+    known = database.pairs(job.database)
+    missing = [pair for pair in pairs if pair not in known]
+    kept = f", {len(pairs) - len(missing)} of them kept from before" if len(missing) < len(pairs) else ""
+    say(f"matching: {len(pairs):,} of {count * (count - 1) // 2:,} pairs{kept}: {rule}")
+    before = job.seconds.get("matching", 0.0)
+    with job.timed("matching"):
+        if missing:
+            everything = len(missing) == count * (count - 1) // 2
+            arguments = (job.database, missing, job.database.with_name("pairs.txt"), everything, job.flags)
+            job.run(colmap.match_pairs, arguments, "Matching", len(missing), unit="pairs")
+    done, connected = database.rows(job.database, "two_view_geometries"), database.connected(job.database)
+    say(f"matching: {connected:,} of {done:,} pairs are connected, in {job.seconds['matching'] - before:.1f} s")

@@ -1,0 +1,103 @@
+"""The output folder: never overwritten unasked, and incomplete until transforms.json is written."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+from nerfloom.base.errors import DataError
+from nerfloom.processing.settings import ColmapFlags
+from nerfloom.processing.unfinished import STARTED, go_on, mark, unfinished
+from nerfloom.training.data_folder import processed_folder
+
+FINISHED = "transforms.json"
+"""File that is written last; a folder with it is complete."""
+_OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|(images|masks)(_\d+)?")
+
+
+def check_apart(output: Path, data: Path) -> None:
+    """Check that input and output do not overlap.
+
+    Args:
+        output: the folder to write.
+        data: the folder or file to read.
+
+    Raises:
+        DataError: if the output would overwrite the input, or lie among it.
+    """
+    if output.exists() and output.resolve() == data.resolve():
+        raise DataError(f"--output-dir {output} is the same folder as --data; {_advice(output)}")
+    inside = data.resolve()
+    if inside.is_relative_to(output.resolve()) and _OURS.fullmatch(inside.relative_to(output.resolve()).parts[0]):
+        raise DataError(f"--data {data} overlaps the files written to --output-dir {output}; {_advice(output)}")
+
+
+def _advice(output: Path) -> str:
+    return f"choose another folder, such as: --output-dir {processed_folder(output)}"
+
+
+def claim(output: Path, data: Path, overwrite: bool) -> None:
+    """Create the output folder, or with `overwrite` remove what an earlier run wrote to it.
+
+    Args:
+        output: the folder to write.
+        data: the folder or file to read.
+        overwrite: whether to replace an earlier run's output; other files are left alone.
+
+    Raises:
+        DataError: if the folder is not empty and `overwrite` is false, or if files to be removed contain `data`.
+    """
+    if output.exists() and not output.is_dir():
+        raise DataError(f"--output-dir {output} is a file; choose a folder")
+    present = sorted(output.iterdir()) if output.is_dir() else []
+    if is_unfinished(output) and not overwrite:
+        raise DataError(
+            f"--output-dir {output} holds a run that was stopped; --resume goes on, --overwrite begins again"
+        )
+    if present and not overwrite:
+        content = "a processed data set" if (output / FINISHED).exists() else f"'{present[0].name}' but no {FINISHED}"
+        raise DataError(f"--output-dir {output} holds {content}; choose a new folder, or use --overwrite")
+    written = [path for path in present if _OURS.fullmatch(path.name)]
+    for path in written:
+        if data.resolve().is_relative_to(path.resolve()):
+            raise DataError(f"--overwrite would remove {path}, which contains --data; choose another --output-dir")
+    for path in sorted(written, key=lambda path: path.name != FINISHED):  # first the mark of completion
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    output.mkdir(parents=True, exist_ok=True)
+
+
+def begin(flags: ColmapFlags, sources: list[Path]) -> None:
+    """Claim the output folder and mark what the run starts with; with `flags.resume`, go on with what was stopped.
+
+    Args:
+        flags: the user's flags.
+        sources: the files that are read, as `unfinished.mark` takes them.
+
+    Raises:
+        DataError: as `claim` and `unfinished.go_on`.
+    """
+    if flags.resume and is_unfinished(flags.output_dir):
+        go_on(flags, sources)
+        return
+    claim(flags.output_dir, flags.data, flags.overwrite)
+    mark(flags, sources)
+
+
+def is_unfinished(output: Path) -> bool:
+    """Return whether the folder `output` holds a run of COLMAP that was stopped."""
+    return not (output / FINISHED).exists() and (unfinished(output) / STARTED).is_file()
+
+
+def ready(output: Path) -> str:
+    """Return the last line of a command: where the data folder is, and how to train on it.
+
+    Args:
+        output: the data folder.
+    """
+    words = ("ns-train", "gaussian-splatting", "--data", str(output), "--max-seconds", "300")
+    return f"data folder: {output}; next: {shlex.join(words)}"

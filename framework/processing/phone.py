@@ -1,0 +1,127 @@
+"""Conversion of phone captures, whose poses are known: preparation of images, and transforms.json."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import one_line
+from nerfloom.processing.output import FINISHED, ready
+from nerfloom.processing.pipeline import prepare_and_report
+from nerfloom.processing.pyramid import write_pyramid
+from nerfloom.processing.transforms import Frame, Lens, content, write
+
+UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
+"""Errors raised if a JSON file lacks a number, or has something else instead."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read the JSON object in the file `path`.
+
+    Raises:
+        DataError: if the file is missing, is not JSON or does not hold an object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError(f"{path} does not exist") from error
+    except (ValueError, OSError, RecursionError) as error:
+        raise DataError(f"{path} is not readable JSON: {one_line(error)}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold a JSON object: names and values in braces")
+    return content
+
+
+def finite(value: Any) -> float:
+    """Convert the JSON value `value` to a number.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if it is not a finite number (`UNUSABLE`).
+    """
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{number} is not finite")
+    return number
+
+
+def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
+    """Return a lens without distortion.
+
+    Args:
+        size: width and height, pixels.
+        intrinsics: fx, fy, cx, cy, pixels.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
+    """
+    width, height = (int(finite(value)) for value in size)
+    fx, fy, cx, cy = (finite(value) for value in intrinsics)
+    if min(fx, fy) <= 0:
+        raise ValueError("a focal length must be above zero")
+    return Lens("OPENCV", {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
+
+
+def evenly_spaced(items: list, most: int) -> list:
+    """Return at most `most` evenly spaced `items`, the first and the last among them."""
+    if len(items) <= most:
+        return items
+    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
+
+
+def write_folder(
+    folder: Path,
+    posed: dict[Path, tuple[np.ndarray, Lens]],
+    output: Path,
+    num_downscales: int,
+    applied: np.ndarray,
+    crop: int = 0,
+) -> None:
+    """Prepare images and write a data folder.
+
+    Args:
+        folder: folder of the images.
+        posed: camera-to-world pose (4, 4) with OpenGL axes, and lens of the uncropped image, by the image's path.
+        output: the output folder, after `output.claim`.
+        num_downscales: number of folders of reduced images.
+        applied: (3, 4) transform from the phone's frame to that of the poses.
+        crop: pixels to cut off at each side.
+
+    Raises:
+        DataError: if no image is readable, or one differs in size from its lens.
+    """
+    prepared, _ = prepare_and_report(folder, list(posed), output / "images", upright=False, crop=crop)
+    frames = []
+    for image in prepared:
+        pose, uncropped = posed[Path(image.source)]
+        lens = cropped(uncropped, crop)
+        size = (image.width, image.height)
+        if size != (lens.values["w"], lens.values["h"]):
+            expected = f"{uncropped.values['w']}x{uncropped.values['h']}"
+            actual = f"{size[0] + 2 * crop}x{size[1] + 2 * crop}"
+            raise DataError(f"{folder / image.source} is {actual} pixels, but its camera is for {expected}")
+        frames.append(Frame(image.name, pose, lens, source=image.source))
+    write_pyramid(output / "images", [image.name for image in prepared], num_downscales)
+    # The phone measures gravity, so the frame is upright and need not be estimated from the poses.
+    write(output / FINISHED, content(frames, applied, None, {"orientation_override": "none"}))
+    say(f"{len(frames)} images with the phone's poses")
+    say(ready(output))
+
+
+def cropped(lens: Lens, crop: int) -> Lens:
+    """Return the lens of images with `crop` pixels cut off at each side.
+
+    Args:
+        lens: lens of the uncropped images.
+        crop: pixels.
+    """
+    values = dict(lens.values)
+    for key, change in (("w", 2 * crop), ("h", 2 * crop), ("cx", crop), ("cy", crop)):
+        values[key] -= change
+    return Lens(lens.model, values)

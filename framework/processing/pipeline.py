@@ -1,0 +1,134 @@
+"""Creation of a data folder from images: preparation, features, matching, reconstruction, output."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.processing import colmap, contrast, database, features, mapping, matching, transforms
+from nerfloom.processing.images import PreparedImage, prepare_all, write_masks
+from nerfloom.processing.job import Job
+from nerfloom.processing.output import FINISHED, ready
+from nerfloom.processing.parallax import NO_PARALLAX, PAIRS, WITHOUT, share_that_turned
+from nerfloom.processing.pyramid import write_pyramid
+from nerfloom.processing.summary import Summary, lines
+
+FEWEST = 3
+"""Minimum number of images of a reconstruction."""
+
+
+def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> None:
+    """Estimate the poses of images and write the data folder, after `output.claim` and `unfinished.mark`.
+
+    Args:
+        job: the reconstruction.
+        folder: folder of the images.
+        sources: paths of the images in it, as `find_images` returns them.
+        masks: folder of masks, or None.
+
+    Raises:
+        DataError: if nothing can be reconstructed; the folder then has no transforms.json.
+    """
+    flags, output, work = job.flags, job.flags.output_dir, job.work
+    with job.timed("preparing"):
+        prepared, unreadable = prepare_and_report(folder, sources, job.images)
+        clear = contrast.for_features(folder, prepared, job.images, job.stretched)
+        if len(prepared) < FEWEST:
+            raise DataError(f"--data {flags.data}: {len(prepared)} images can be used; at least {FEWEST} are needed")
+        mask_of = write_masks(masks, prepared, output / "masks") if masks is not None else {}
+    names = [image.name for image in prepared]
+    features.extract(job, prepared, clear, output / "masks" if mask_of else None)
+    rule = matching.choose_matching(flags.matching_method, len(names), flags.exhaustive_limit, job.ordered)
+    with job.timed("matching"):
+        pairs = matching.choose_pairs(rule, names, job)
+    matching.match(job, pairs, len(names), matching.RULES[rule])
+    turned = share_that_turned(database.matches(job.database, PAIRS))
+    if turned >= WITHOUT:
+        say(f"warning: {NO_PARALLAX}")
+    sizes = mapping.reconstruct(job, names, rule, turned)
+    with job.timed("unfolding"):
+        sizes = mapping.unfold(job) or sizes
+
+    final = work / "sparse" / "0"
+    with job.timed("writing"):
+        if flags.undistort:
+            job.run(colmap.undistort, (final, job.images, work / "flat"), "Undistorting")
+            shutil.move(work / "flat" / "images", output / "images")
+            final = work / "flat" / "sparse"
+        model: colmap.Model = job.run(colmap.read_model, (final,), "Reading the model")
+        frames = _frames(model, prepared, mask_of)
+        kept = [frame.name for frame in frames] if flags.undistort else names
+        write_pyramid(output / "images", kept, flags.num_downscales)
+        write_pyramid(output / "masks", sorted(mask_of.values()), flags.num_downscales if mask_of else 0, masks=True)
+        points = model.points @ transforms.Z_UP[:, :3].T
+        transforms.write_points(output / "sparse_pc.ply", points, model.colors)
+    summary = Summary(
+        images=len(prepared),
+        unreadable=len(unreadable),
+        registered=len(frames),
+        other_models=tuple(sizes[1:]),
+        points=len(points),
+        reprojection_error=round(model.error, 4),
+        matching=rule,
+        pairs=database.rows(job.database, "two_view_geometries"),
+        turned=turned,
+        seconds=job.seconds,
+    )
+    _keep(work, output / "colmap", final)
+    (output / "colmap" / "summary.json").write_text(json.dumps(summary.as_json(), indent=2))
+    transforms.write(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
+    for line in lines(summary):
+        say(line)
+    say(ready(output))
+
+
+def prepare_and_report(
+    folder: Path, sources: list[Path], images: Path, upright: bool = True, crop: int = 0
+) -> tuple[list[PreparedImage], list[str]]:
+    """Prepare images (`prepare_all`), and report how many are unreadable and why the first is.
+
+    Args:
+        folder: folder of the sources.
+        sources: paths of the images in it.
+        images: folder to write to.
+        upright: whether to undo the EXIF orientation.
+        crop: pixels to cut off at each side.
+
+    Returns:
+        The prepared images, and the messages for unreadable ones.
+
+    Raises:
+        DataError: if no image is readable.
+    """
+    prepared, unreadable = prepare_all(folder, sources, images, upright, crop)
+    if unreadable:
+        say(f"{len(unreadable)} of {len(sources)} images are unreadable and skipped, the first: {unreadable[0]}")
+    if not prepared:
+        raise DataError(f"{folder} has no readable image: {unreadable[0]}")
+    return prepared, unreadable
+
+
+def _frames(model: colmap.Model, prepared: list[PreparedImage], masks: dict[str, str]) -> list[transforms.Frame]:
+    lenses = {number: transforms.lens_of(*camera) for number, camera in model.cameras.items()}
+    frames = []
+    for image in prepared:
+        if image.name in model.images:
+            number, camera, world_to_camera = model.images[image.name]
+            pose = transforms.transformed(transforms.opengl_pose(world_to_camera), transforms.Z_UP)
+            mask = masks.get(image.name)
+            frames.append(transforms.Frame(image.name, pose, lenses[camera], mask, number, image.source))
+    return frames
+
+
+def _keep(work: Path, target: Path, final: Path) -> None:
+    """Move the results out of the working folder, models last, and remove the rest."""
+    shutil.move(work / "database.db", target / "database.db")
+    models = work / "sparse"
+    if final.parent != models:  # the undistorted model belongs to the images
+        shutil.move(models / "0", target / "distorted")
+        shutil.move(final, models / "0")
+    shutil.move(models, target / "sparse")
+    shutil.rmtree(work)

@@ -1,0 +1,127 @@
+"""Polycam's raw exports: keyframes/images (or corrected_images), with a JSON file of pose and lens for each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.processing.listing import find_images
+from nerfloom.processing.phone import UNUSABLE, evenly_spaced, finite, read_json, undistorted_lens, write_folder
+from nerfloom.processing.transforms import Lens
+
+Z_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
+"""(3, 4) transform from the phone's frame (y up) to one with z up, as in nerfstudio."""
+
+
+def convert(export: Path, output: Path, num_downscales: int, max_images: int, min_blur_score: float, crop: int) -> None:
+    """Write a data folder from an export.
+
+    Args:
+        export: the unpacked raw export.
+        output: the output folder, after `output.claim`.
+        num_downscales: number of folders of reduced images.
+        max_images: maximum number of images, evenly spaced.
+        min_blur_score: minimum of Polycam's blur score; images with a lower one are skipped as blurred.
+        crop: pixels to cut off at each side.
+
+    Raises:
+        DataError: if `export` is not an export, or no image of it is usable.
+    """
+    images, cameras = _folders(export)
+    posed, blurred, without_camera = {}, 0, 0
+    for name in find_images(images):
+        path = (cameras / name).with_suffix(".json")
+        if not path.is_file():
+            without_camera += 1
+            continue
+        camera = read_json(path)
+        if blur_score_of(camera, path, min_blur_score) < min_blur_score:
+            blurred += 1
+            continue
+        posed[name] = (pose_of(camera, path), lens_of(camera, path))
+    if without_camera:
+        say(f"{without_camera} images have no camera in {cameras} and are skipped")
+    if blurred:
+        say(f"{blurred} images have a blur score below {min_blur_score:g} and are skipped (--min-blur-score)")
+    if not posed:
+        raise DataError(f"{export} has no usable image; lower --min-blur-score, or export again")
+    chosen = {name: posed[name] for name in evenly_spaced(list(posed), max_images)}
+    write_folder(images, chosen, output, num_downscales, Z_UP, crop)
+
+
+def check(export: Path) -> None:
+    """Check that `export` is an unpacked raw export.
+
+    Raises:
+        DataError: if it is not.
+    """
+    _folders(export)
+
+
+def blur_score_of(camera: dict[str, Any], path: Path, unknown: float) -> float:
+    """Return Polycam's measure of an image's sharpness.
+
+    Args:
+        camera: content of the camera's JSON file.
+        path: the file, for messages.
+        unknown: the result if the file has no score.
+
+    Raises:
+        DataError: if the score is not a number.
+    """
+    try:
+        return finite(camera.get("blur_score", unknown))
+    except UNUSABLE as error:
+        raise DataError(f"{path}: the blur_score is not a number") from error
+
+
+def pose_of(camera: dict[str, Any], path: Path) -> np.ndarray:
+    """Return the camera-to-world matrix (4, 4), OpenGL axes, z up, of a camera.
+
+    Args:
+        camera: content of the camera's JSON file.
+        path: the file, for messages.
+
+    Raises:
+        DataError: if the pose is incomplete.
+    """
+    try:
+        rows = [[finite(camera[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
+    except UNUSABLE as error:
+        raise DataError(f"{path} has no complete pose (t_00 to t_23)") from error
+    pose = np.eye(4)
+    pose[:3] = Z_UP[:, :3] @ np.array(rows)
+    return pose
+
+
+def lens_of(camera: dict[str, Any], path: Path) -> Lens:
+    """Return the lens of a camera.
+
+    Args:
+        camera: content of the camera's JSON file.
+        path: the file, for messages.
+
+    Raises:
+        DataError: if the lens is incomplete.
+    """
+    try:
+        size = (camera["width"], camera["height"])
+        return undistorted_lens(size, [camera[name] for name in ("fx", "fy", "cx", "cy")])
+    except UNUSABLE as error:
+        raise DataError(f"{path} has no complete lens (width, height, fx, fy, cx, cy)") from error
+
+
+def _folders(export: Path) -> tuple[Path, Path]:
+    """Return the folders of images and cameras, the ones corrected by Polycam if they exist."""
+    if export.is_file():
+        raise DataError(f"--data {export} is a file; unpack the raw export and pass its folder")
+    for root in (export / "keyframes", export):
+        for prefix in ("corrected_", ""):
+            images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"
+            if images.is_dir() and cameras.is_dir():
+                return images, cameras
+    raise DataError(f"--data {export} is not a raw export of Polycam: it has no keyframes/images and keyframes/cameras")

@@ -1,0 +1,120 @@
+"""Record3D's exports with EXR and RGBD: EXR_RGBD/rgb with numbered images, and metadata.json with the poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.processing.listing import find_images
+from nerfloom.processing.phone import UNUSABLE, evenly_spaced, read_json, undistorted_lens, write_folder
+from nerfloom.processing.transforms import Lens
+
+
+def convert(export: Path, output: Path, num_downscales: int, max_images: int) -> None:
+    """Write a data folder from an export.
+
+    An image's number is the index of its pose in metadata.json; images may be missing.
+
+    Args:
+        export: the folder EXR_RGBD, or its parent.
+        output: the output folder, after `output.claim`.
+        num_downscales: number of folders of reduced images.
+        max_images: maximum number of images, evenly spaced.
+
+    Raises:
+        DataError: if `export` is not an export, or no image of it is usable.
+    """
+    root = find_root(export)
+    path = root / "metadata.json"
+    metadata = read_json(path)
+    poses = poses_of(metadata, path)
+    numbered = {int(name.stem): name for name in find_images(root / "rgb") if name.stem.isdecimal()}
+    usable = [number for number in sorted(numbered) if number < len(poses)]
+    if len(usable) < len(numbered):
+        say(f"{len(numbered) - len(usable)} images have a number beyond the {len(poses)} poses and are skipped")
+    if not usable:
+        raise DataError(f"{root / 'rgb'} has no image whose number is that of a pose in {path}")
+    if len(usable) < len(poses):
+        say(f"{len(poses) - len(usable)} of {len(poses)} poses have no image")
+    lenses = lenses_of(metadata, len(poses), path)
+    posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly_spaced(usable, max_images)}
+    write_folder(root / "rgb", posed, output, num_downscales, np.eye(4)[:3])
+
+
+def find_root(export: Path) -> Path:
+    """Return the folder with rgb and metadata.json: `export` or one in it.
+
+    Raises:
+        DataError: if there is none.
+    """
+    for root in (export / "EXR_RGBD", export):
+        if (root / "rgb").is_dir() and (root / "metadata.json").is_file():
+            return root
+    raise DataError(
+        f"--data {export} is not an export of Record3D: it has no EXR_RGBD with rgb and metadata.json; "
+        "export with 'EXR + RGBD'"
+    )
+
+
+def poses_of(metadata: dict[str, Any], path: Path) -> np.ndarray:
+    """Return the camera-to-world matrices (N, 4, 4), OpenGL axes, from entries [qx, qy, qz, qw, tx, ty, tz].
+
+    Args:
+        metadata: content of metadata.json.
+        path: the file, for messages.
+
+    Raises:
+        DataError: if the entries are invalid.
+    """
+    try:
+        rows = np.array(metadata["poses"], np.float64).reshape(-1, 7)
+    except UNUSABLE as error:
+        raise DataError(f"{path} has no poses of 7 numbers each") from error
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(rows[:, :4], axis=1, keepdims=True)
+    if not len(rows) or not np.isfinite(rows).all() or not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise DataError(f"{path} has no poses, or poses that are not finite or have no rotation")
+    rows[:, :4] /= lengths
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rotations(rows[:, :4])
+    poses[:, :3, 3] = rows[:, 4:]
+    return poses
+
+
+def rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Return the rotation matrices (N, 3, 3) of unit `quaternions` (N, 4), real part last."""
+    x, y, z, w = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def lenses_of(metadata: dict[str, Any], count: int, path: Path) -> list[Lens]:
+    """Return the lens of each pose: its own if the export has one for each, else that of the whole capture (K).
+
+    Args:
+        metadata: content of metadata.json; K is stored column by column.
+        count: number of poses N.
+        path: the file, for messages.
+
+    Raises:
+        DataError: if the intrinsics are incomplete.
+    """
+    try:
+        size = (metadata["w"], metadata["h"])
+        own = metadata.get("perFrameIntrinsicCoeffs") or []
+        if len(own) == count:
+            each = [tuple(row[:4]) for row in own]
+        else:
+            matrix = np.array(metadata["K"], np.float64).reshape(3, 3).T
+            each = [(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])] * count
+        return [undistorted_lens(size, intrinsics) for intrinsics in each]
+    except UNUSABLE as error:
+        raise DataError(f"{path} has no complete lens (w, h, K of 9 numbers)") from error

@@ -1,0 +1,77 @@
+"""The report at the end: how many images were registered, how long it took, and advice if they are too few."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
+
+ENOUGH = 0.8
+"""Share of registered images below which advice is given."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Figures of a reconstruction."""
+
+    images: int
+    """Number of readable images."""
+    unreadable: int
+    """Number of unreadable images."""
+    registered: int
+    """Number of images in the largest model, which is kept."""
+    other_models: tuple[int, ...]
+    """Number of images in each of the other models."""
+    points: int
+    """Number of sparse points."""
+    reprojection_error: float
+    """Mean reprojection error, pixels."""
+    matching: str
+    """Rule by which pairs were selected."""
+    pairs: int
+    """Number of pairs of images that were matched."""
+    turned: float
+    """Share of pairs of images between which the camera only turned (`parallax.share_that_turned`)."""
+    seconds: dict[str, float]
+    """Seconds by stage."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures as a dictionary for a JSON file."""
+        return asdict(self) | {"seconds": {stage: round(value, 2) for stage, value in self.seconds.items()}}
+
+
+def lines(summary: Summary) -> list[str]:
+    """Return the figures of `summary` as lines of text."""
+    share = summary.registered / summary.images
+    stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
+    messages = [
+        f"registered: {summary.registered} of {summary.images} images ({share:.0%}); "
+        f"{summary.points} points; mean reprojection error {summary.reprojection_error:.2f} pixels",
+        f"time: {sum(summary.seconds.values()):.1f} s ({stages})",
+    ]
+    if summary.other_models:
+        sizes = ", ".join(map(str, summary.other_models))
+        messages.append(f"left out: {len(summary.other_models)} other models that are not connected, of {sizes} images")
+    if summary.turned >= WITHOUT:
+        messages.append(f"warning: {NO_PARALLAX}")
+    if share < ENOUGH:
+        messages.append(f"few images were registered. {advice(summary.matching)}")
+    return messages
+
+
+def advice(matching: str) -> str:
+    """Return advice for images that cannot be connected.
+
+    Args:
+        matching: the rule that selected the pairs.
+    """
+    steps = [
+        "take images with more overlap (two thirds or more with the next), sharp, in constant light",
+        "set --max-num-features 16384 and --max-image-size 3200",
+    ]
+    if matching != "exhaustive":
+        steps.append("set --matching-method exhaustive")
+    if matching == "sequential":
+        steps.append("take more frames (--num-frames-target, or a larger --sequential-overlap)")
+    return "To improve: " + "; ".join(steps) + "."

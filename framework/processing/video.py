@@ -1,0 +1,60 @@
+"""Extraction of images from a video: frames as they are stored, each once, the sharpest of each of equal intervals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nerfloom.base.console import say
+from nerfloom.processing import frame_choice
+from nerfloom.processing.ffmpeg import chosen_frames, survey
+from nerfloom.processing.images import save
+
+
+def write_frames(video: Path, folder: Path, target: int) -> list[Path]:
+    """Write `target` different frames of a video, or all if it has fewer, as folder/frame_00001.jpg and so on.
+
+    Args:
+        video: the video file.
+        folder: folder to create.
+        target: number of frames to write.
+
+    Returns:
+        The paths of the frames in the folder.
+
+    Raises:
+        DataError: if the video or ffmpeg is missing, or the video has no readable frame.
+    """
+    times, seen = survey(video, lambda picture: (frame_choice.sharpness(picture), frame_choice.blocks(picture)))
+    fresh = frame_choice.different([squares for _, squares in seen])
+    sharpnesses = np.array([seen[number][0] for number in fresh])
+    numbers = fresh[frame_choice.sharpest(sharpnesses, frame_choice.intervals(times[fresh], target))]
+    folder.mkdir(parents=True)
+    names = []
+    for index, frame in enumerate(chosen_frames(video, numbers)):
+        names.append(Path(f"frame_{index + 1:05d}.jpg"))
+        save(Image.fromarray(frame), folder / names[-1])
+    say(line(times, len(fresh), target, len(names)))
+    return names
+
+
+def line(times: np.ndarray, fresh: int, target: int, written: int) -> str:
+    """Return a line of text: how many frames a video has, and how many of them are written.
+
+    Args:
+        times: (N,) times of all frames, seconds.
+        fresh: number of different frames.
+        target: number of frames that are wanted.
+        written: number of frames that are written.
+    """
+    count, gaps = len(times), np.diff(times)
+    uneven = " at uneven times" if count > 2 and gaps.max() > 1.5 * max(np.median(gaps), 1e-9) else ""
+    text = f"video: {count} frames in {times[-1] - times[0]:.1f} s{uneven}"
+    if fresh < count:
+        text += f", of which {count - fresh} repeat the one before and are dropped"
+    if written < target:
+        taken = "the only one is" if written == 1 else f"all {written} are"
+        return f"{text}; {taken} taken, as there are no more, though --num-frames-target is {target}"
+    return f"{text}; {written} are taken, the sharpest of each of {target} intervals"

@@ -1,1 +1,0 @@
-"""Tools around training: processing, comparison, benchmarks, stress, checks, integrations."""

@@ -1,1 +1,0 @@
-"""Benchmarks of `ns-bench`: repeatable measurements of speed and error."""

@@ -1,0 +1,136 @@
+"""The folder given by --data: detection of its format, and advice if it has none."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from nerfloom.registry import load_dataparser, registered
+
+if TYPE_CHECKING:
+    from nerfloom.data.parsed_scene import DataParser
+
+PARTS = re.compile(
+    r"transforms(_train|_val|_test)?\.json|poses_bounds\.npy|(cameras|frames|images|points3D|rigs)\.(bin|txt)"
+    r"|metadata\.json|.+\.tsv|(images|masks)(_\d+)?|sparse|colmap|[0-9]|train|val|test|rgb|EXR_RGBD|keyframes"
+)
+"""Names of files and folders in a data folder that users may pass instead of the folder itself."""
+MAX_LEVELS = 3
+"""Maximum number of levels between such a part and the data folder."""
+MAX_FILES = 5000
+"""Maximum number of files examined to give advice."""
+
+
+def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None, str]:
+    """Return the data folder and its format; for None, no folder and the format of the embedded scene.
+
+    A part of a data folder, such as transforms.json or sparse/0, stands for the folder. Formats that cannot be loaded
+    are reported and ignored.
+
+    Args:
+        path: the path that the user gave, or None.
+        named: the format that the user named, or None; a named format need not recognise the folder.
+
+    Raises:
+        DataError: if the folder does not exist, or no format or several recognise it.
+    """
+    if path is None:
+        return None, named or "procedural"
+    formats = _formats([named] if named else list(registered("dataparsers")))
+    for folder in _candidates(path):
+        matches = [name for name, parser in formats.items() if _recognizes(name, parser, folder)]
+        if len(matches) == 1:
+            return folder, matches[0]
+        if matches:
+            several = " or ".join(matches)
+            raise DataError(
+                f"--data {folder}: the format may be {several}; name it after the flags, as in '{matches[0]}'"
+            )
+    if named is not None:
+        return path, named
+    raise DataError(f"--data {path}: {_advice(path)}")
+
+
+def _candidates(path: Path) -> Iterator[Path]:
+    """Yield the folder itself, and its parents as long as it is named like a part of a data folder."""
+    if os.path.isdir(path):  # `Path.is_dir` raises for names that no file can have
+        yield path
+    elif not os.path.isfile(path):
+        return
+    for _ in range(MAX_LEVELS):
+        if not PARTS.fullmatch(path.name):
+            return
+        path = path.parent
+        yield path
+
+
+def _formats(names: list[str]) -> dict[str, type[DataParser]]:
+    """Load the formats that can be loaded; a single one was named by the user, and it must load."""
+    formats = {}
+    for name in names:
+        try:
+            formats[name] = load_dataparser(name)
+        except ConfigError as error:
+            if len(names) == 1:
+                raise
+            say(f"warning: {error}; it is ignored")
+    return formats
+
+
+def _recognizes(name: str, parser: type[DataParser], path: Path) -> bool:
+    try:
+        return parser.recognizes(path)
+    except Exception as error:  # it should not raise, but an error in one plugin must not affect other formats
+        say(f"warning: data format '{name}' failed to examine {path}: {type(error).__name__}: {error}; it is ignored")
+        return False
+
+
+def _advice(path: Path) -> str:
+    """Say what to do about a path that is not a data folder."""
+    if not os.path.exists(path):
+        return "there is no such folder"
+    if os.path.isfile(path):
+        if path.suffix.lower() in VIDEO_SUFFIXES:
+            return f"a video has no camera poses yet. {_processing('video', path)}"
+        if path.suffix.lower() == ".json":
+            return f"this is a file, not a data folder; to read it as a transforms.json: --data {path} nerfstudio"
+        return "this is a file, not a data folder"
+    files = [Path(folder, name) for folder, name in islice(_files(path), MAX_FILES)]
+    if count := sum(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
+        number = f"{count} image{'s' if count > 1 else ''}" if len(files) < MAX_FILES else "images"
+        return f"there are {number}, but no camera poses. {_processing('images', path)}"
+    if videos := sorted(file for file in files if file.suffix.lower() in VIDEO_SUFFIXES):
+        return f"a video has no camera poses yet. {_processing('video', videos[0])}"
+    return f"the folder is in no known data format. Known: {', '.join(registered('dataparsers'))}"
+
+
+def _files(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield directory and name of every file below a folder, hidden ones excepted."""
+    for folder, below, names in os.walk(path):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        yield from ((folder, name) for name in names if not name.startswith("."))
+
+
+def _processing(kind: str, path: Path) -> str:
+    """Return the commands that create a data folder."""
+    output = processed_folder(path)
+    source, target = shlex.quote(str(path)), shlex.quote(str(output))
+    return f"Estimate them first: ns-process-data {kind} --data {source} --output-dir {target} (then: --data {target})"
+
+
+def processed_folder(path: Path) -> Path:
+    """Return the default output folder for processing a folder of images or a video, beside it.
+
+    Args:
+        path: folder of images, or video file.
+    """
+    resolved = path if path.name not in ("", "..") else path.resolve()
+    return resolved.with_name(f"{resolved.stem if resolved.is_file() else resolved.name}-processed")

@@ -1,0 +1,152 @@
+"""Drawing for all browsers, one piece at a time, in the thread that calls `Studio.work`."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import cast
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import NerfloomError
+from nerfloom.cameras.ndc import Ndc
+from nerfloom.evaluation.outputs import Arrays
+from nerfloom.ray_model import RayModel
+from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.drawing import Truth, draw
+from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
+from nerfloom.viewer.request import Request, smaller
+from nerfloom.viewer.viewed import Subject
+
+REST = 0.15
+"""Seconds without a new request after which a picture is refined."""
+WHOLE = 1e6
+"""Seconds that a piece may take of a method that casts no rays, so that it is the whole picture. Gaussians beside an
+image are drawn by the size of that image, so that strips of it differ from the whole: on fox they came to 28 dB."""
+
+
+class Studio:
+    """Pictures of one subject for several browsers.
+
+    Browsers come, go and ask in any thread. Everything is drawn where `work` is called, so that a model in training is
+    never read and changed at once.
+
+    Args:
+        subject: what is looked at.
+        coarse_seconds: time that the picture of a moving camera may take.
+        piece_seconds: time that a piece of a refinement may take.
+        ndc: function that returns the normalised device coordinates of the scene; None if it has none.
+        truth: true images for the output `error`.
+    """
+
+    def __init__(
+        self,
+        subject: Subject,
+        coarse_seconds: float = 0.1,
+        piece_seconds: float = 0.1,
+        ndc: Ndc | None = None,
+        truth: Truth | None = None,
+    ) -> None:
+        self.subject = subject
+        self.coarse_seconds, self.piece_seconds = coarse_seconds, piece_seconds
+        self.hurried = False
+        self._ndc, self._truth = ndc, truth
+        self._speed = Speed()
+        self._browsers: dict[int, Browser] = {}
+        self._lock = threading.Lock()
+        self._asked = threading.Event()
+
+    # -- any thread -------------------------------------------------------------------------------------------
+
+    def enter(self, number: int, browser: Browser) -> None:
+        """Add a `browser` with its `number`."""
+        with self._lock:
+            self._browsers[number] = browser
+
+    def leave(self, number: int) -> None:
+        """Remove the browser with a `number`, if it is there."""
+        with self._lock:
+            self._browsers.pop(number, None)
+
+    def ask(self, number: int, change: Callable[[Request | None], Request | None]) -> None:
+        """Replace a browser's request.
+
+        Args:
+            number: the browser's.
+            change: function from its last request to the new one; None for none yet.
+        """
+        with self._lock:
+            browser = self._browsers.get(number)
+            request = None if browser is None else change(browser.wanted)
+            if browser is None or request is None or not browser.ask(request):
+                return
+        self._asked.set()
+
+    def wake(self) -> None:
+        """End `wait`."""
+        self._asked.set()
+
+    @property
+    def is_empty(self) -> bool:
+        """True if no browser is there."""
+        return not self._browsers
+
+    # -- the drawing thread -----------------------------------------------------------------------------------
+
+    def wait(self, seconds: float) -> None:
+        """Wait for a request, at most so many `seconds`."""
+        self._asked.wait(seconds)
+        self._asked.clear()
+
+    def work(self) -> float | None:
+        """Draw the next piece for one of the browsers, and return its seconds; None if there is nothing to draw."""
+        with self._lock:
+            browsers = list(self._browsers.values())
+        now = time.monotonic()
+        index = next_browser([one.waiting(self.subject.step, now) for one in browsers], now, REST)
+        if index is None:
+            return None
+        browser = browsers[index]
+        start = time.perf_counter()
+        try:
+            self._serve(browser)
+        except (NerfloomError, MemoryError, RuntimeError, ValueError) as error:
+            reason = " ".join(str(error).split())[:300] or type(error).__name__
+            say(f"viewer: a picture could not be drawn: {reason}")
+            browser.drawn, browser.pieces, browser.step = browser.wanted, [], self.subject.step
+        browser.served_at = time.monotonic()
+        return time.perf_counter() - start
+
+    def _serve(self, browser: Browser) -> None:
+        """Draw the next piece for a browser."""
+        request, step, budget = browser.wanted, self.subject.step, self._piece_seconds
+        assert request is not None
+        if request != browser.drawn:
+            stride = coarse_stride(self._speed, request.width, request.height, self.coarse_seconds, browser.stride)
+            whole = Piece(stride, 1, 0, smaller(request.width, request.height, stride)[1])
+            kept = self._timed(request, whole)
+            left: list[Piece] = []
+            if stride > 1 or self._rays > 1:
+                left = refinement(self._speed, request.width, request.height, stride, self._rays, budget)
+            browser.begin(request, stride, step, kept, left)
+            return
+        if not browser.pieces:
+            browser.renew(self._speed, self._rays, step, budget)
+        browser.refine(self._timed(request, browser.pieces[0]))
+
+    @property
+    def _piece_seconds(self) -> float:
+        return self.piece_seconds if isinstance(self.subject.model, RayModel) else WHOLE
+
+    @property
+    def _rays(self) -> Rays:
+        """Rays per pixel of a finished picture: one while something else has to be done."""
+        return 1 if self.hurried else cast("Rays", self.subject.model.rays_per_pixel)
+
+    def _timed(self, request: Request, piece: Piece) -> Arrays:
+        """Draw a piece, and measure it."""
+        start = time.perf_counter()
+        kept = draw(self.subject, request, piece, self._ndc, self._truth)
+        pixels = smaller(request.width, request.height, piece.stride)[0] * (piece.bottom - piece.top)
+        self._speed = self._speed.with_one(pixels * piece.rays, time.perf_counter() - start)
+        return kept

@@ -114,7 +114,7 @@ def trained_on(data: Path, folder: Path, seconds: float, limit: float | None) ->
         content["pixels MB"] = round(train_set.pixels.numel() / 1e6, 1)
         content["loading"] = status("VmHWM")
         forget_peak()
-        return content | train(Trainer(run, train_set, None), seconds)
+        return content | train(Trainer.of(run, train_set), seconds)
 
 
 def train(trainer: Trainer, seconds: float) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from benchmarks.children import own_command
 from nerfloom.base.console import say
 from nerfloom.base.errors import FlagError, NerfloomError
 from nerfloom.benchmarks.workload import default_run, endless_trainer
-from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.data.dataset import Dataset
 from nerfloom.kernels import native
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
@@ -199,8 +199,10 @@ def child(work: str, data: Path, seconds: float) -> dict[str, float]:
         Steps or images per second, and the seconds of the first, the longest and the median one.
     """
     with tempfile.TemporaryDirectory() as folder:
-        trainer = endless_trainer(default_run("instant-ngp", data), SETTINGS_FOR, Path(folder))
-        once = rendering(trainer) if work == "rendering" else lambda _: trainer.train_step()
+        run = default_run("instant-ngp", data)
+        trainer = endless_trainer(run, SETTINGS_FOR, Path(folder))
+        views = load_split(run, "test") if work == "rendering" else None
+        once = rendering(trainer, views) if views is not None else lambda _: trainer.train_step()
         print("ready", native.variant(), flush=True)
         sys.stdin.readline()
         first = timed(once, 0)  # the first training step includes silhouettes
@@ -215,16 +217,16 @@ def child(work: str, data: Path, seconds: float) -> dict[str, float]:
     }
 
 
-def rendering(trainer: Trainer) -> Callable[[int], object]:
+def rendering(trainer: Trainer, views: Dataset) -> Callable[[int], object]:
     """Train for a few steps, and return a function that renders a test view by its number.
 
     Args:
-        trainer: trainer of a run whose data has test images.
+        trainer: trainer of a run.
+        views: its test images.
     """
-    views = load_split(trainer.run, "test")
     for _ in range(STEPS_BEFORE_RENDERING):
         trainer.train_step()
-    background = evaluation_background(trainer.model)
+    background = trainer.model.background
     return lambda number: trainer.model.render_view(views.view(number % len(views)), background)
 
 

@@ -151,7 +151,7 @@ def trainer_of(method: str, folder: Path, scene: Callable[[int], Dataset] | None
     names = {field.name for field in dataclasses.fields(declared.config)}
     smaller = {name: value for name, value in SMALLER.items() if name in names}
     config = dataclasses.replace(declared.config, vis="none", **smaller, **ON_A_GPU.get(method, {}))
-    return Trainer(Run(method, config, "blender", load_dataparser("blender")(), folder), dataset, None)
+    return Trainer.of(Run(method, config, "blender", load_dataparser("blender")(), folder), dataset)
 
 
 def counted(trainer: Trainer, before: int, steps: int) -> Counted:

@@ -120,7 +120,7 @@ def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -
     with tempfile.TemporaryDirectory() as folder:
         run = Run(method, config, SCENE, load_dataparser(SCENE)(), Path(folder) / "run")
         create_folder(run)
-        trainer = Trainer(run, data, None)
+        trainer = Trainer.of(run, data)
         trainer.train()
     return trainer
 

@@ -20,7 +20,6 @@ from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import FINE_QUALITY, Browser
 from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.request import Pose, Request
-from nerfloom.viewer.viewed import of_trained
 
 WARM_UP = 12
 """Pictures of a moving camera before those that are measured."""
@@ -61,7 +60,7 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
         count: number of pictures of the moving camera.
     """
     trained = load_trained(run, device_type="cpu")
-    studio = Studio(of_trained(trained))
+    studio = Studio(trained)
     shown: list[tuple[float, int]] = []
 
     def show(image: np.ndarray, quality: int) -> None:
@@ -86,7 +85,7 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
             threading.Event().wait(0.005)
     assert shown[-1][1] == FINE_QUALITY
     return Times(
-        trained.run.method,
+        trained.method,
         width,
         height,
         first,

@@ -57,17 +57,18 @@ if TYPE_CHECKING:
     from nerfloom.plug_and_play.skipping import OccupancyGrid as OccupancyGrid
     from nerfloom.plug_and_play.skipping import sample as sample
     from nerfloom.ray_model import RayModel as RayModel
+    from nerfloom.renderable import Renderable as Renderable
     from nerfloom.rendering.rendered import Picture as Picture
     from nerfloom.rendering.rendered import Rendered as Rendered
     from nerfloom.rendering.renderer import Renderer as Renderer
     from nerfloom.rendering.volume import VolumeRenderer as VolumeRenderer
-    from nerfloom.runs import TrainedRun as TrainedRun
     from nerfloom.runs import image as image
     from nerfloom.runs import list_methods as list_methods
     from nerfloom.runs import load as load
     from nerfloom.runs import train as train
     from nerfloom.samplers.base import Sampler as Sampler
     from nerfloom.samplers.proposal import interlevel_loss as interlevel_loss
+    from nerfloom.training.loaded import Loaded as Loaded
 
 _HOMES = {
     "Cameras": "cameras.cameras",
@@ -79,6 +80,7 @@ _HOMES = {
     "Field": "fields.base",
     "GaussianModel": "gaussian_model",
     "LearnsMotion": "model",
+    "Loaded": "training.loaded",
     "Loss": "model",
     "Method": "method",
     "Model": "model",
@@ -92,6 +94,7 @@ _HOMES = {
     "RayConfig": "base.config",
     "RayModel": "ray_model",
     "Rays": "geometry.rays",
+    "Renderable": "renderable",
     "Rendered": "rendering.rendered",
     "Renderer": "rendering.renderer",
     "Rendering": "plug_and_play.rendering",
@@ -100,7 +103,6 @@ _HOMES = {
     "Samples": "geometry.rays",
     "Scene": "data.scene",
     "TrainConfig": "base.config",
-    "TrainedRun": "runs",
     "View": "cameras.view",
     "ViewBatch": "data.pixels.batch",
     "VolumeRenderer": "rendering.volume",

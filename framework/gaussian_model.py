@@ -22,7 +22,7 @@ from nerfloom.rendering.outputs import NORMALS, Output
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.capacity import Room
 from nerfloom.splats.density_control import RESET, GradientMean, grown
-from nerfloom.splats.drawing import DRAWN, draw_view, on_image, splat_camera
+from nerfloom.splats.drawing import DRAWN, draw_view, on_image, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.learning import as_gaussians, as_tables, row_changes, steps_per_move
 from nerfloom.splats.look import Look
@@ -65,7 +65,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         self.harmonics = table(3 * higher, "harmonics", 0.025)
         self.register_buffer("extent", torch.tensor(scene_size(scene)))
         self.gradients, self.room = GradientMean(), Room()
-        self.near = max(0.2 * scene.near, 1e-3)
+        self.near = smallest_depth(scene)
         self._on_image: Tensor | None = None
         self._longer_side = scene.image_size
         self._redrawn: Redrawn | None = None

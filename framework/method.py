@@ -8,11 +8,12 @@ from typing import Any
 
 from nerfloom.base.config import RayConfig, TrainConfig
 from nerfloom.base.decisions import Choice, Decision, fill, left_open
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError, is_out_of_memory
 from nerfloom.data.scene import Scene
 from nerfloom.fields.base import Field
 from nerfloom.model import Model
 from nerfloom.ray_model import RayModel
+from nerfloom.renderable import RendersFromImages
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import volume_renderer as volume_renderer
 from nerfloom.samplers.base import Sampler
@@ -47,7 +48,7 @@ def depth_choice(scene: Scene) -> Choice:
 
 @dataclass(frozen=True)
 class Method:
-    """Declaration of a method. Its name is that of the entry point, its summary the first line of its file.
+    """Declaration of a method. Its summary is the first line of its file.
 
     A method that casts rays declares a field, a sampler and a renderer, each as a function of settings and scene; a
     plugin replaces one of them by `dataclasses.replace(METHOD, renderer=...)`. A method that draws whole images
@@ -70,6 +71,8 @@ class Method:
     """Fills in the settings that depend on the data, and gives the reasons (`nerfloom.base.decisions.fill`)."""
     interface: int = 3
     """Version of the plugin interface that the method was written for (`registry.INTERFACE`)."""
+    name: str = "unnamed"
+    """Name that it is registered by, that of its entry point; filled in when it is loaded by it."""
 
     def decided(self, config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
         """Return settings with nothing left open: those of the method, and those of all methods that cast rays.
@@ -109,8 +112,24 @@ class Method:
             scene: properties of the scene.
 
         Raises:
-            ConfigError: if the settings do not fit the scene or each other.
+            ConfigError: if the settings do not fit the scene or each other, if the model needs more memory than the
+                machine has, or if the data shows several scenes, and the method learns one.
         """
+        if scene.num_scenes > 1 and not issubclass(self.model, RendersFromImages):
+            raise ConfigError(
+                f"the data shows {scene.num_scenes} scenes, and {self.name} learns one: choose a method that learns "
+                "from many, such as pixel-nerf, or data of one scene"
+            )
+        try:
+            return self._built(config, scene)
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise ConfigError(
+                f"the settings make a model of {self.name} that this machine has no memory for"
+            ) from error
+
+    def _built(self, config: TrainConfig, scene: Scene) -> Model[Any]:
         config, _ = self.decided(config, scene)
         if self.field is None:
             return self.model(config, scene)

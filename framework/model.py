@@ -1,12 +1,12 @@
-"""The interface of models, which the trainer, the evaluator and the commands use."""
+"""The interface of models, which the trainer uses: things to look at that learn."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -15,19 +15,13 @@ from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import has_bfloat16
 from nerfloom.base.optimised import ParameterGroup, RowChange, parameter_groups
 from nerfloom.base.pace import Pace
-from nerfloom.base.protocols import SeesRegistered
 from nerfloom.base.step_kind import StepKind
-from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
-from nerfloom.fields.appearance import Appearance
-from nerfloom.geometry.points import Points
-from nerfloom.rendering.outputs import Output
-from nerfloom.rendering.rendered import Picture
+from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.renderable import Renderable
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
-PartT = TypeVar("PartT")
 
 
 @dataclass(frozen=True)
@@ -47,16 +41,14 @@ class Loss:
         return torch.stack(list(self.terms.values())).sum()
 
 
-class Model(nn.Module, ABC, Generic[ConfigT]):
-    """Base class of models, which are trained and rendered.
+class Model(nn.Module, Renderable, Generic[ConfigT]):
+    """Base class of models: things to look at that learn.
 
     Samples are at random positions if `self.training` is True, and at fixed positions if it is False.
     """
 
     batches: ClassVar[Literal["pixels", "views"]]
     """Kind of the training batches: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
-    cameras: ClassVar[tuple[str, ...] | None] = None
-    """Camera models that it can draw images of; None for all for which there are rays."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()
@@ -71,24 +63,6 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
             batch: a `PixelBatch` or a `ViewBatch`, according to `batches`.
             step: number of training steps done.
         """
-
-    @abstractmethod
-    def render_view(self, view: View, background: Tensor) -> Picture:
-        """Render an image in evaluation mode, without gradient.
-
-        Args:
-            view: the camera, on the model's device.
-            background: (3,) colour in [0, 1] of the background.
-        """
-
-    def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        """Render the colours (H, W, 3) of an image alone, as `render_view` does; for models that are faster at that.
-
-        Args:
-            view: the camera, on the model's device.
-            background: (3,) colour in [0, 1] of the background.
-        """
-        return self.render_view(view, background).rgb
 
     def before_step(self, step: int, progress: float) -> None:
         """Apply schedules and update samplers; called before each training step.
@@ -142,19 +116,9 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         return parameter_groups(self)
 
     @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Further outputs of its pictures, beside colours, depths and opacity (`Picture.extras`)."""
-        return ()
-
-    @property
     def samples_per_step(self) -> int | None:
         """Number of samples per training step, to which the number of pixels is adapted; None for a fixed one."""
         return None
-
-    @property
-    def rays_per_pixel(self) -> int:
-        """Number of rays that are averaged for each pixel of an image, if the view does not set it."""
-        return 1
 
     @property
     def runs_on_kernels(self) -> bool:
@@ -171,6 +135,23 @@ class Model(nn.Module, ABC, Generic[ConfigT]):
         """True if networks run in bfloat16: as configured, or else if the device supports it."""
         chosen = self.config.mixed_precision
         return has_bfloat16(self.device) if chosen is None else chosen
+
+    @property
+    def background(self) -> Tensor:
+        """The background colour (3,) of training; if that is random or automatic, white if images have alpha."""
+        asked = self.config.background
+        white = asked == "white" or (asked != "black" and self.scene.has_alpha)
+        return torch.full((3,), float(white), device=self.device)
+
+    @contextmanager
+    def rendering(self) -> Iterator[None]:
+        """Within a `with` block, put the model in evaluation mode, with the precision and threads of pictures."""
+        with (
+            evaluating(self),
+            torch_on_one_thread(self.runs_on_kernels),
+            torch.autocast(self.device.type, torch.bfloat16, enabled=self.uses_bfloat16),
+        ):
+            yield
 
     def size(self) -> int:
         """Return the number of trainable parameters."""
@@ -221,57 +202,3 @@ class KeepsPace(Protocol):
         Args:
             pace: the run before the step.
         """
-
-
-@runtime_checkable
-class RendersFromImages(Protocol):
-    """A model that renders a scene from images of it, which it is shown: scenes that it never learnt from, too.
-
-    It may learn from images of several scenes (`Scene.num_scenes`), which other models may not.
-    """
-
-    def show_images(self, dataset: Dataset) -> None:
-        """Show the model images, before its first step and its first picture; its parameters stay as they are.
-
-        Args:
-            dataset: images on the model's device. Without `source_images`, those that it learns from: each may be
-                rendered from the others. Otherwise further scenes, which are rendered from their source images.
-        """
-
-
-@runtime_checkable
-class HasAppearance(Protocol, metaclass=SeesRegistered):
-    """A model that can learn an appearance vector for each image."""
-
-    appearance: Appearance | None
-    """The vectors; None if the settings or the scene do not use them."""
-
-
-@runtime_checkable
-class RefinesPoses(Protocol):
-    """A model that can refine the poses of the training cameras."""
-
-    def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras with their refined poses.
-
-        Args:
-            cameras: M training cameras with their given poses.
-        """
-
-
-@runtime_checkable
-class HasDensity(Protocol):
-    """A model whose density can be evaluated at any position."""
-
-    def density(self, points: Points) -> Tensor:
-        """Return the density (N,) at `points`, in 1/length."""
-
-
-def parts(model: nn.Module, kind: Callable[..., PartT]) -> list[PartT]:
-    """Return the modules of a model that are of a kind, including the model itself.
-
-    Args:
-        model: the model to search.
-        kind: a class or a runtime-checkable protocol, as in `parts(model, SkipsCells)`.
-    """
-    return [module for module in model.modules() if isinstance(module, cast("type[PartT]", kind))]

@@ -20,11 +20,11 @@ from nerfloom.encodings.opening import Opening
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
-from nerfloom.model import Loss, Model, evaluating, parts
+from nerfloom.model import Loss, Model
+from nerfloom.renderable import RendersRays, parts
 from nerfloom.rendering.outputs import Output, empty
 from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.rendering.renderer import Renderer
@@ -37,7 +37,7 @@ from nerfloom.scene.shared_space import SharedSpace
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 
 
-class RayModel(Model[RayConfigT], Generic[RayConfigT]):
+class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     """A model that evaluates a field at the positions of a sampler and composites the values with a renderer."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
@@ -109,18 +109,14 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
         """
         per_pixel, outputs = view.rays_per_pixel or self.rays_per_pixel, self.outputs
         offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
-        chunk, count = max(self.config.eval_num_rays_per_chunk // per_pixel, 1), grid.numel()
+        chunk, count = max(self.rays_at_once // per_pixel, 1), grid.numel()
         pixels, seen = grid.reshape(-1), self._seen(view)
         places = None if seen is None else seen.reshape(-1).nonzero().squeeze(-1)
         # Written into as they come: small results kept between a chunk's large ones would break up the heap.
         rgb, extras = background.to(self.device, torch.float32).repeat(count, 1), empty(outputs, count, self.device)
         depth, median, accumulation = torch.full((3, count), self.scene.far, device=self.device)
         accumulation.zero_()
-        with (
-            evaluating(self),
-            torch_on_one_thread(self.runs_on_kernels),
-            torch.autocast(self.device.type, torch.bfloat16, enabled=self.uses_bfloat16),
-        ):
+        with self.rendering():
             for start in range(0, count if places is None else len(places), chunk):
                 part: slice | Tensor = slice(start, start + chunk)
                 part = part if places is None else places[part]
@@ -203,6 +199,11 @@ class RayModel(Model[RayConfigT], Generic[RayConfigT]):
     def samples_per_step(self) -> int | None:
         """Number of samples per training step, as the sampler sets it; None for a fixed number of pixels."""
         return self.sampler.samples_per_step
+
+    @property
+    def rays_at_once(self) -> int:
+        """Maximum number of rays of a picture that are rendered at once, as configured."""
+        return self.config.eval_num_rays_per_chunk
 
     @property
     def rays_per_pixel(self) -> int:

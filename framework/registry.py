@@ -211,7 +211,7 @@ def load_method(name: str) -> Method:
     if not isinstance(method, Method):
         entry = entry_of("methods", name)
         raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is no nerfloom.Method")
-    return method
+    return replace(method, name=name)
 
 
 def load_dataparser(name: str) -> type[DataParser]:

@@ -1,4 +1,4 @@
-"""Training of methods, and rendering and evaluation of trained runs."""
+"""Training of methods, and loading of what was trained, to render and to evaluate it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from nerfloom.base.config import from_plain, to_plain
-from nerfloom.base.splits import Split
 from nerfloom.base.step_limit import limited_as_given
-from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.view import View
-from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background
 from nerfloom.registry import load_dataparser, load_method, registered, summary
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.data_folder import find_data
-from nerfloom.training.datasets import load_split
+from nerfloom.training.load import load as opened
+from nerfloom.training.loaded import Loaded
 from nerfloom.training.run import Run, run_folder
 from nerfloom.training.run_path import config_file
-from nerfloom.training.trained import Trained, load_trained
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -27,95 +22,29 @@ Device = Literal["auto", "cpu", "cuda", "mps"]
 """Type of a device; auto is cuda if it is available, and cpu otherwise."""
 
 
-class TrainedRun:
-    """A trained run, for rendering and evaluation.
-
-    Args:
-        trained: model, settings and folder of the run.
-    """
-
-    def __init__(self, trained: Trained) -> None:
-        self.model = trained.model
-        """The trained model (`nerfloom.Model`), in evaluation mode."""
-        self.run = trained.run
-        """Method, settings, data format and folder of the run."""
-        self._datasets: dict[Split, Dataset] = {}
-
-    def __repr__(self) -> str:
-        return f"TrainedRun({self.run.method!r}, {str(self.run.folder)!r}, {self.model.size():,} parameters)"
-
-    def dataset(self, split: Split = "test") -> Dataset:
-        """Return the images of a split, with their cameras. They are read once.
-
-        Args:
-            split: train, val or test.
-
-        Raises:
-            DataError: if the data cannot be read any more.
-        """
-        if split not in self._datasets:
-            self._datasets[split] = load_split(self.run, split).to(self.model.device)
-        return self._datasets[split]
-
-    def views(self, split: Split = "test") -> list[View]:
-        """Return a view for each image of `split`: train, val or test."""
-        dataset = self.dataset(split)
-        return [dataset.view(index) for index in range(len(dataset))]
-
-    def render(self, camera: View | Cameras, time: float | None = None) -> Picture:
-        """Render an image, with colour, depth and opacity.
-
-        Args:
-            camera: a view, or one camera.
-            time: time in [0, 1] of a moving scene; that of the view if None.
-
-        Raises:
-            ValueError: if there are several cameras.
-        """
-        if isinstance(camera, Cameras):
-            if len(camera) != 1:
-                raise ValueError(f"render() takes one camera, not {len(camera)}: choose one, as in cameras[0:1]")
-            camera = View(camera.to(self.model.device), time)
-        elif time is not None:
-            camera = View(camera.camera, time, camera.rays_per_pixel, camera.stride)
-        return self.model.render_view(camera, evaluation_background(self.model))
-
-    def evaluate(
-        self, split: Split = "test", max_images: int | None = None, lpips_weights: str | Path | None = None
-    ) -> dict[str, Any]:
-        """Return PSNR in dB, SSIM, at five scales too, LPIPS and rendering speed, by their names in eval.json.
-
-        Args:
-            split: the images to compare with: train, val or test.
-            max_images: maximum number of images, evenly spread over the split; None for all.
-            lpips_weights: file of LPIPS's weights; that of the run's settings if None.
-        """
-        weights = None if lpips_weights is None else Path(lpips_weights)
-        return evaluate(self.model, self.dataset(split), max_images=max_images, lpips_weights=weights).results
-
-
 def list_methods() -> dict[str, str]:
     """Return the summary of each method that can be trained, by name."""
     return {name: summary(entry) for name, entry in registered("methods").items()}
 
 
-def load(run: str | Path, data: str | Path | None = None, device: Device = "auto") -> TrainedRun:
-    """Load a trained run.
+def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Loaded:
+    """Load a trained run or a file of Gaussians.
 
     Args:
-        run: folder of the run, its config.yml, or a folder above it, whose newest run is taken.
-        data: new location of the data, if it has been moved.
+        path: folder of the run, its config.yml, a folder above it, whose newest run is taken, or a file of Gaussians
+            (.ply, .spz, .splat).
+        data: new location of the run's data, if it has been moved; the data of a file of Gaussians, if there are any.
         device: device of the model.
 
     Raises:
         ConfigError: if config.yml is missing or invalid.
         CheckpointError: if the checkpoint is missing or does not fit the settings.
+        DataError: if the file cannot be read.
     """
-    data_folder = None if data is None else Path(data)
-    return TrainedRun(load_trained(config_file(Path(run)), device_type=device, data=data_folder))
+    return opened(config_file(Path(path)), device_type=device, data=None if data is None else Path(data))
 
 
-def train(method: str, data: str | Path | None = None, format: str | None = None, **settings: Any) -> TrainedRun:
+def train(method: str, data: str | Path | None = None, format: str | None = None, **settings: Any) -> Loaded:
     """Train a method as `ns-train` does, and load the result.
 
     Args:
@@ -146,7 +75,7 @@ def image(picture: Picture, what: str = "rgb") -> Image:
     """Return a component of a rendered image as a PIL image, which notebooks display.
 
     Args:
-        picture: the rendered image, from `TrainedRun.render`.
+        picture: the rendered image, from `Loaded.render`.
         what: rgb for colour; depth for median depth, from dark (near) to light (far) over the depths of opaque pixels;
             accumulation for opacity; or the name of another output (`Picture.outputs`), such as normals.
 

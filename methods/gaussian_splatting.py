@@ -26,6 +26,7 @@ from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.kernels.splats.project import SplatCamera, sort_keys
 from nerfloom.losses.functions import mean_depth_error
+from nerfloom.registry import load_method
 from nerfloom.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from nerfloom.splats.drawing import draw, splat_camera
 from nerfloom.splats.guide import GUIDE, FoundDistances
@@ -110,7 +111,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         self.appearance: Appearance | None = None
         if config.appearance:
             optimised, share = Optimised("appearance", config.appearance_rate), config.mean_appearance_share
-            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share)
+            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share, config.eval_appearance)
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
@@ -129,7 +130,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         if kind == "field":
             with torch.enable_grad():
                 seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
-                found = found_surfaces(dataset, self.config, self.config.field_steps, seconds, count)
+                field = load_method("nerfacto" if dataset.scene.unbounded else "instant-ngp")
+                found = found_surfaces(field, dataset, self.config, self.config.field_steps, seconds, count)
             first = from_points(found.positions, found.colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             self.found_distances.set(found.images, found.pixels, found.distances)
             if not len(first):

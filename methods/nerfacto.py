@@ -170,13 +170,15 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
     """Return a field of one hash grid and two small networks, with appearance vectors if their length is not 0."""
-    opening, size = config.open_levels_until, config.appearance_embedding_dim
+    opening, size, appearance = config.open_levels_until, config.appearance_embedding_dim, None
+    if size:
+        appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
     return EncodedField(
         scene.box,
         HashGrid.of(config, opening),
         config.hidden_width,
         unbounded=config.contraction,
-        appearance=Appearance(size, scene.num_cameras, mean_share=config.mean_appearance_share) if size else None,
+        appearance=appearance,
         opening=opening,
     )
 

@@ -110,7 +110,7 @@ class ZipNeRF(RefinedModel[ZipNeRFConfig]):
         if config.exposure:
             rate = config.exposure_learning_rate
             optimised, share = Optimised("exposures", rate), config.mean_appearance_share
-            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share)
+            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share, config.eval_appearance)
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         rendered = super().render(rays, background)

@@ -146,6 +146,7 @@ LAYERS = (
     ("fields",),
     ("samplers",),
     ("rendering",),
+    ("renderable",),
     ("plug_and_play",),
     ("losses",),
     ("splats",),

@@ -18,7 +18,7 @@ from nerfloom.data.depths import ray_distances, read_depth, read_depths
 from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.geometry.rays import Samples
 from nerfloom.losses.functions import depth_error
-from tests.training.helpers import tiny_run, tiny_trainer
+from tests.training.helpers import tiny_run
 
 
 def test_millimetres_in_sixteen_bits(tmp_path: Path) -> None:
@@ -150,8 +150,7 @@ def test_depths_reach_batches_as_distances(places: int, shared_tiny: Path, tmp_p
 
 @pytest.mark.medium
 def test_depth_teaches_nerfacto_where_the_surface_is(shared_tiny: Path, tmp_path: Path) -> None:
-    still = tiny_trainer("nerfacto", shared_tiny, tmp_path / "still")
-    parsed = still.run.parser.parse(shared_tiny, "train")
+    parsed = tiny_run("nerfacto", shared_tiny, tmp_path / "still").parse("train")
     parsed = dataclasses.replace(parsed, depth_paths=ball_depths(tmp_path, parsed))
     from nerfloom.training.trainer import Trainer
 
@@ -161,7 +160,7 @@ def test_depth_teaches_nerfacto_where_the_surface_is(shared_tiny: Path, tmp_path
         folder.mkdir()
         run = tiny_run("nerfacto", shared_tiny, folder, max_num_iterations=120, max_eval_images=0, depth_loss_mult=mult)
         dataset = load_dataset(parsed, "train")
-        trainer = Trainer(run, dataset, None)
+        trainer = Trainer.of(run, dataset)
         trainer.train()
         batch = gather_batch(dataset, dataset.cameras.image_pixels(0), torch.ones(400, 3))
         with torch.no_grad():

@@ -91,7 +91,7 @@ def test_the_penalty_in_closed_form() -> None:
 def test_a_pixel_has_its_cameras_distance_and_a_run_its_term(shared_tiny: Path, tmp_path: Path) -> None:
     run = tiny_run("nerfacto", shared_tiny, tmp_path, free_space_loss_mult=0.5)
     dataset = load_dataset(run.parser.parse(shared_tiny, "train"), "train")
-    trainer = Trainer(run, dataset, None)
+    trainer = Trainer.of(run, dataset)
     assert isinstance(trainer.source, PixelSource)
     distances = distances_alone(dataset.cameras, dataset.scene.near, 2.0)
     batch = trainer.source.drawing_from(dataset).draw(Request(0, 32, 4))

@@ -15,7 +15,7 @@ from nerfloom.data.pixels.batch import composite, draw_batch
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.dataparsers.blender import Blender
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.metrics import psnr, ssim
 from nerfloom.scene.profile import SceneProfile
 from nerfloom.scene.silhouettes import Silhouettes
@@ -134,7 +134,7 @@ def test_ignored_pixels_do_not_count_in_evaluation(shared_tiny: Path, tmp_path: 
     assert [row["name"] for row in found.per_image] == list(data.names[1:])
     assert found.results["psnr"] == same.results["psnr"]
     assert found.results["psnr"] != plain.results["psnr"]
-    background = evaluation_background(model)
+    background = model.background
     target = composite(data.image(1).float() / 255, background)
     rgb = model.render_view(data.view(1), background).rgb.clamp(0, 1)
     kept = some.kept_of(1)
@@ -158,7 +158,7 @@ def test_similarity_is_of_windows_of_kept_pixels(shared_tiny: Path, tmp_path: Pa
     kept = torch.ones(len(data), height, width, dtype=torch.bool)
     kept[0, :3, : width - 2] = False
     found = evaluate(model, replace(data, kept=PixelSet.of_mask(kept.reshape(-1))), max_images=1)
-    background = evaluation_background(model)
+    background = model.background
     rgb = model.render_view(data.view(0), background).rgb.clamp(0, 1)
     target = composite(data.image(0).float() / 255, background)
     assert found.per_image[0]["ssim"] == pytest.approx(ssim(rgb[3:], target[3:]), abs=1e-6)
@@ -175,7 +175,7 @@ def test_what_is_ignored_is_not_taken_for_empty(shared_tiny: Path, tmp_path: Pat
     sums = Silhouettes.of(masked).sums[0]
     opaque = (data.image(0)[..., 3] > 0) | ~half[0]
     assert int(sums[-1, -1]) == int(opaque.sum())
-    trainer = Trainer(tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=3), masked, None)
+    trainer = Trainer.of(tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=3), masked)
     trainer.train_step()
     drawn = trainer.train_set.drawn
     assert drawn is not None

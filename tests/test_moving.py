@@ -49,7 +49,7 @@ def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Train
     )
     (folder / "run").mkdir()
     settings = {"max_num_iterations": 80, "max_eval_images": 0, **settings, **changes}
-    return Trainer(tiny_run(method, data, folder / "run", **settings), moving, None)
+    return Trainer.of(tiny_run(method, data, folder / "run", **settings), moving)
 
 
 def mean_squared_error(trainer: Trainer) -> float:

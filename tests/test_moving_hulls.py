@@ -95,7 +95,7 @@ def test_an_opaque_pixel_that_no_motion_explains_is_given_up(tmp_path: Path) -> 
 def test_of_too_few_images_no_speed_is_found_and_nothing_carved(count: int, tmp_path: Path) -> None:
     dataset, times = photographed(swinging_limb(0.5), count, size=40)
     run = tiny_run("kplanes", tmp_path, tmp_path, max_num_iterations=1, max_eval_images=0)
-    trainer = Trainer(run, dataset, None)
+    trainer = Trainer.of(run, dataset)
     drawn = skip_by_silhouettes(trainer.config, trainer.model, trainer.train_set, fresh=True).drawn
     assert drawn is None  # a pixel that is empty at its time teaches what is there at others
     said, sampler = chosen(trainer), trainer.model.sampler

@@ -165,7 +165,7 @@ def test_images_that_are_too_small_are_refused(shared_tiny: Path) -> None:
 def test_a_run_learns_from_all_sizes_and_reports_each(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     data = loaded(shared_tiny, "val")
-    trainer = type(trainer)(trainer.run, loaded(shared_tiny), data)
+    trainer = type(trainer)(trainer.method, trainer.config, loaded(shared_tiny), data)
     for _ in range(3):
         assert all(map(math.isfinite, trainer.train_step().losses.values()))
     found: Evaluation = evaluate(trainer.model, data)

@@ -145,7 +145,7 @@ def dimmed(folder: Path, out: Path, factors: torch.Tensor, **settings: object) -
     pixels[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
     varied = dataclasses.replace(still, pixels=pixels, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (out / "run").mkdir()
-    trainer = Trainer(tiny_run("nerfacto", folder, out / "run", max_eval_images=0, **settings), varied, None)
+    trainer = Trainer.of(tiny_run("nerfacto", folder, out / "run", max_eval_images=0, **settings), varied)
     trainer.train()
     return trainer
 

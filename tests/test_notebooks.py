@@ -46,7 +46,7 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str,
     scene = partial(registry.load_dataparser("procedural"), size=SIZE, num_train=12)
     small = {"max_num_iterations": 60, "vis": "none"}
 
-    def shortly(method: str, **settings: Any) -> nerfloom.TrainedRun:
+    def shortly(method: str, **settings: Any) -> nerfloom.Loaded:
         del settings["max_seconds"]
         return train(method, **{**settings, **TINY.get(method, TINY["instant-ngp"]), **small})
 

@@ -20,11 +20,11 @@ from nerfloom.dataparsers.procedural import Procedural
 from nerfloom.evaluation.evaluator import evaluate, views_to_judge
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.methods.pixel_nerf import METHOD, PixelNeRF, PixelNeRFConfig
-from nerfloom.model import RendersFromImages
+from nerfloom.renderable import RendersFromImages
 from nerfloom.stress.faults import spoiled_pose
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.run import Run, create_folder
-from nerfloom.training.trained import build_model, load_trained
+from nerfloom.training.trained import load_trained
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY, tiny_trainer
 
@@ -162,7 +162,7 @@ def test_methods_that_learn_one_scene_refuse_several(method: str, many: dict[str
     from nerfloom.registry import load_method
 
     with pytest.raises(ConfigError, match=f"shows 3 scenes, and {method} learns one") as raised:
-        build_model(method, load_method(method).config, many["train"].scene)
+        load_method(method).build(load_method(method).config, many["train"].scene)
     assert "\n" not in str(raised.value)
     assert isinstance(built(many["train"]), RendersFromImages)
 
@@ -207,7 +207,7 @@ def trained_on_many(folder: Path, parser: Procedural, config: PixelNeRFConfig) -
     run = Run("pixel-nerf", dataclasses.replace(config, vis="none"), "procedural", parser, folder)
     create_folder(run)
     sets = {split: load_dataset(run.parse(split), split) for split in ("train", "val", "test")}
-    return Trainer(run, sets["train"], sets["val"]), sets["test"]
+    return Trainer.of(run, sets["train"], sets["val"]), sets["test"]
 
 
 @pytest.fixture

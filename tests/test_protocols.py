@@ -14,7 +14,7 @@ from nerfloom.base.optimised import DefersGradient
 from nerfloom.base.protocols import SeesRegistered
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.appearance import Appearance
-from nerfloom.model import HasAppearance
+from nerfloom.renderable import HasAppearance
 from nerfloom.samplers.base import SkipsCells, StopsEarly
 from nerfloom.samplers.occupancy import OccupancySampler
 

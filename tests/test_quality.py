@@ -10,7 +10,7 @@ import torch
 from nerfloom.data.dataset import DataParser
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.procedural import Procedural
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.registry import load_method
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder
@@ -25,7 +25,7 @@ def trained(parser: DataParser, data: Path | None, folder: Path, steps: int) -> 
     )
     run = Run("instant-ngp", config, "", parser, folder)
     create_folder(run)
-    trainer = Trainer(run, load_split(run, "train"), None)
+    trainer = Trainer.of(run, load_split(run, "train"))
     trainer.train()
     return trainer, run
 
@@ -38,7 +38,7 @@ def test_the_embedded_scene_in_colour_and_depth(tmp_path: Path) -> None:
     psnr = evaluate(trainer.model, test_set, max_images=8).results["psnr"]
     errors, opacity_errors = [], []
     for index in range(0, 16, 2):
-        view = trainer.model.render_view(test_set.view(index), evaluation_background(trainer.model))
+        view = trainer.model.render_view(test_set.view(index), trainer.model.background)
         path = parser.parse(None, "test").image_paths[index]
         with np.load(path.with_name(f"{path.stem}_geometry.npz")) as geometry:
             truth = torch.from_numpy(geometry["depth"])

@@ -161,7 +161,7 @@ def test_without_points_what_cameras_look_at_decides_whether_rays_start_late(
 ) -> None:
     trainer = small(tmp_path)
     dataset = seen_by(trainer.train_set, cameras)
-    config = dataclasses.replace(trainer.run.config, rays_shared_by="auto")
+    config = dataclasses.replace(trainer.config, rays_shared_by="auto")
     _, settings, made = decided("nerfacto", config, dataset)
     assert settings.rays_shared_by == (2 if reason is None else 0)
     said = [decision.line() for decision in made if decision.option == "rays start"]
@@ -176,7 +176,7 @@ def test_without_points_scenes_that_move_and_several_start_at_the_near_ends(
     trainer = small(tmp_path)
     still = seen_by(trainer.train_set, around(1.0, *range(0, 360, 30)))
     other = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **changed))
-    config = dataclasses.replace(trainer.run.config, rays_shared_by="auto")
+    config = dataclasses.replace(trainer.config, rays_shared_by="auto")
     _, settings, made = decided("nerfacto", config, other)
     assert settings.rays_shared_by == 0
     assert [decision for decision in made if decision.option == "rays start" and UNKNOWN in decision.line()]
@@ -230,7 +230,7 @@ def test_in_real_captures_rays_start_late_where_the_cameras_go_around_something(
 def test_known_points_decide_whether_rays_start_late(distance: float, least: int, tmp_path: Path) -> None:
     trainer = small(tmp_path)
     dataset = with_points(trainer.train_set, distance)
-    config = dataclasses.replace(trainer.run.config, rays_shared_by="auto")
+    config = dataclasses.replace(trainer.config, rays_shared_by="auto")
     _, settings, made = decided("nerfacto", config, dataset)
     assert settings.rays_shared_by == least
     said = [decision.line() for decision in made if decision.option == "rays start"]

@@ -23,7 +23,6 @@ from nerfloom.kernels.grids.planes import PlanesLayout
 from nerfloom.kernels.table_memory import table
 from nerfloom.registry import load_method, registered
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.training.trained import build_model
 from tests.training.helpers import TINY
 
 SHARED_BY = type(load_method("instant-ngp").config)
@@ -72,7 +71,7 @@ def test_each_number_makes_a_model_or_one_line(method: str) -> None:
     for name, value in numbers(config):
         for scene in KINDS:
             try:
-                build_model(method, dataclasses.replace(config, **{name: value}), scene)
+                load_method(method).build(dataclasses.replace(config, **{name: value}), scene)
                 built.add(name)
             except NerfloomError:  # one line by construction, as tests/test_errors.py shows
                 refused.add(name)
@@ -101,7 +100,7 @@ def test_each_number_makes_a_model_or_one_line(method: str) -> None:
 )
 def test_a_recipe_is_told_what_it_may_say(method: str, settings: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError) as error:
-        build_model(method, from_plain(tiny_config(method), settings, "recipe.yml"), STILL)
+        load_method(method).build(from_plain(tiny_config(method), settings, "recipe.yml"), STILL)
     assert words in str(error.value)
 
 

@@ -224,19 +224,19 @@ def test_every_method_that_casts_rays_learns_from_them(
     kind: str, dataset: Dataset, shared_tiny: Path, tmp_path: Path
 ) -> None:
     run = tiny_run(kind, shared_tiny, tmp_path)
-    trainer = Trainer(run, dataset, None)
+    trainer = Trainer.of(run, dataset)
     said = [decision.line() for decision in trainer.decisions]
     count = dataset.scene.num_sparse_depths
     assert f"  depth loss: 0.001, as the reconstruction's points are seen in {count:,} pixels" in said
     report = trainer.train_step()
     assert report.losses["depth"] > 0
     assert ("depth_coarse" in report.losses) == (kind in ("vanilla-nerf", "dnerf"))
-    off = Trainer(tiny_run(kind, shared_tiny, tmp_path, depth_loss_mult=0.0), dataset, None)
+    off = Trainer.of(tiny_run(kind, shared_tiny, tmp_path, depth_loss_mult=0.0), dataset)
     assert "depth" not in off.train_step().losses
 
 
 def test_points_teach_in_the_first_half_alone(dataset: Dataset, shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = Trainer(tiny_run("nerfacto", shared_tiny, tmp_path, max_num_iterations=6), dataset, None)
+    trainer = Trainer.of(tiny_run("nerfacto", shared_tiny, tmp_path, max_num_iterations=6), dataset)
     reports = [trainer.train_step() for _ in range(6)]
     assert ["depth" in report.losses for report in reports] == [True] * 3 + [False] * 3
 
@@ -252,7 +252,7 @@ def test_points_teach_where_the_surface_is_and_that_space_before_it_is_empty(
         changes = {"max_num_iterations": 80, "max_eval_images": 0, "depth_loss_mult": mult}
         run = tiny_run("nerfacto", shared_tiny, tmp_path, **changes)
         run = dataclasses.replace(run, folder=tmp_path / f"{mult}")
-        trainer = Trainer(run, blind, None)
+        trainer = Trainer.of(run, blind)
         for _ in range(80):
             trainer.train_step()
         known = dataset.sparse_depth
@@ -270,11 +270,11 @@ def test_the_same_seed_gives_the_same_bits(dataset: Dataset, shared_tiny: Path, 
     for name in ("a", "b"):
         run = dataclasses.replace(tiny_run("nerfacto", shared_tiny, tmp_path), folder=tmp_path / name)
         (tmp_path / name).mkdir()
-        trainer = Trainer(run, dataset, None)
+        trainer = Trainer.of(run, dataset)
         for step in range(8):
             if name == "b" and step == 4:
                 content = trainer._content()
-                trainer = Trainer(run, dataset, None)
+                trainer = Trainer.of(run, dataset)
                 trainer.restore(content)
             trainer.train_step()
         states.append(tensors(trainer))

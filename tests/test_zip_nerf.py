@@ -241,7 +241,7 @@ def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path,
     varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (tmp_path / "run").mkdir()
     settings = {"max_eval_images": 0, "max_num_iterations": 70, "exposure_learning_rate": 1e-2}
-    trainer = Trainer(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied, None)
+    trainer = Trainer.of(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied)
     trainer.train()
     grey = affine_of(trainer.model.appearance.vectors.detach())
     assert grey[~dark].mean().item() - grey[dark].mean().item() > 0.1

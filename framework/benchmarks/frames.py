@@ -15,9 +15,8 @@ from torch import Tensor
 from nerfloom.base.console import track
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.kernels import native
-from nerfloom.model import Model
+from nerfloom.renderable import Renderable
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.trained import load_trained
 
@@ -66,7 +65,7 @@ def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count:
     trained = load_trained(run, device_type="cpu")
     model, cameras = trained.model, trained.run.parse("test").cameras
     gaussians = len(model.gaussians()) if isinstance(model, HasGaussians) else None
-    background, name = evaluation_background(model), "/".join(run.resolve().parts[-3:])
+    background, name = model.background, "/".join(run.resolve().parts[-3:])
     rows = []
     for width in widths:
         sized = [_resized(cameras, index % len(cameras), width) for index in range(count)]
@@ -75,7 +74,7 @@ def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count:
                 seconds, kernels = _seconds(model, sized, background)
             rows.append(
                 Frames(
-                    name, trained.run.method, gaussians, width, sized[0].sizes[0][0], number, count,
+                    name, trained.method, gaussians, width, sized[0].sizes[0][0], number, count,
                     count / sum(seconds), median(seconds), max(seconds), kernels,
                 )
             )  # fmt: skip
@@ -87,7 +86,7 @@ def _resized(cameras: Cameras, index: int, width: int) -> Cameras:
     return camera.scaled(width / camera.sizes[0][1])
 
 
-def _seconds(model: Model, cameras: list[Cameras], background: Tensor) -> tuple[list[float], dict[str, float]]:
+def _seconds(model: Renderable, cameras: list[Cameras], background: Tensor) -> tuple[list[float], dict[str, float]]:
     """Return the seconds of each picture, and the mean seconds of a picture in each kernel."""
     moment = 0.5 if model.scene.moving else None
     for camera in cameras[:WARM_UP]:

@@ -208,7 +208,7 @@ def _timed(
         config = replace(load_method(method).config, vis="none", **settings)
         config = replace(config, machine=replace(config.machine, cuda_graphs=mode))  # type: ignore[arg-type]
         run = Run(method, config, "blender", load_dataparser("blender")(), Path(folder))
-        trainer = Trainer(run, SCENES[method](SIZE).to(device), None)
+        trainer = Trainer.of(run, SCENES[method](SIZE).to(device))
         for _ in range(before):
             trainer.train_step()
         wait_for(device)

@@ -43,6 +43,6 @@ def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:
     config, _ = load_method(run.method).decided(config, train_set.scene)
     run = dataclasses.replace(run, config=dataclasses.replace(config, max_seconds=None))
     create_folder(run)
-    trainer = Trainer(run, train_set, None)
+    trainer = Trainer.of(run, train_set)
     trainer.prepare()
     return trainer

@@ -1,8 +1,8 @@
-"""The command `ns-eval`: metrics of a trained run on held-out views."""
+"""The command `ns-eval`: metrics of a trained run, or of a file of Gaussians, on held-out views."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -10,26 +10,20 @@ from nerfloom.base.config import RaysPerPixel
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
-from nerfloom.training.run_path import check_writable, trained_run
+from nerfloom.cli.run_flags import OPENS, RunFlags
+from nerfloom.training.run_path import check_writable
 
 
-@dataclass(frozen=True)
-class EvalFlags:
-    """Compute PSNR, SSIM and LPIPS of a trained run on held-out views."""
+@dataclass(frozen=True, kw_only=True)
+class EvalFlags(RunFlags):
+    """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views."""
 
-    load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
-    flag's name may be left out."""
     output_path: Path | None = None
     """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
     """Maximum number of views with pictures in that folder, evenly spaced, besides worst.png; all if not given."""
-    load_checkpoint: Path | None = None
-    """Checkpoint to load; the newest if not given."""
-    data: Path | None = None
-    """Folder of the data, if it has moved since training; needed with a file of Gaussians."""
     split: Literal["test", "val", "train"] = "test"
     """Split to evaluate."""
     max_images: int | None = None
@@ -45,8 +39,6 @@ class EvalFlags:
     """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
     round_to_uint8: bool = False
     """Round colours to 8 bits before they are measured."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to render on."""
 
 
 def main() -> None:
@@ -56,13 +48,13 @@ def main() -> None:
 
 def _command(arguments: list[str]) -> None:
     words, named = with_format("ns-eval", with_run(arguments))
-    flags = read_flags(EvalFlags, "ns-eval", words, takes="RUN_FOLDER")
+    flags = read_flags(EvalFlags, "ns-eval", words, takes=OPENS)
     if flags.max_images is not None and flags.max_images < 1:
         raise FlagError(f"--max-images is {flags.max_images}; it must be at least 1")
     if flags.max_pictures is not None and flags.max_pictures < 0:
         raise FlagError(f"--max-pictures is {flags.max_pictures}; it must be at least 0")
-    flags = replace(flags, load_config=trained_run(flags.load_config, flags.load_checkpoint, flags.data))
-    output = flags.output_path or _beside(flags.load_config)
+    found = flags.check()
+    output = flags.output_path or _beside(found)
     make_room(output)
     if flags.render_output_path is not None:
         check_writable(flags.render_output_path, "pictures to")
@@ -71,43 +63,35 @@ def _command(arguments: list[str]) -> None:
     from nerfloom.base.console import say
     from nerfloom.evaluation.error_bound import limited_error, measured_error, parse_error
     from nerfloom.evaluation.evaluator import evaluate
-    from nerfloom.training.datasets import load_split
     from nerfloom.training.report import write_evaluation
-    from nerfloom.training.splat_files import load_run_or_splats
 
-    trained = load_run_or_splats(
-        flags.load_config,
-        flags.load_checkpoint,
-        flags.device_type,
-        flags.data,
-        flags.rays_per_pixel,
-        flags.eval_appearance,
-        named,
+    loaded = flags.load(
+        found, rays_per_pixel=flags.rays_per_pixel, eval_appearance=flags.eval_appearance, data_format=named
     )
-    dataset = load_split(trained.run, flags.split).to(trained.model.device)
+    model, dataset = loaded.model, loaded.dataset(flags.split)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
-    with nullcontext() if bound is None else limited_error(trained.model, bound):
+    with nullcontext() if bound is None else limited_error(model, bound):
         evaluation = evaluate(
-            trained.model,
+            model,
             dataset,
             max_images=flags.max_images,
             pictures=flags.render_output_path,
             max_pictures=flags.max_pictures,
             round_to_uint8=flags.round_to_uint8,
-            lpips_weights=flags.lpips_weights,
+            lpips_weights=flags.lpips_weights or loaded.run.config.lpips_weights,
         )
     say(f"{flags.split}: {evaluation.line()}")
     if evaluation.far_below is not None:
         say(f"  {evaluation.far_below}")
     if bound is not None:
-        worst, faster = measured_error(trained.model, dataset, bound)
+        worst, faster = measured_error(model, dataset, bound)
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
     if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
         say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
     say(f"LPIPS: {evaluation.lpips_note}")
     if evaluation.masks_note is not None:
         say(f"masks: {evaluation.masks_note}")
-    write_evaluation(output, trained.run, trained.checkpoint, evaluation, trained.model.device)
+    write_evaluation(output, loaded.run, loaded.checkpoint, evaluation, model.device)
     say(f"written to {output}")
     if (wrong := evaluation.pictures_note or evaluation.warning) is not None:
         raise ConfigError(wrong)

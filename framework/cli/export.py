@@ -1,4 +1,4 @@
-"""The command `ns-export`: points, meshes, cameras and more of a trained run, in the frame and units of its input."""
+"""The command `ns-export`: points, meshes, Gaussians, pages and more, in the frame and units of the input."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.base.extras import install_command
-from nerfloom.cli.common import chosen_kind, make_room, run_command, with_run
+from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
 from nerfloom.cli.export_flags import ExportFlags
 from nerfloom.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
 from nerfloom.cli.flags import read_flags
-from nerfloom.training.run_path import trained_run
+from nerfloom.cli.run_flags import OPENS
 
 if TYPE_CHECKING:
-    from nerfloom.cameras.poses import Placement
     from nerfloom.data.dataset import ParsedScene
-    from nerfloom.training.trained import Trained
+    from nerfloom.training.loaded import Loaded
 
 USAGE = """\
 usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
@@ -33,11 +32,15 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-ns-export WHAT --help shows its flags. Everything is written in the frame and units of the run's input.
+A file of Gaussians (.ply, .spz, .splat) stands for a run: gaussian-splat and web need no data, the others --data DIR.
+
+  ns-export web splat.ply --output-dir exports
+
+ns-export WHAT --help shows its flags. Everything is written in the frame and units of the input.
 """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PointFlags(ExportFlags):
     """Write point_cloud.ply: points at the median depth of random training rays."""
 
@@ -53,7 +56,7 @@ class PointFlags(ExportFlags):
     """Estimate normals from each point's neighbours if the method has none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CameraFlags(ExportFlags):
     """Write cameras as nerfstudio/transforms.json, colmap/sparse/0/*.txt, and transforms_train.json."""
 
@@ -61,7 +64,7 @@ class CameraFlags(ExportFlags):
     """Name images relative to transforms.json instead of by absolute paths."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OccupancyFlags(ExportFlags):
     """Write occupancy.npz, the occupancy grid, and occupancy.ply, its occupied cells."""
 
@@ -69,7 +72,7 @@ class OccupancyFlags(ExportFlags):
     """What occupancy.ply holds: the cells' centres, or the surface of their boxes."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SplatFlags(ExportFlags):
     """Write splat.ply or splat.spz: Gaussians, as the code of 3D Gaussian Splatting and viewers read them."""
 
@@ -79,7 +82,7 @@ class SplatFlags(ExportFlags):
     """Make the file at most this large, in millions of bytes: fewer harmonics first, fewer Gaussians last."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WebFlags(ExportFlags):
     """Write scene.html: a page that shows the scene's Gaussians, or such as are fitted to the pictures of a field."""
 
@@ -100,19 +103,18 @@ def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
     name, (kind, file, run), rest = chosen
-    flags = read_flags(kind, f"ns-export {name}", with_run(rest), takes="RUN_FOLDER")
-    found = trained_run(flags.load_config, flags.load_checkpoint, flags.data)
+    words, named = with_format(f"ns-export {name}", with_run(rest))
+    flags = read_flags(kind, f"ns-export {name}", words, takes=OPENS)
+    found = flags.check()
     path = flags.output_dir / file.format_map(vars(flags))
     make_room(path)
-    from nerfloom.training.trained import load_trained
-
-    trained = load_trained(found, flags.load_checkpoint, flags.device_type, flags.data)
-    if trained.model.scene.warped:
+    loaded = flags.load(found, data_format=named)
+    if loaded.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
-    run(flags, trained, trained.placement, path)
+    run(flags, loaded, path)
 
 
-def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def _points(flags: PointFlags, loaded: Loaded, path: Path) -> None:
     if flags.num_points < 1 or not flags.reach >= 0 or not flags.std_ratio >= 0:
         raise FlagError("--num-points must be at least 1, --reach and --std-ratio at least 0")
     if flags.remove_outliers or flags.estimate_normals:
@@ -122,14 +124,12 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
     from nerfloom.data.ply import write_points
     from nerfloom.export.neighbors import inliers, plane_normals
     from nerfloom.export.points import joined, num_views, picture_points, surface_points
-    from nerfloom.ray_model import RayModel
-    from nerfloom.training.datasets import load_split
+    from nerfloom.renderable import RendersRays
 
-    model = trained.model
-    dataset = load_split(trained.run, "train").to(model.device)
-    seed_step(trained.run.config.machine.seed, 0)
-    if isinstance(model, RayModel):
-        chunks = -(-flags.num_points // model.config.eval_num_rays_per_chunk)
+    model, dataset = loaded.model, loaded.dataset("train")
+    seed_step(loaded.run.config.machine.seed, 0)
+    if isinstance(model, RendersRays):
+        chunks = -(-flags.num_points // model.rays_at_once)
         parts = surface_points(model, dataset, flags.num_points, flags.reach or None)
     else:
         chunks = num_views(dataset)
@@ -144,8 +144,8 @@ def _points(flags: PointFlags, trained: Trained, placement: Placement, path: Pat
     normals = found.normals
     if normals is None and flags.estimate_normals:
         normals = plane_normals(found.positions, -found.directions)
-    positions = placement.original_points(found.positions)
-    normals = None if normals is None else placement.original_directions(normals).float()
+    positions = loaded.placement.original_points(found.positions)
+    normals = None if normals is None else loaded.placement.original_directions(normals).float()
     write_points(path, positions, found.colors, normals)
     say(f"{len(positions):,} points: {path}")
 
@@ -156,26 +156,25 @@ def _need_packages(what: str, otherwise: str = "") -> None:
         raise ConfigError(f"{what} packages that are not installed: {advice}{otherwise}")
 
 
-def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def _cameras(flags: CameraFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.base.console import say
     from nerfloom.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
     from nerfloom.export.colmap_text import images_folder, write_model
     from nerfloom.export.transforms import write_transforms
-    from nerfloom.training.datasets import load_split
     from nerfloom.training.run import write_json
 
     # Load the images too: cameras of unreadable images are not in the model.
-    dataset = load_split(trained.run, "train").to(trained.model.device)
-    refined = refined_cameras(trained.model, dataset.cameras)
-    write_json(path, camera_list(refined, dataset.names, placement))
+    dataset = loaded.dataset("train")
+    refined = refined_cameras(loaded.model, dataset.cameras)
+    write_json(path, camera_list(refined, dataset.names, loaded.placement))
     say(f"{len(refined)} training cameras: {path}")
     scenes: dict[str, ParsedScene] = {}
     for split in SPLITS:
         try:
-            scenes[split] = trained.run.parse(split)
+            scenes[split] = loaded.run.parse(split)
         except DataError as error:
             say(f"no '{split}' cameras: {error}")
-    posed = posed_files(scenes, all_cameras(scenes, dataset.cameras, refined), placement)
+    posed = posed_files(scenes, all_cameras(scenes, dataset.cameras, refined), loaded.placement)
     file = path.parent / "nerfstudio" / "transforms.json"
     write_transforms(file, posed, flags.relative_paths)
     counts = ", ".join(f"{len(members)} {split}" for split, members in posed.splits.items())
@@ -189,29 +188,29 @@ def _cameras(flags: CameraFlags, trained: Trained, placement: Placement, path: P
         say(f"COLMAP model: {model}; its images are in {images_folder(posed)}")
 
 
-def _occupancy(flags: OccupancyFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def _occupancy(flags: OccupancyFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.base.console import say
     from nerfloom.export.occupancy import write_cells, write_grid
-    from nerfloom.model import parts
+    from nerfloom.renderable import parts
     from nerfloom.samplers.base import SkipsCells
 
-    grids = parts(trained.model, SkipsCells)
+    grids = parts(loaded.model, SkipsCells)
     if not grids:
-        raise ConfigError(f"ns-export occupancy: this run of {trained.run.method} has no occupancy grid")
+        raise ConfigError(f"ns-export occupancy: this run of {loaded.method} has no occupancy grid")
     if flags.cells == "boxes":
         _need_packages("--cells boxes needs", "; or take --cells centers")
     grid = grids[0]
     count = int(grid.occupied_when()[: grid.resolution**3].sum())
-    write_grid(path, grid, placement)
+    write_grid(path, grid, loaded.placement)
     say(f"{grid.resolution}^3 cells, {count:,} occupied: {path}")
     if not count:
         raise ConfigError("no cell is occupied, so that there is nothing to write to occupancy.ply")
     cells = path.with_suffix(".ply")
-    write_cells(cells, grid, placement, flags.cells == "boxes")
+    write_cells(cells, grid, loaded.placement, flags.cells == "boxes")
     say(f"{count:,} cells: {cells}")
 
 
-def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
     from nerfloom.base.console import say
@@ -221,19 +220,19 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
     from nerfloom.splats.gaussians import HasGaussians
     from nerfloom.splats.transform import transformed
 
-    if not isinstance(trained.model, HasGaussians):
+    if not isinstance(loaded.model, HasGaussians):
         raise ConfigError(
-            f"ns-export gaussian-splat: {trained.run.method} has no Gaussians; ns-train gaussian-splatting makes them"
+            f"ns-export gaussian-splat: {loaded.method} has no Gaussians; ns-train gaussian-splatting makes them"
         )
-    found = trained.model.gaussians().map(lambda values: values.detach().cpu())
+    found = loaded.model.gaussians().map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
         raise ConfigError("this run has no Gaussians left; train it again")
     # Programs read float32 from these files.
-    origin = local_origin(placement.original_points(good.means), good.typical_size / placement.scale)
-    about, look = placement if origin is None else placement.about(origin), trained.model.look()
+    origin = local_origin(loaded.placement.original_points(good.means), good.typical_size / loaded.placement.scale)
+    about, look = loaded.placement if origin is None else loaded.placement.about(origin), loaded.model.look()
     for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes, look):
         say(cost)
     if sentence := write_offset(path, origin):
@@ -241,10 +240,12 @@ def _splats(flags: SplatFlags, trained: Trained, placement: Placement, path: Pat
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 
 
-def _web(flags: WebFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def _web(flags: WebFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.export.run_page import export_page
+    from nerfloom.registry import load_method
 
-    export_page(trained, path, flags.max_megabytes, flags.fit_seconds, flags.time)
+    splatting = load_method("gaussian-splatting")
+    export_page(loaded, path, flags.max_megabytes, flags.fit_seconds, flags.time, splatting)
 
 
 KINDS: dict[str, tuple[type[Any], str, Any]] = {

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from nerfloom.export.mesh import Mesh
     from nerfloom.export.meshing import Cleaning
     from nerfloom.export.texture import Texturing
-    from nerfloom.training.trained import Trained
+    from nerfloom.training.loaded import Loaded
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MeshFlags(ExportFlags):
     """Flags of every mesh."""
 
@@ -45,7 +45,7 @@ class MeshFlags(ExportFlags):
     """Time after which what is left of the texture gets the colours of the vertices."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MarchingCubesFlags(MeshFlags):
     """Write a mesh of the surface where the density of a field passes a level, with colours and normals."""
 
@@ -55,7 +55,7 @@ class MarchingCubesFlags(MeshFlags):
     """Time of a scene that moves, 0 to 1."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TsdfFlags(MeshFlags):
     """Write a mesh of what the training cameras see: the surface that their depth images agree on; for every method."""
 
@@ -65,29 +65,26 @@ class TsdfFlags(MeshFlags):
     """Maximum number of training views that are rendered, evenly spaced."""
 
 
-def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> None:
     """Write a mesh of a level of the density, in the frame of the input.
 
     Args:
         flags: flags of the command.
-        trained: the run.
-        placement: the input's in the run's scene.
+        loaded: what is exported.
         path: file to write.
 
     Raises:
         ConfigError: if a flag is out of range, the method has no density, or there is no surface.
     """
-    lattice, cleaning, texturing = _prepared(flags, trained, placement)
+    lattice, cleaning, texturing = _prepared(flags, loaded)
     from nerfloom.base.console import say
     from nerfloom.export.density import default_level
     from nerfloom.export.meshing import density_mesh
-    from nerfloom.model import HasDensity
+    from nerfloom.renderable import HasDensity
 
-    model, level = trained.model, flags.isosurface_threshold
+    model, level = loaded.model, flags.isosurface_threshold
     if not isinstance(model, HasDensity):
-        raise ConfigError(
-            f"ns-export marching-cubes: {trained.run.method} has no density; 'ns-export tsdf' makes a mesh"
-        )
+        raise ConfigError(f"ns-export marching-cubes: {loaded.method} has no density; 'ns-export tsdf' makes a mesh")
     if level is not None and not 0 < level < float("inf"):
         raise FlagError(f"--isosurface-threshold is {level:g}; it must be above zero")
     if not 0 <= flags.time <= 1:
@@ -96,36 +93,34 @@ def marching_cubes(flags: MarchingCubesFlags, trained: Trained, placement: Place
     if level is None:
         level = default_level(model.scene.box)
         say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
-    cameras = trained.run.parse("train").cameras
+    cameras = loaded.run.parse("train").cameras
     mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning, texturing)
-    _write(mesh, placement, path, start)
+    _write(mesh, loaded.placement, path, start)
 
 
-def tsdf(flags: TsdfFlags, trained: Trained, placement: Placement, path: Path) -> None:
+def tsdf(flags: TsdfFlags, loaded: Loaded, path: Path) -> None:
     """Write a mesh of fused depth images, in the frame of the input.
 
     Args:
         flags: flags of the command.
-        trained: the run.
-        placement: the input's in the run's scene.
+        loaded: what is exported.
         path: file to write.
 
     Raises:
         ConfigError: if a flag is out of range, or there is no surface.
     """
-    lattice, cleaning, texturing = _prepared(flags, trained, placement)
+    lattice, cleaning, texturing = _prepared(flags, loaded)
     if flags.max_num_views < 1:
         raise FlagError(f"--max-num-views is {flags.max_num_views}; it must be at least 1")
     from nerfloom.export.meshing import fused_mesh
-    from nerfloom.training.datasets import load_split
 
     start = time.monotonic()
-    dataset = load_split(trained.run, "train").to(trained.model.device)
-    mesh = fused_mesh(trained.model, dataset, lattice, flags.truncation, flags.max_num_views, cleaning, texturing)
-    _write(mesh, placement, path, start)
+    dataset = loaded.dataset("train")
+    mesh = fused_mesh(loaded.model, dataset, lattice, flags.truncation, flags.max_num_views, cleaning, texturing)
+    _write(mesh, loaded.placement, path, start)
 
 
-def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple[Lattice, Cleaning, Texturing | None]:
+def _prepared(flags: MeshFlags, loaded: Loaded) -> tuple[Lattice, Cleaning, Texturing | None]:
     """Return the lattice, what is kept and the texture, checked, and check that a mesh's packages are installed."""
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"a mesh needs packages that are not installed: {advice}")
@@ -141,8 +136,8 @@ def _prepared(flags: MeshFlags, trained: Trained, placement: Placement) -> tuple
             raise ConfigError("--texture-size: a PLY file has no texture; take --format obj or --format glb")
         texturing = Texturing(flags.texture_size, flags.texture_seconds)
         texturing.check()
-    box, low, high = trained.model.scene.box, flags.bounding_box_min, flags.bounding_box_max
-    return lattice_of(box, flags.resolution, placement, low, high), cleaning, texturing
+    box, low, high = loaded.model.scene.box, flags.bounding_box_min, flags.bounding_box_max
+    return lattice_of(box, flags.resolution, loaded.placement, low, high), cleaning, texturing
 
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:

@@ -1,4 +1,4 @@
-"""The command `ns-render`: images, animations and videos of a trained run."""
+"""The command `ns-render`: images, animations and videos of a trained run, or of a file of Gaussians."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from nerfloom.cli.render_flags import (
     TimeFlags,
     check_flags,
 )
+from nerfloom.cli.run_flags import OPENS
 from nerfloom.evaluation.video_suffixes import check_suffix
-from nerfloom.training.run_path import trained_run
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from nerfloom.cli.render_paths import Views
     from nerfloom.evaluation.frames import Frames
     from nerfloom.rendering.outputs import Output
+    from nerfloom.training.loaded import Loaded
     from nerfloom.training.splat_files import DataFormat
-    from nerfloom.training.trained import Trained
 
 NUMBERS = ("distance", "scalar")
 """Kinds of outputs that are shown in the colours of a range."""
@@ -53,15 +53,14 @@ def _command(arguments: list[str]) -> None:
         raise FlagError(answer)
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names"}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
-    flags: Any = read_flags(path, f"ns-render {name}", words, "RUN_FOLDER", config=options)
+    flags: Any = read_flags(path, f"ns-render {name}", words, OPENS, config=options)
     _render(name, flags, named)
 
 
 def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     check_flags(flags)
     check_suffix(flags.output_path)
-    run = flags.run
-    found = trained_run(run.load_config, run.load_checkpoint, run.data)
+    found = flags.run.check()
     output = flags.output_path
     is_folder = not output.suffix
     if isinstance(flags, DatasetFlags) and is_folder:
@@ -72,26 +71,22 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     from nerfloom.base.console import say
     from nerfloom.cameras.view import View
     from nerfloom.evaluation.error_bound import limited_error, parse_error
-    from nerfloom.evaluation.evaluator import evaluation_background
     from nerfloom.evaluation.frames import open_frames
     from nerfloom.evaluation.outputs import chosen_outputs, rendered_outputs
-    from nerfloom.training.splat_files import load_run_or_splats
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
-    rays = flags.outputs.rays_per_pixel
-    trained = load_run_or_splats(found, run.load_checkpoint, run.device_type, run.data, rays, data_format=named)
-    model = trained.model
+    loaded = flags.run.load(found, rays_per_pixel=flags.outputs.rays_per_pixel, data_format=named)
+    model = loaded.model
     outputs = chosen_outputs(model, flags.outputs.rendered_output_names)
-    views, background = _views(flags, trained), evaluation_background(trained.model)
-    facts = _facts(name, flags, trained, views)
+    views, background = _views(flags, loaded), model.background
+    facts = _facts(name, flags, loaded, views)
     if is_folder:
         _check_folder(output, facts)
-    unit = 1 / float(trained.content["scale"])
 
     def render(index: int) -> Any:
         view = View.of(views.cameras, index, views.times)
         truth = None if views.truth is None else views.truth(index)
-        return rendered_outputs(model, view, background, outputs, unit, truth)
+        return rendered_outputs(model, view, background, outputs, loaded.unit, truth)
 
     with nullcontext() if bound is None else limited_error(model, bound):
         frames = open_frames(output, len(views.cameras), facts)
@@ -102,18 +97,18 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     frames.remove()
 
 
-def _views(flags: Flags, trained: Trained) -> Views:
+def _views(flags: Flags, loaded: Loaded) -> Views:
     """Return what is rendered, at its final size."""
     import torch
 
     from nerfloom.cli.render_paths import camera_path_views, dataset_views, path_views
 
     if isinstance(flags, CameraPathFlags):
-        views = camera_path_views(flags, trained)
+        views = camera_path_views(flags, loaded)
     elif isinstance(flags, DatasetFlags):
-        views = dataset_views(flags, trained)
+        views = dataset_views(flags, loaded)
     else:
-        views = path_views(flags, trained)
+        views = path_views(flags, loaded)
     sizes = torch.stack([views.cameras.widths, views.cameras.heights])
     if int(sizes.min()) < 1:
         raise ConfigError(f"--downscale-factor {flags.outputs.downscale_factor} leaves no pixel")
@@ -122,7 +117,7 @@ def _views(flags: Flags, trained: Trained) -> Views:
     return views
 
 
-def _facts(name: str, flags: Flags, trained: Trained, views: Views) -> dict[str, Any]:
+def _facts(name: str, flags: Flags, loaded: Loaded, views: Views) -> dict[str, Any]:
     """Return everything that the pictures depend on, as plain data."""
     from nerfloom.base.config import to_plain
     from nerfloom.evaluation.frames import hash_of_file, hash_of_tensors
@@ -131,11 +126,12 @@ def _facts(name: str, flags: Flags, trained: Trained, views: Views) -> dict[str,
     numbers = [getattr(cameras, field.name) for field in dataclasses.fields(cameras)]
     facts = {
         "path": name,
-        "method": trained.run.method,
-        "run": str(trained.run.folder.resolve()),
-        "checkpoint": trained.checkpoint.name,
-        "checkpoint_sha256": hash_of_file(trained.checkpoint),
-        "settings": to_plain(trained.run.config),
+        "method": loaded.method,
+        "run": str(loaded.origin.resolve()),
+        "checkpoint": loaded.checkpoint.name,
+        "checkpoint_sha256": hash_of_file(loaded.checkpoint),
+        "settings": None if loaded.source is None else to_plain(loaded.source.config),
+        "up": flags.run.up,
         "num_frames": len(cameras),
         "camera_model": cameras.model,
         "cameras_sha256": hash_of_tensors(*(one for one in numbers if hasattr(one, "shape")), views.times),

@@ -8,6 +8,7 @@ from typing import Literal
 
 from nerfloom.base.config import RaysPerPixel
 from nerfloom.base.errors import FlagError
+from nerfloom.cli.run_flags import RunFlags
 
 USAGE = """\
 usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
@@ -22,25 +23,14 @@ paths:
 
   ns-render interpolate RUN_FOLDER --output-path walk.mp4
 
-A file of Gaussians stands for a run: ns-render PATH splat.ply --data DIR [flags] [FORMAT [format flags]]
+A file of Gaussians (.ply, .spz, .splat) stands for a run: orbit and camera-path need no data, the others
+--data DIR [FORMAT [format flags]], as in
+
+  ns-render orbit splat.ply --output-path orbit.mp4
+  ns-render interpolate splat.ply --data DIR --output-path walk.mp4
 
 ns-render PATH --help shows its flags.
 """
-
-
-@dataclass(frozen=True)
-class RunFlags:
-    """The trained run."""
-
-    load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
-    flag's name may be left out."""
-    load_checkpoint: Path | None = None
-    """Checkpoint to load; the newest if not given."""
-    data: Path | None = None
-    """Folder of the data, if it has moved since training; needed with a file of Gaussians."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to render on."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +71,7 @@ class PathFlags:
     """Flags of every path."""
 
     run: RunFlags
-    """The trained run."""
+    """The trained run, or the file of Gaussians."""
     outputs: ViewFlags = field(default_factory=ViewFlags)
     """Outputs of a view, and their colours."""
     files: FileFlags = field(default_factory=FileFlags)

@@ -28,9 +28,9 @@ from nerfloom.cli.render_flags import (
 from nerfloom.data.dataset import Dataset, ParsedScene
 from nerfloom.data.image_files import reduce_image
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.evaluation.paths import (
     arc_of,
+    around,
     focus_distance,
     interpolate,
     middle_pose,
@@ -40,8 +40,7 @@ from nerfloom.evaluation.paths import (
     stretches,
 )
 from nerfloom.scene.folds import in_order
-from nerfloom.training.datasets import load_split
-from nerfloom.training.trained import Trained
+from nerfloom.training.loaded import Loaded
 
 
 @dataclass(frozen=True)
@@ -60,56 +59,60 @@ class Views:
     """Function from an index to the true image (H, W, 3) in [0, 1]; None if it is unknown."""
 
 
-def camera_path_views(flags: CameraPathFlags, trained: Trained) -> Views:
+def camera_path_views(flags: CameraPathFlags, loaded: Loaded) -> Views:
     """Return the views of a camera path's file, which needs no data.
 
     Args:
         flags: flags of the path.
-        trained: the trained run.
+        loaded: what is rendered.
 
     Raises:
         DataError: if the file cannot be read.
         ConfigError: if the run is in normalised device coordinates.
     """
-    if trained.model.scene.warped:
+    if loaded.model.scene.warped:
         raise ConfigError("ns-render camera-path: this run sees only what its cameras saw (--ndc); take spiral")
     path = read_camera_path(flags.camera_path_filename)
     if flags.dataparser_transforms is not None:
         path = replace(path, placement=read_transforms(flags.dataparser_transforms))
-    path = path.placed(trained.placement)
+    path = path.placed(loaded.placement)
     if path.has_crop:
         say(f"{flags.camera_path_filename}: its crop box is not applied")
     times = None
-    if trained.model.scene.moving:
+    if loaded.model.scene.moving:
         times = torch.linspace(0, 1, len(path)) if path.times is None else path.times
-    cameras = path.cameras().scaled(1 / flags.outputs.downscale_factor).to(trained.model.device)
+    cameras = path.cameras().scaled(1 / flags.outputs.downscale_factor).to(loaded.model.device)
     return Views(cameras, times, path.fps if flags.fps is None else flags.fps)
 
 
-def path_views(flags: InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags, trained: Trained) -> Views:
+def path_views(flags: InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags, loaded: Loaded) -> Views:
     """Return the views of a path that is made of the cameras of the data.
 
     Args:
         flags: flags of the path.
-        trained: the trained run.
+        loaded: what is rendered.
 
     Raises:
         DataError: if the data cannot be read.
         ConfigError: if a flag does not fit the run.
     """
-    parsed = trained.run.parse(flags.split if isinstance(flags, TimeFlags) else "train")
-    moving, count = trained.model.scene.moving, flags.num_frames
+    scene, count = loaded.model.scene, flags.num_frames
+    if loaded.source is None and isinstance(flags, OrbitFlags):
+        cameras = orbit(around(scene), scene.box.mean(0).cpu(), count).scaled(1 / flags.outputs.downscale_factor)
+        return Views(cameras.to(loaded.model.device), None, flags.fps)
+    parsed = loaded.run.parse(flags.split if isinstance(flags, TimeFlags) else "train")
+    moving = scene.moving
     times = torch.linspace(0, 1, count) if moving else None
     if isinstance(flags, TimeFlags):
         cameras = _one_camera(flags, parsed, moving)
     elif isinstance(flags, OrbitFlags):
-        cameras, times = _circle(flags, trained, parsed)
+        cameras, times = _circle(flags, loaded, parsed)
     elif isinstance(flags, SpiralFlags):
-        cameras = _spiral(flags, trained, parsed)
+        cameras = _spiral(flags, loaded, parsed)
     else:
         cameras = walk_past(parsed, count)
     cameras = cameras.scaled(1 / (flags.outputs.downscale_factor * parsed.downscale_factor))
-    return Views(cameras.to(trained.model.device), times, flags.fps)
+    return Views(cameras.to(loaded.model.device), times, flags.fps)
 
 
 def _one_camera(flags: TimeFlags, parsed: ParsedScene, moving: bool) -> Cameras:
@@ -121,8 +124,8 @@ def _one_camera(flags: TimeFlags, parsed: ParsedScene, moving: bool) -> Cameras:
     return parsed.cameras[torch.full((flags.num_frames,), flags.camera_index)]
 
 
-def _circle(flags: OrbitFlags, trained: Trained, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
-    scene = trained.model.scene
+def _circle(flags: OrbitFlags, loaded: Loaded, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
+    scene = loaded.model.scene
     if scene.warped:
         raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
     # The middle of the box is an object's; a capture's is what it looks at.
@@ -161,25 +164,25 @@ def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
     return interpolate(cameras, num_frames)
 
 
-def _spiral(flags: SpiralFlags, trained: Trained, parsed: ParsedScene) -> Cameras:
-    model = trained.model
+def _spiral(flags: SpiralFlags, loaded: Loaded, parsed: ParsedScene) -> Cameras:
+    model = loaded.model
     middle = replace_poses(parsed.cameras, middle_pose(parsed.cameras)[None]).scaled(1 / parsed.downscale_factor)
-    focus = focus_distance(model, middle.to(model.device), evaluation_background(model))
+    focus = focus_distance(model, middle.to(model.device), model.background)
     return spiral(parsed.cameras, flags.num_frames, focus, flags.radius)
 
 
-def dataset_views(flags: DatasetFlags, trained: Trained) -> Views:
+def dataset_views(flags: DatasetFlags, loaded: Loaded) -> Views:
     """Return the views of a split, with their true images.
 
     Args:
         flags: flags of the path.
-        trained: the trained run.
+        loaded: what is rendered.
 
     Raises:
         DataError: if the data cannot be read.
     """
-    dataset = load_split(trained.run, flags.split).to(trained.model.device)
-    background, factor = evaluation_background(trained.model), flags.outputs.downscale_factor
+    dataset = loaded.dataset(flags.split)
+    background, factor = loaded.model.background, flags.outputs.downscale_factor
 
     def truth(index: int) -> Tensor:
         return composite(_reduced(dataset, index, factor).float() / 255, background)

@@ -29,7 +29,7 @@ from nerfloom.training.datasets import first_split, load_split
 from nerfloom.training.lock import sole_user
 from nerfloom.training.machine import kernels
 from nerfloom.training.outcome import Outcome
-from nerfloom.training.report import write_evaluation, write_summary
+from nerfloom.training.report import SUMMARY, write_evaluation, write_summary
 from nerfloom.training.run import Run, create_folder, write_report, write_transforms
 from nerfloom.training.signals import Stopped, handled, signal_of
 from nerfloom.training.skipping import as_plain, lines, skip_report
@@ -50,7 +50,7 @@ def start(run: Run) -> None:
     with joined_processes() as several:
         run = replace(run, folder=Path(from_first(str(run.folder))))  # it is named by the time
         trainer = _prepare(run)
-        run = trainer.run  # with open settings filled in
+        run = replace(run, config=trainer.config)  # with open settings filled in
         if not several.first:
             _follow(trainer)
             return
@@ -97,7 +97,7 @@ def _prepare(run: Run) -> Trainer:
             say("note: on the cores of one CPU, several processes learn more slowly than one (docs/benchmarks.md)")
     if images is not None:
         say(images)
-    trainer = Trainer(run, train_set, eval_set)
+    trainer = Trainer.of(run, train_set, eval_set)
     trainer.held_out.load_all = lambda: _held_out(run, device)
     for line in trainer.profile.lines():
         say(line)
@@ -131,7 +131,7 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
         if processes().first:
             with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it when a process has ended
                 trainer.save()
-        where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.run.folder}"
+        where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.folder}"
         raise LostProcessError(f"{where}: {error}; continue with: {command}") from error
 
 
@@ -141,7 +141,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     profile = run.folder / "scene_profile.json"
     if trainer.first_step == 0 or not profile.exists():  # a resumed run has no open settings left, and keeps its own
         write_report(profile, trainer.profile.as_plain())
-    with _noted_stop(lambda: _saved_note(trainer)), _viewer(trainer) as between_steps:
+    with _noted_stop(lambda: _saved_note(run)), _viewer(run, trainer) as between_steps:
         outcome = _train(trainer, between_steps)
     state = trainer.state
     say(
@@ -156,7 +156,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
     if isinstance(trainer.model, HasGaussians):
         say(_count(trainer.model))
     write_report(run.folder / "skip_report.json", as_plain(rungs))
-    write_summary(trainer, outcome)
+    write_summary(run.folder / SUMMARY, trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.stopped_by is not None:
         raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
@@ -185,6 +185,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         seconds=evaluation_seconds(run.config, trainer.state),
         pictures=run.folder / "pictures",
         max_pictures=PICTURES,
+        lpips_weights=run.config.lpips_weights,
     )
     say(f"test: {evaluation.line()}")  # before files are written, which may fail on a full disk
     if evaluation.far_below is not None:
@@ -198,13 +199,13 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
 
 
-def _viewer(trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:
+def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:
     """Open the viewer of a run in training, if it is asked for."""
     if "viewer" not in trainer.config.vis:
         return nullcontext()
     from nerfloom.viewer.training_viewer import training_viewer
 
-    return training_viewer(trainer)
+    return training_viewer(run, trainer)
 
 
 @contextmanager
@@ -216,9 +217,9 @@ def _noted_stop(note: Callable[[], str]) -> Iterator[None]:
         raise Stopped(signal_of(stop), note()) from None
 
 
-def _saved_note(trainer: Trainer) -> str:
+def _saved_note(run: Run) -> str:
     """Return a line that says which checkpoint an interrupted run has saved."""
-    saved = list_checkpoints(trainer.checkpoint_folder)
+    saved = list_checkpoints(run.folder / FOLDER)
     if not saved:
         return "stopped at once: nothing was saved"
-    return f"stopped at once: {saved[-1].name} is what was saved; continue with: ns-train --resume {trainer.run.folder}"
+    return f"stopped at once: {saved[-1].name} is what was saved; continue with: ns-train --resume {run.folder}"

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,8 +18,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.fields.appearance import Appearance
 from nerfloom.losses.functions import mean_squared_error
-from nerfloom.model import HasAppearance, Model, evaluating
-from nerfloom.ray_model import RayModel
+from nerfloom.renderable import HasAppearance, Renderable, RendersRays
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Steps of Adam, pixels per step, and learning rate, with which an appearance vector is fitted."""
@@ -28,7 +26,7 @@ CANDIDATES = 32
 """Maximum number of training images' vectors among which the first vector is looked for."""
 
 
-def appearance_of(model: Model[Any]) -> Appearance | None:
+def appearance_of(model: Renderable) -> Appearance | None:
     """Return the appearance vectors of the training images; None if the model has none.
 
     Args:
@@ -47,7 +45,7 @@ def right_half(image: Tensor) -> Tensor:
 
 
 @contextmanager
-def fitted_appearance(model: Model[Any], dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
+def fitted_appearance(model: Renderable, dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
     """Render with the appearance fitted to the left half of an image, within a `with` block.
 
     Args:
@@ -61,7 +59,7 @@ def fitted_appearance(model: Model[Any], dataset: Dataset, index: int, backgroun
 
 
 @contextmanager
-def shown_appearance(model: Model[Any], vector: Tensor | None) -> Iterator[None]:
+def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]:
     """Render views that are no training images with an appearance vector, within a `with` block.
 
     Args:
@@ -74,7 +72,7 @@ def shown_appearance(model: Model[Any], vector: Tensor | None) -> Iterator[None]
 
 
 def fit_appearance(
-    model: Model[Any], dataset: Dataset, pixels: Tensor, background: Tensor, start: Tensor | None = None
+    model: Renderable, dataset: Dataset, pixels: Tensor, background: Tensor, start: Tensor | None = None
 ) -> Tensor | None:
     """Fit the appearance vector with which the model's colours come closest to given pixels.
 
@@ -97,7 +95,7 @@ def fit_appearance(
     vector = start.detach().clone().requires_grad_()
     if len(pixels):
         with appearance.shown(vector):
-            if isinstance(model, RayModel):
+            if isinstance(model, RendersRays):
                 _fit(model, dataset, pixels, vector, background)
             else:
                 _fit_view(model, dataset, pixels, vector, background)
@@ -105,20 +103,20 @@ def fit_appearance(
 
 
 @torch.no_grad()
-def _closest(model: Model[Any], appearance: Appearance, dataset: Dataset, pixels: Tensor, background: Tensor) -> Tensor:
+def _closest(model: Renderable, appearance: Appearance, dataset: Dataset, pixels: Tensor, background: Tensor) -> Tensor:
     """Return the vector (D,) with which some of the pixels are shown best: the mean, or one of the training images'.
 
     What the mean shows is learnt besides (`Appearance`), so that vectors near it say little of the light of others, and
     a descent from there may end where it is no better.
     """
     mean = appearance.vectors.mean(0)
-    if not len(pixels) or not isinstance(model, RayModel):
+    if not len(pixels) or not isinstance(model, RendersRays):
         return mean
     candidates = torch.cat([mean[None], _some(appearance.vectors, CANDIDATES)])
     some = _some(pixels, PIXELS)
     batch = gather_batch(dataset, some, background.repeat(len(some), 1))
     rays, errors = replace(batch.rays, camera_indices=None), []
-    with evaluating(model), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
+    with model.rendering(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for vector in candidates:
             with appearance.shown(vector):
                 errors.append(mean_squared_error(model.render(rays, batch.background).rgb, batch.rgb))
@@ -137,10 +135,10 @@ def _left_pixels(dataset: Dataset, index: int) -> Tensor:
     return pixels.reshape(-1) if kept is None else pixels[kept[:, : width // 2]]
 
 
-def _fit(model: RayModel[Any], dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
+def _fit(model: RendersRays, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
     optimizer = torch.optim.Adam([vector], lr=RATE)
     generator = torch.Generator().manual_seed(0)
-    with evaluating(model), torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
+    with model.rendering(), torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for _ in range(STEPS):
             chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=generator).to(pixels.device)]
             batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
@@ -149,14 +147,14 @@ def _fit(model: RayModel[Any], dataset: Dataset, pixels: Tensor, vector: Tensor,
             optimizer.step()
 
 
-def _fit_view(model: Model[Any], dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
+def _fit_view(model: Renderable, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
     """Fit the vector of a model that draws whole images, by pixels of one image."""
     optimizer = torch.optim.Adam([vector], lr=RATE)
     index = int(torch.searchsorted(dataset.cameras.offsets.to(pixels), pixels[0], right=True)) - 1
     pixels_there = pixels - dataset.cameras.offsets[index].to(pixels)
     view = dataset.view(index)
     true = gather_batch(dataset, pixels, background.repeat(len(pixels), 1)).rgb
-    with evaluating(model), torch.enable_grad():
+    with model.rendering(), torch.enable_grad():
         for _ in range(STEPS):
             shown = model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there]
             (vector.grad,) = torch.autograd.grad(mean_squared_error(shown, true), [vector])

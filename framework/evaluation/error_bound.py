@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from nerfloom.base.console import track
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import evaluation_background, spread, timed_view
-from nerfloom.model import Model, parts
+from nerfloom.evaluation.evaluator import spread, timed_view
+from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import StopsEarly
 
 MEASURED_VIEWS = 4
@@ -34,7 +33,7 @@ def parse_error(text: str) -> float:
 
 
 @contextmanager
-def limited_error(model: Model[Any], bound: float) -> Iterator[None]:
+def limited_error(model: Renderable, bound: float) -> Iterator[None]:
     """End rays at a given transmittance, within a `with` block; the rest of a ray changes a colour by at most as much.
 
     Args:
@@ -57,7 +56,7 @@ def limited_error(model: Model[Any], bound: float) -> Iterator[None]:
             sampler.early_stop = stop
 
 
-def measured_error(model: Model[Any], dataset: Dataset, bound: float) -> tuple[float, float]:
+def measured_error(model: Renderable, dataset: Dataset, bound: float) -> tuple[float, float]:
     """Measure the error and the speed-up of rendering with an error bound, on a few views.
 
     Args:
@@ -68,7 +67,7 @@ def measured_error(model: Model[Any], dataset: Dataset, bound: float) -> tuple[f
     Returns:
         The maximum difference of a colour channel to rendering without early stop, and the ratio of the two times.
     """
-    background, worst, times = evaluation_background(model), 0.0, [0.0, 0.0]
+    background, worst, times = model.background, 0.0, [0.0, 0.0]
     chosen = spread(len(dataset), MEASURED_VIEWS)
     for index in track(chosen, "Measuring the error", total=len(chosen)):
         views = []

@@ -15,7 +15,6 @@ from typing import Any, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import AppearanceConfig
 from nerfloom.base.console import say, track
 from nerfloom.base.device import runs_ahead, wait_for
 from nerfloom.base.errors import DataError
@@ -29,7 +28,7 @@ from nerfloom.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick
 from nerfloom.evaluation.statistics import statistics
 from nerfloom.evaluation.view_files import Judged, ViewFiles
 from nerfloom.kernels.images.ssim import WINDOW
-from nerfloom.model import Model, RendersFromImages
+from nerfloom.renderable import Renderable, RendersFromImages
 from nerfloom.rendering.rendered import Picture
 
 T = TypeVar("T")
@@ -43,16 +42,6 @@ MASKED = (
     "kept pixels, for which ignored pixels are copied from the true image"
 )
 """What is measured of images with ignored pixels."""
-
-
-def evaluation_background(model: Model) -> Tensor:
-    """Return the background colour (3,) of an evaluation of `model`.
-
-    It is that of training; if that is random or automatic, white, or black if no image has alpha.
-    """
-    asked = model.config.background
-    black = asked == "black" or (asked != "white" and not model.scene.has_alpha)
-    return torch.full((3,), 0.0 if black else 1.0, device=model.device)
 
 
 @dataclass(frozen=True)
@@ -76,7 +65,7 @@ def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
     return Measured(psnr(*judged), quick_ssim(rgb, target, kept) if min(rgb.shape[:2]) >= WINDOW else None)
 
 
-def measure_view(model: Model, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
+def measure_view(model: Renderable, dataset: Dataset, index: int, background: Tensor, stride: int = 1) -> Measured:
     """Render a view and compute its metrics.
 
     Args:
@@ -105,7 +94,7 @@ def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
     return [index for index in judged if _has_kept_pixels(dataset, index, half)]
 
 
-def timed_view(model: Model, view: View, background: Tensor) -> tuple[Picture, float]:
+def timed_view(model: Renderable, view: View, background: Tensor) -> tuple[Picture, float]:
     """Render a view; return the rendered image and the seconds that it took.
 
     Args:
@@ -219,7 +208,7 @@ class Evaluation:
 
 
 def evaluate(
-    model: Model,
+    model: Renderable,
     dataset: Dataset,
     *,
     max_images: int | None = None,
@@ -235,8 +224,8 @@ def evaluate(
     Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
     not count: PSNR omits them, SSIM omits the windows that have any, at one scale and at five (`ms_ssim`), and LPIPS is
     the mean of its map over the others, for which masked-out pixels are copied from the true image. Images without
-    other pixels are skipped. If appearance is fitted to left halves (`eval_appearance`), right halves count. An image
-    has no SSIM if no window counts.
+    other pixels are skipped. If appearance is fitted to left halves (`Appearance.held_out`), right halves count. An
+    image has no SSIM if no window counts.
 
     Args:
         model: the trained model.
@@ -248,23 +237,23 @@ def evaluate(
             them, files of the view with the lowest PSNR are written besides, as worst.png and so on. Views with files
             are evaluated before the others.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
-        lpips_weights: file of LPIPS's weights; that of the model's settings if None.
+        lpips_weights: file of LPIPS's weights; those of the package lpips if None.
         title: text of the progress bar.
 
     Raises:
         ConfigError: if the file of weights cannot be used.
         DataError: if there is no image to evaluate.
     """
-    has_appearance = appearance_of(model) is not None
-    half = has_appearance and isinstance(model.config, AppearanceConfig) and model.config.eval_appearance == "half"
+    appearance = appearance_of(model)
+    half = appearance is not None and appearance.held_out == "half"
     views = views_to_judge(dataset, half)
     asked = [views[rank] for rank in spread(len(views), max_images)]
     if not asked:
         raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
     if isinstance(model, RendersFromImages) and dataset.source_images is not None:
         model.show_images(dataset)
-    lpips, lpips_note = load_lpips(lpips_weights or model.config.lpips_weights, model.device)
-    background = evaluation_background(model)
+    lpips, lpips_note = load_lpips(lpips_weights, model.device)
+    background = model.background
     judge = partial(_judge, model, dataset, background, half, round_to_uint8, lpips)
     if seconds is not None and runs_ahead(model.device):
         judge(asked[0])  # compiles what rendering needs, which the other views do not wait for
@@ -278,7 +267,7 @@ def evaluate(
     spent = sum(row["seconds"] for row in rows)
     speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None: no rays are cast
     counts = {"num_images": len(rows), "num_images_in_split": len(views)}
-    protocol: Literal["mean", "half"] | None = ("half" if half else "mean") if has_appearance else None
+    protocol = None if appearance is None else appearance.held_out
     results = {**statistics(rows), **speed, **counts}
     return Evaluation(rows, results, lpips_note, protocol, files.note)
 
@@ -310,7 +299,7 @@ def _in_time(views: list[int], cost: float, seconds: float | None) -> list[int]:
 
 
 def _judge(
-    model: Model,
+    model: Renderable,
     dataset: Dataset,
     background: Tensor,
     half: bool,

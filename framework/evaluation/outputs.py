@@ -13,7 +13,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
 from nerfloom.evaluation.panels import depth_range, viridis
-from nerfloom.model import Model
+from nerfloom.renderable import Renderable
 from nerfloom.rendering.outputs import ACCUMULATION, FIXED, RGB, Output
 from nerfloom.rendering.rendered import Picture
 
@@ -26,7 +26,7 @@ Arrays = Mapping[str, np.ndarray]
 """What is kept of a frame, by name: uint8 (H, W) or (H, W, 3), shown as it is, or numbers (H, W) float32."""
 
 
-def chosen_outputs(model: Model[Any], names: Sequence[str]) -> list[Output]:
+def chosen_outputs(model: Renderable, names: Sequence[str]) -> list[Output]:
     """Return the outputs of these names.
 
     Args:
@@ -47,7 +47,7 @@ def chosen_outputs(model: Model[Any], names: Sequence[str]) -> list[Output]:
 
 
 def rendered_outputs(
-    model: Model[Any],
+    model: Renderable,
     view: View,
     background: Tensor,
     outputs: Sequence[Output],

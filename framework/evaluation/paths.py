@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,12 +11,15 @@ from torch import Tensor
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.cameras.view import View
+from nerfloom.data.scene import Scene
 from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.model import Model
+from nerfloom.renderable import Renderable
 
 JUMP = 5.0
 """Ratio of the step between two neighbours to the median step from which a walk is said to jump."""
+AROUND, ABOVE, OPENING = 1.0, math.radians(20), math.radians(50)
+"""Of cameras around a scene: distance from its middle in edges of its box, elevation and field of view, radians."""
 FEWEST = 3
 """Minimum number of cameras between two jumps; fewer are left out of an interpolated path."""
 GAP = 60.0
@@ -100,6 +102,24 @@ def orbit(cameras: Cameras, center: Tensor, num_frames: int, arc: Arc | None = N
     up = torch.tensor([0.0, 0.0, 1.0])
     poses = torch.stack([look_at(center + offset, center, up) for offset in circle])
     return replace_poses(cameras, poses)
+
+
+def around(scene: Scene, count: int = 8) -> Cameras:
+    """Return pinhole cameras on a circle around the box of a scene that comes without any, looking down a little.
+
+    Args:
+        scene: the scene, +z up.
+        count: number of cameras.
+    """
+    middle, reach = scene.box.mean(0).cpu(), AROUND * float((scene.box[1] - scene.box[0]).max())
+    angles, side = torch.arange(count) * (2 * torch.pi / count), scene.image_size
+    height = torch.full((count,), math.sin(ABOVE))
+    places = torch.stack([math.cos(ABOVE) * angles.cos(), math.cos(ABOVE) * angles.sin(), height], dim=-1)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    poses = torch.stack([look_at(middle + reach * place, middle, up) for place in places])
+    focal, half = torch.full((count,), 0.5 * side / math.tan(OPENING / 2)), torch.full((count,), 0.5 * side)
+    sides = torch.full((count,), side)
+    return Cameras(poses, focal, focal, half, half, sides, sides)
 
 
 def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
@@ -186,7 +206,7 @@ def look_same_way(cameras: Cameras) -> bool:
     return float(cameras.camera_to_worlds[:, :, 2].mean(0).norm()) > SAME_WAY
 
 
-def focus_distance(model: Model[Any], camera: Cameras, background: Tensor) -> float:
+def focus_distance(model: Renderable, camera: Cameras, background: Tensor) -> float:
     """Return the median distance of what one camera shows, scene units, as the model renders it.
 
     Args:
@@ -204,7 +224,7 @@ def focus_distance(model: Model[Any], camera: Cameras, background: Tensor) -> fl
     return depth
 
 
-def _first_time(model: Model[Any]) -> Tensor | None:
+def _first_time(model: Renderable) -> Tensor | None:
     return torch.zeros(1) if model.scene.moving else None
 
 

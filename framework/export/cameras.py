@@ -16,7 +16,7 @@ from nerfloom.cameras.cameras import LENSES, Cameras, join_cameras
 from nerfloom.cameras.carried import carried_poses
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import ParsedScene
-from nerfloom.model import Model, RefinesPoses
+from nerfloom.renderable import RefinesPoses, Renderable
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """Splits in the order in which their images are listed."""
@@ -24,7 +24,7 @@ ORTHONORMAL_STEPS = 2
 """Newton steps that make a rotation orthonormal in float64; from float32, one is enough."""
 
 
-def refined_cameras(model: Model[Any], cameras: Cameras) -> Cameras:
+def refined_cameras(model: Renderable, cameras: Cameras) -> Cameras:
     """Return a run's training cameras, refined where the model has refined them.
 
     Args:

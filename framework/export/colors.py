@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from nerfloom.evaluation.evaluator import evaluation_background
-from nerfloom.export.density import evaluating
 from nerfloom.geometry.rays import Rays
-from nerfloom.ray_model import RayModel
+from nerfloom.renderable import RendersRays
 
 REACH = 3.0
 """Length of a ray before the surface and behind it, in cells."""
@@ -23,7 +19,7 @@ CHUNK = 2**15
 
 
 @torch.no_grad()
-def seen_colors(model: RayModel[Any], vertices: Tensor, normals: Tensor, spacing: float, time: float) -> Tensor:
+def seen_colors(model: RendersRays, vertices: Tensor, normals: Tensor, spacing: float, time: float) -> Tensor:
     """Return the colours (V, 3) of vertices, each by a short ray against its normal; NaN where it meets nothing.
 
     A ray crosses as much of the surface as rays from cameras do, so that its colour is a mean of the field's colours
@@ -36,7 +32,7 @@ def seen_colors(model: RayModel[Any], vertices: Tensor, normals: Tensor, spacing
         spacing: edge of a cell, scene units.
         time: time in [0, 1] of a scene that moves.
     """
-    background, reach, device = evaluation_background(model), REACH * spacing, model.device
+    background, reach, device = model.background, REACH * spacing, model.device
     found = []
     for places, outwards in zip(vertices.float().split(CHUNK), normals.float().split(CHUNK), strict=True):
         count = len(places)
@@ -50,7 +46,7 @@ def seen_colors(model: RayModel[Any], vertices: Tensor, normals: Tensor, spacing
             pixel_radii=torch.full((count,), 0.25, device=device),
             times=torch.full((count,), time, device=device) if model.scene.moving else None,
         )
-        with evaluating(model):
+        with model.rendering():
             rendered = model.render(rays, background)
         opacity = rendered.accumulation.float()[:, None]
         color = (rendered.rgb.float() - (1 - opacity) * background) / opacity.clamp(min=OPAQUE)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,8 +14,7 @@ from nerfloom.export.lattice import Lattice
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.march.occupancy import Occupancy
-from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.model import HasDensity, Model, parts
+from nerfloom.renderable import HasDensity, Renderable, parts
 from nerfloom.samplers.base import SkipsCells
 
 BLOCK = 32
@@ -72,7 +69,7 @@ class LatticeDensity:
         ConfigError: if the model has no density.
     """
 
-    def __init__(self, model: Model[Any], lattice: Lattice, level: float, time: float = 0.0) -> None:
+    def __init__(self, model: Renderable, lattice: Lattice, level: float, time: float = 0.0) -> None:
         if not isinstance(model, HasDensity):
             raise ConfigError("this method has no density whose surface could be found; 'ns-export tsdf' makes a mesh")
         self._model, self._density = model, model.density
@@ -121,7 +118,7 @@ class LatticeDensity:
 
     @torch.no_grad()
     def _evaluated(self, positions: Tensor) -> Tensor:
-        with evaluating(self._model):
+        with self._model.rendering():
             found = torch.cat([self._chunk(chunk) for chunk in positions.split(CHUNK)])
         self.seen.add(found)
         return found
@@ -171,16 +168,6 @@ class LatticeDensity:
             sigma = self.density(self.lattice.positions(points[kept]).float())
             if not bool((sigma < COARSE_SHARE * self.level).all()):
                 yield block
-
-
-@contextmanager
-def evaluating(model: Model[Any]) -> Iterator[None]:
-    """Within the `with` block, the networks of `model` run in the precision and on the threads of its rendering."""
-    with (
-        torch_on_one_thread(model.runs_on_kernels),
-        torch.autocast(model.device.type, torch.bfloat16, enabled=model.uses_bfloat16),
-    ):
-        yield
 
 
 def default_level(box: Tensor) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,15 +13,13 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.export import density, tsdf
 from nerfloom.export.colors import seen_colors, spread_colors
 from nerfloom.export.isosurface import isosurface
 from nerfloom.export.lattice import Lattice
 from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
 from nerfloom.export.texture import Texturing, painted
-from nerfloom.model import Model
-from nerfloom.ray_model import RayModel
+from nerfloom.renderable import Renderable, RendersRays
 
 ColorFunction = Callable[[Tensor, Tensor], Tensor]
 """Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""
@@ -50,7 +47,7 @@ class Cleaning:
 
 
 def density_mesh(
-    model: Model[Any],
+    model: Renderable,
     lattice: Lattice,
     level: float,
     time: float,
@@ -82,7 +79,7 @@ def density_mesh(
         raise ConfigError(_without_surface(seen, level))
 
     def colors(vertices: Tensor, normals: Tensor) -> Tensor:
-        if not isinstance(model, RayModel):
+        if not isinstance(model, RendersRays):
             return torch.full((len(vertices), 3), torch.nan)
         return seen_colors(model, vertices, normals, lattice.spacing, time)
 
@@ -90,7 +87,7 @@ def density_mesh(
 
 
 def fused_mesh(
-    model: Model[Any],
+    model: Renderable,
     dataset: Dataset,
     lattice: Lattice,
     truncation: float,
@@ -116,7 +113,7 @@ def fused_mesh(
     chosen = chosen.to(dataset.device)
     cameras, times = dataset.cameras[chosen], None if dataset.times is None else dataset.times[chosen]
     stride = tsdf.stride_for(cameras, lattice)
-    rendered = tsdf.rendered_views(model, cameras, times, evaluation_background(model), stride)
+    rendered = tsdf.rendered_views(model, cameras, times, model.background, stride)
     depths = list(track(rendered, "Rendering depth", total=len(cameras)))
     fused = tsdf.FusedDistance(lattice, depths, truncation)
     blocks = fused.blocks()

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_pixels
-from nerfloom.evaluation.evaluator import evaluation_background
-from nerfloom.model import Model
-from nerfloom.ray_model import RayModel
+from nerfloom.renderable import Renderable, RendersRays
 from nerfloom.rendering.outputs import NORMALS
 
 OPAQUE = 0.5
@@ -44,7 +41,7 @@ class SurfacePoints:
 
 
 @torch.no_grad()
-def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
+def surface_points(model: RendersRays, dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
     """Return surface points at the median depth of random training pixels, chunk by chunk.
 
     There are fewer than `count` points if some rays do not end on a surface.
@@ -56,12 +53,12 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
         reach: maximum distance of a point from the box's centre along each axis, in half edges of the box; None keeps
             all points.
     """
-    background, scene = evaluation_background(model), model.scene
-    chunk = model.config.eval_num_rays_per_chunk
+    background, scene = model.background, model.scene
+    chunk = model.rays_at_once
     for start in range(0, count, chunk):
         pixels = draw_pixels(dataset, min(chunk, count - start)).to(model.device)
         rays = dataset.cameras.pixel_rays(pixels, scene.near, scene.far, dataset.times)
-        with torch.autocast(model.device.type, torch.bfloat16, enabled=model.uses_bfloat16):
+        with model.rendering():
             out = model.render(rays, background)
         depth = out.median_depth.float()
         positions = rays.origins + depth[:, None] * rays.directions
@@ -78,7 +75,7 @@ def surface_points(model: RayModel[Any], dataset: Dataset, count: int, reach: fl
 
 
 @torch.no_grad()
-def picture_points(model: Model[Any], dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
+def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
     """Return surface points at the median depth of random pixels of rendered training views, view by view.
 
     It is for methods that cast no rays; views are evenly spaced in the data set, at most `MOST_VIEWS`.
@@ -89,7 +86,7 @@ def picture_points(model: Model[Any], dataset: Dataset, count: int, reach: float
         count: number of pixels.
         reach: as in `surface_points`.
     """
-    background, far = evaluation_background(model), model.scene.far
+    background, far = model.background, model.scene.far
     views = torch.linspace(0, len(dataset) - 1, num_views(dataset), dtype=torch.float64).round().long().tolist()
     for number, index in enumerate(views):
         view = dataset.view(index)
@@ -119,7 +116,7 @@ def num_views(dataset: Dataset) -> int:
     return min(len(dataset), MOST_VIEWS)
 
 
-def _within(model: Model[Any], positions: Tensor, reach: float | None) -> Tensor:
+def _within(model: Renderable, positions: Tensor, reach: float | None) -> Tensor:
     """Return which positions (N, 3) are finite and within `reach`, (N,) bool."""
     selected = positions.isfinite().all(-1)
     if reach is not None:

@@ -1,4 +1,4 @@
-"""The web page of a trained run: its Gaussians or those fitted to it, the page, and how close that comes to the run."""
+"""The web page of a run or a file: its Gaussians or those fitted to it, the page, and how close that comes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import torch
 
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError, FlagError, printable
+from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import evaluation_background, measure, spread, views_to_judge
+from nerfloom.evaluation.evaluator import measure, spread, views_to_judge
 from nerfloom.evaluation.metrics import psnr
+from nerfloom.evaluation.paths import around
 from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
@@ -27,28 +29,27 @@ from nerfloom.export.web import (
     pinhole,
     upright,
 )
-from nerfloom.ray_model import RayModel
+from nerfloom.method import Method
+from nerfloom.renderable import Renderable, RendersRays
 from nerfloom.scene.folds import in_order
-from nerfloom.splats.drawing import DRAWN, draw_colors, splat_camera
+from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.transform import transformed
 from nerfloom.training.checkpoint import write_atomically
-from nerfloom.training.datasets import first_split, load_split
-from nerfloom.training.trained import Trained
+from nerfloom.training.datasets import first_split
+from nerfloom.training.loaded import Loaded
 
-NEAR, LEAST_NEAR = 0.2, 1e-3
-"""Smallest depth at which a centre is drawn, as a fraction of the scene's near distance and in scene units."""
 VIEWS = 5
-"""Maximum number of held-out views by which a page is compared with its run."""
+"""Maximum number of views by which a page is compared with what it shows."""
 
 
 @dataclass(frozen=True)
 class Closeness:
-    """Metrics of a page's Gaussians against their run, drawn by our own renderer on held-out views."""
+    """Metrics of a page's Gaussians against what they show, drawn by our own renderer."""
 
-    views: int
-    """Number of views."""
+    views: str
+    """What was compared, for people."""
     method: float
     """PSNR against the method's own pictures, dB."""
     photographs: float | None
@@ -59,55 +60,59 @@ class Closeness:
 
     def line(self) -> str:
         """Return a line for people."""
-        text = f"on {self.views} of the held-out views: PSNR {self.method:.2f} dB against the method's own pictures"
+        text = f"on {self.views}: PSNR {self.method:.2f} dB against the method's own pictures"
         if self.photographs is None:
             return text
         return f"{text}, {self.photographs:.2f} dB against the photographs (the method: {self.method_itself:.2f} dB)"
 
 
-def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds: float, moment: float | None) -> None:
-    """Write the web page of a run, and say its size and how close it comes.
+def export_page(
+    loaded: Loaded, path: Path, max_megabytes: float, fit_seconds: float, moment: float | None, splatting: Method
+) -> None:
+    """Write the web page of a run or a file of Gaussians, and say its size and how close it comes.
 
     Args:
-        trained: the run.
+        loaded: what is shown.
         path: file to write.
         max_megabytes: maximum size of the page, in millions of bytes.
         fit_seconds: seconds in which Gaussians are fitted to a field.
         moment: time that the page shows of a scene that moves, 0 to 1; 0 if None.
+        splatting: the method that fits them.
 
     Raises:
         ConfigError: if the flags do not fit the run, or there is nothing to show.
     """
     check_size(max_megabytes)
-    model = trained.model
+    model = loaded.model
     moment = _moment(model.scene.moving, moment)
-    if not isinstance(model, (HasGaussians, RayModel)):
-        raise ConfigError(f"ns-export web: {trained.run.method} has neither Gaussians nor rays, so it cannot be shown")
-    dataset = _at(load_split(trained.run, "train").to(model.device), moment)
-    cameras = pinhole(refined_cameras(model, dataset.cameras))
-    near = max(NEAR * model.scene.near, LEAST_NEAR)
+    dataset = None if loaded.source is None else _at(loaded.dataset("train"), moment)
+    if dataset is None:
+        cameras = around(model.scene)
+        names = [f"view {number + 1}" for number in range(len(cameras))]
+    else:
+        cameras, names = pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
+    near = smallest_depth(model.scene)
     if isinstance(model, HasGaussians):
         found, look = model.gaussians(), model.look()
-    else:
+    elif isinstance(model, RendersRays) and dataset is not None:
         if not fit_seconds > 0:
             raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
-        found, look = fit_gaussians(model, dataset, cameras, near, fit_seconds), OURS
-    found = found.map(lambda values: values.detach().cpu())
-    good = found[found.finite()]
-    if len(good) < len(found):
-        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
-    if not len(good):
-        raise ConfigError("there are no Gaussians to show; train the run again")
+        machine = loaded.run.config.machine
+        found, look = fit_gaussians(model, splatting, dataset, cameras, fit_seconds, machine), OURS
+    else:
+        raise ConfigError(f"ns-export web: {loaded.method} has neither Gaussians nor rays, so it cannot be shown")
+    good = _finite(found)
     turn = upright(cameras)
-    order = in_order(dataset.names)  # data formats sort 10.jpg before 2.jpg
+    order = in_order(names)  # data formats sort 10.jpg before 2.jpg
+    red, green, blue = model.background.tolist()
     facts = PageFacts(
-        title=_title(trained),
-        about=_about(trained, moment),
-        background=tuple(evaluation_background(model).tolist()),
+        title=_title(loaded),
+        about=_about(loaded, moment),
+        background=(red, green, blue),
         near=near,
         look=look,
         focus=focus_of(cameras, turn),
-        cameras=camera_rows(cameras[torch.tensor(order)], [printable(dataset.names[i]) for i in order], turn),
+        cameras=camera_rows(cameras[torch.tensor(order)], [printable(names[i]) for i in order], turn),
     )
     text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, max_megabytes)
     for cost in costs:
@@ -118,46 +123,66 @@ def export_page(trained: Trained, path: Path, max_megabytes: float, fit_seconds:
     say(f"{len(content) / 1e6:.2f} MB, {len(drawn):,} Gaussians of degree {drawn.degree}: {path}")
     if moment is not None:
         say(f"the scene moves, and the page shows it at time {moment:g}, still")
-    held_out = first_split(trained.run, ("test", "val"))
-    views = _at((dataset if held_out is None else held_out).to(model.device), moment)
     back = transformed(drawn, turn.T, 1.0, torch.zeros(3)).map(lambda values: values.to(model.device))
-    say(closeness(trained, back, views, near, look, moment).line())
+    held_out = None if loaded.source is None else first_split(loaded.source, ("test", "val"))
+    views = dataset if held_out is None else _at(held_out.to(model.device), moment)
+    seen = cameras.to(model.device) if views is None else views.cameras
+    say(closeness(model, back, seen, views, near, look, moment).line())
+
+
+def _finite(found: Gaussians) -> Gaussians:
+    """Return those of some Gaussians that are finite, on the CPU, and say how many are not."""
+    found = found.map(lambda values: values.detach().cpu())
+    good = found[found.finite()]
+    if len(good) < len(found):
+        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
+    if not len(good):
+        raise ConfigError("there are no Gaussians to show; train the run again")
+    return good
 
 
 def closeness(
-    trained: Trained, gaussians: Gaussians, dataset: Dataset, near: float, look: Look, moment: float | None
+    model: Renderable,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    dataset: Dataset | None,
+    near: float,
+    look: Look,
+    moment: float | None,
 ) -> Closeness:
-    """Compare Gaussians with the run that they show.
+    """Compare Gaussians with what they are to show.
 
     Args:
-        trained: the run.
+        model: what they are to show.
         gaussians: N Gaussians in the scene's frame, on the model's device.
-        dataset: views with images, on the model's device.
+        cameras: M cameras to compare from.
+        dataset: their images, on the model's device; None without any.
         near: smallest depth at which a centre is drawn, scene units.
         look: how the Gaussians are drawn.
         moment: time of the views; None for a static scene.
     """
-    model, background = trained.model, evaluation_background(trained.model)
-    judged = views_to_judge(dataset) or list(range(len(dataset)))
+    background = model.background
+    judged = (views_to_judge(dataset) if dataset else []) or list(range(len(cameras)))
     chosen = [judged[rank] for rank in spread(len(judged), VIEWS)]
-    as_seen = dataset.cameras.model in DRAWN
-    cameras = dataset.cameras if as_seen else pinhole(dataset.cameras)
+    as_seen = cameras.model in DRAWN
+    cameras = cameras if as_seen else pinhole(cameras)
     own: list[float] = []
     photographs: list[tuple[float, float]] = []
     for index in track(chosen, "Comparing", total=len(chosen)):
-        view = View.of(cameras, index, dataset.times)
+        view = View.of(cameras, index, None if dataset is None else dataset.times)
         rgb = model.render_rgb(view, background).clamp(0, 1).float()
         with torch.no_grad():
             shown = draw_colors(gaussians, splat_camera(view.camera, near, look), 1, background).clamp(0, 1)
         own.append(psnr(shown, rgb))
-        if as_seen and moment is None:
+        if dataset is not None and as_seen and moment is None:
             target = composite(dataset.image(index).float() / 255, background)
             kept = dataset.kept_of(index)
             photographs.append((measure(shown, target, kept).psnr, measure(rgb, target, kept).psnr))
+    views = f"{len(chosen)} {'views around it' if dataset is None else 'of the held-out views'}"
     if not photographs:
-        return Closeness(len(chosen), fmean(own), None, None)
+        return Closeness(views, fmean(own), None, None)
     page, method = zip(*photographs, strict=True)
-    return Closeness(len(chosen), fmean(own), fmean(page), fmean(method))
+    return Closeness(views, fmean(own), fmean(page), fmean(method))
 
 
 def _moment(moving: bool, asked: float | None) -> float | None:
@@ -174,16 +199,18 @@ def _at(dataset: Dataset, moment: float | None) -> Dataset:
     return dataset if moment is None else replace(dataset, times=torch.full((len(dataset),), moment).to(dataset.device))
 
 
-def _title(trained: Trained) -> str:
-    config = trained.run.config
+def _title(loaded: Loaded) -> str:
+    if not loaded.is_run:
+        return printable(loaded.origin.stem)
+    config = loaded.run.config
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
-    return printable(f"{experiment} · {trained.run.method}")
+    return printable(f"{experiment} · {loaded.method}")
 
 
-def _about(trained: Trained, moment: float | None) -> str:
-    method = trained.run.method
-    parts = [f"Made by Nerfloom with {method}."]
-    if not isinstance(trained.model, HasGaussians):
+def _about(loaded: Loaded, moment: float | None) -> str:
+    method = loaded.method
+    parts = [f"Made by Nerfloom with {method}." if loaded.is_run else "Made by Nerfloom from a file of Gaussians."]
+    if not isinstance(loaded.model, HasGaussians):
         parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")

@@ -1,10 +1,10 @@
 """Gaussians fitted to the pictures of a field, so that a method without Gaussians can be shown where only they can.
 
-They start on the surfaces that the field's rays end on (`framework/export/points.py`), and are then trained as in 3D
-Gaussian Splatting (Kerbl et al. 2023), with moves as in MCMC (Kheradmand et al. 2024). They are to show what the field
-has learnt, so they learn from pictures that it renders, at the training cameras and between them. A field on a CPU
-renders few in a minute; so every other step learns from a photograph, where the field was to show just that: where
-nothing moves, light does not vary, and the lens can be drawn.
+They start on the surfaces that the field's rays end on (`framework/export/points.py`), and gaussian-splatting trains
+them with moves as in 3DGS-MCMC (Kheradmand et al. 2024). They are to show what the field has learnt, so they learn from
+pictures that it renders, at the training cameras and between them. A field on a CPU renders few in a minute; so every
+other step learns from a photograph, where the field was to show just that: where nothing moves, light does not vary,
+and the lens can be drawn.
 """
 
 from __future__ import annotations
@@ -17,29 +17,27 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfloom.base.console import say, track
 from nerfloom.base.device import seed_step, wait_for
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.machine_config import MachineConfig
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.data.pixels.batch import ViewBatch
+from nerfloom.data.sources import BatchSource, Request
 from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.points import joined, surface_points
 from nerfloom.geometry.alignment import nearest_rotations
-from nerfloom.kernels.images.ssim import photometric_loss
-from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.kernels.splats.project import SplatCamera
-from nerfloom.ray_model import RayModel
-from nerfloom.splats.drawing import DRAWN, draw, on_image, splat_camera
+from nerfloom.method import Method
+from nerfloom.renderable import RendersRays
+from nerfloom.splats.drawing import DRAWN
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
-from nerfloom.splats.learning import as_gaussians, as_tables, number_for, open_degree, rate_factor, row_changes
-from nerfloom.splats.mcmc import moved
+from nerfloom.splats.learning import number_for, rate_factor
 from nerfloom.splats.start import from_points
-from nerfloom.training.optim import Adam
-from nerfloom.training.step import backward
+from nerfloom.training.trainer import Trainer
 
 PICTURES_SHARE = 0.45
 """Share of the budget in which pictures are rendered; the others are steps."""
@@ -59,24 +57,36 @@ PASSES = 4
 """Maximum number of times that rays are drawn, of which some end on no surface."""
 OPACITY, SIZE = 0.5, 0.7
 """Of Gaussians at the start: opacity, and standard deviation in distances to neighbours."""
-RATES = {"means": 8e-5, "log_scales": 5e-3, "rotations": 1e-3, "logits": 5e-2, "colors": 2.5e-3, "harmonics": 1.25e-4}
-"""Learning rates before the factor that the budget decides; of centres per scene extent."""
 MOST_GAUSSIANS, MOST_RATE = 300_000, 5.0
 """Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
 """Steps a second by which that factor is chosen."""
-SSIM_WEIGHT = 0.2
-"""Weight of 1 - SSIM in the loss; the absolute error has the rest."""
-STEPS_PER_MOVE, MOVES_END, GROWTH = 100, 0.8, 1.05
-"""Steps between moves, the share of the budget after which there are none, and by how much the number grows in each,
-where there were too few surfaces."""
+SETTINGS: dict[str, Any] = {
+    "max_num_iterations": None,
+    "degree": MAX_DEGREE,
+    "strategy": "mcmc",
+    "steps_per_move": 100,
+    "reduced_until": 0.0,
+    "paced": False,
+    # They are on surfaces already.
+    "noise": 0.0,
+    "opacity_penalty": 0.0,
+    "scale_penalty": 0.0,
+    # Pictures of a field have one light and known poses.
+    "appearance": False,
+    "camera_optimizer": "off",
+    "depth_loss_mult": 0.0,
+    "field_depth_mult": 0.0,
+    "background": "black",  # `FieldPictures` chooses it
+}
+"""Settings of gaussian-splatting by which it learns a field's pictures, beside those that the budget decides."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture that the field has rendered."""
+    """A picture that the field has rendered, or a photograph."""
 
-    camera: SplatCamera
+    view: View
     """Its camera."""
     rgb: Tensor
     """(H, W, 3) light of the field."""
@@ -86,40 +96,88 @@ class Shot:
     """(H, W) bool, pixels that count; None for all."""
 
 
-def fit_gaussians(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near: float, seconds: float) -> Gaussians:
+class FieldPictures(BatchSource):
+    """A source of a field's pictures and of photographs, in turns, over a random colour where the background is seen.
+
+    Args:
+        dataset: the training split.
+        shots: pictures of the field, at least one.
+        photographs: functions that load photographs, possibly none.
+        background: (3,) colour behind pictures that are opaque.
+    """
+
+    def __init__(
+        self, dataset: Dataset, shots: list[Shot], photographs: list[Callable[[], Shot]], background: Tensor
+    ) -> None:
+        self.dataset, self.shots, self.photographs, self.background = dataset, shots, photographs, background
+
+    def draw(self, request: Request) -> ViewBatch:
+        if request.step % 2 and self.photographs:
+            shot = self.photographs[int(torch.randint(len(self.photographs), ()))]()
+        else:
+            shot = self.shots[int(torch.randint(len(self.shots), ()))]
+        behind = torch.rand_like(self.background) if bool(shot.through.any()) else self.background
+        return ViewBatch(0, shot.view, shot.rgb + shot.through * behind, behind, kept=shot.kept)
+
+    def drawing_from(self, dataset: Dataset) -> FieldPictures:
+        return FieldPictures(dataset, self.shots, self.photographs, self.background)
+
+
+def fit_gaussians(
+    model: RendersRays, splatting: Method, dataset: Dataset, cameras: Cameras, seconds: float, machine: MachineConfig
+) -> Gaussians:
     """Return Gaussians that look like a field.
 
     Args:
         model: the model in evaluation mode.
+        splatting: the method gaussian-splatting.
         dataset: the training split, on the model's device; its times are those of the pictures.
         cameras: M pinhole cameras of that split.
-        near: smallest depth at which a Gaussian is drawn, scene units.
         seconds: time for pictures and steps together; more is taken where the fewest pictures take longer than theirs.
+        machine: seed and device.
 
     Raises:
         ConfigError: if no training ray ends on a surface.
     """
     begun = time.perf_counter()
-    seed_step(model.config.machine.seed, 0)
+    seed_step(machine.seed, 0)
     most = number_for(seconds, MOST_GAUSSIANS)
     points, colors = _surfaces(model, dataset, most)
-    shots = _shots(model, dataset, cameras, near, PICTURES_SHARE * seconds)
+    shots = _shots(model, dataset, cameras, PICTURES_SHARE * seconds)
+    photographs = _photographs(model, dataset)
     height, width = shots[0].rgb.shape[:2]
-    photographs = _photographs(model, dataset, near)
     say(
         f"learning from {len(shots)} pictures of the field, of {width} x {height}, and from {len(photographs)}"
         f" photographs; {len(points):,} points on surfaces"
     )
-    first = from_points(points, colors, MAX_DEGREE, OPACITY, SIZE)
-    background = evaluation_background(model)
-    rates = _rates(cameras, (1 - PICTURES_SHARE) * seconds)
-    with torch_on_one_thread():
+    own_share = (1 - PICTURES_SHARE) * seconds
+    settings: Any = splatting.config
+    config = replace(
+        settings,
+        **SETTINGS,
         # On a slow machine even the fewest pictures take longer than their share; a page of no steps is of no use.
-        left = max(seconds - (time.perf_counter() - begun), (1 - PICTURES_SHARE) * seconds)
-        return _trained(first, shots, photographs, background, rates, most, left)
+        max_seconds=max(seconds - (time.perf_counter() - begun), own_share),
+        num_gaussians=most,
+        rate_factor=rate_factor(STEPS_PER_SECOND * own_share, MOST_RATE),
+        machine=machine,
+    )
+    learnt = replace(dataset, cameras=cameras, scene=replace(dataset.scene, num_scenes=1))
+    trainer = Trainer(splatting, config, learnt, source=FieldPictures(learnt, shots, photographs, model.background))
+    trainer.prepare(start=False)
+    fitted: Any = trainer.model
+    fitted.set_gaussians(from_points(points, colors, MAX_DEGREE, OPACITY, SIZE))
+    steps = trainer.steps()
+    for percent in track(range(100), "Fitting Gaussians", total=100):
+        for report in steps:
+            if report.progress >= (percent + 1) / 100:
+                break
+    found, dropped = fitted.gaussians(), trainer.state.skipped
+    without = f", of which {dropped:,} were dropped, since their gradients were not finite" if dropped else ""
+    say(f"{len(found):,} Gaussians after {trainer.state.step:,} steps{without}")
+    return found
 
 
-def _surfaces(model: RayModel[Any], dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
+def _surfaces(model: RendersRays, dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
     """Return up to `count` points (K, 3) on surfaces and their colours (K, 3), on the model's device."""
     positions, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     for _ in track(range(PASSES), "Looking for surfaces", total=PASSES):
@@ -135,7 +193,7 @@ def _surfaces(model: RayModel[Any], dataset: Dataset, count: int) -> tuple[Tenso
 # -- pictures -----------------------------------------------------------------------------------------------------
 
 
-def _shots(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near: float, seconds: float) -> list[Shot]:
+def _shots(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: float) -> list[Shot]:
     """Return pictures that the model renders in about so many seconds.
 
     They are parts of images rather than small images, in which there is too little to learn from.
@@ -148,15 +206,15 @@ def _shots(model: RayModel[Any], dataset: Dataset, cameras: Cameras, near: float
         if len(shots) >= FEWEST_PICTURES and time.perf_counter() > end:
             break
         moment = None if dataset.times is None else float(dataset.times[index])
-        shots.append(_shot(model, cropped(camera, share), moment, near))
+        shots.append(_shot(model, cropped(camera, share), moment))
     return shots
 
 
-def _part(model: RayModel[Any], dataset: Dataset, cameras: Cameras, seconds: float) -> float:
+def _part(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: float) -> float:
     """Return the share of images' sides that pictures show so that PICTURES, or two a camera, take so many seconds."""
     pixels = float((cameras.widths * cameras.heights).double().mean())
     moment = None if dataset.times is None else float(dataset.times[0])
-    background = evaluation_background(model)
+    background = model.background
     stride = max(int(math.sqrt(pixels / TIMED_RAYS)), 1)
     model.render_view(View(cameras[:1], moment, stride=8 * stride), background)  # allocates what the first use does
     start, view = time.perf_counter(), View(cameras[:1], moment, stride=stride)
@@ -217,25 +275,25 @@ def between(cameras: Cameras, index: int) -> Cameras | None:
     return replace(cameras[index : index + 1], camera_to_worlds=pose)
 
 
-def _shot(model: RayModel[Any], camera: Cameras, moment: float | None, near: float) -> Shot:
-    background = evaluation_background(model)
-    picture = model.render_view(View(camera, moment), background)
+def _shot(model: RendersRays, camera: Cameras, moment: float | None) -> Shot:
+    view, background = View(camera, moment), model.background
+    picture = model.render_view(view, background)
     rgb, through = picture.rgb.clamp(0, 1).float(), torch.zeros_like(picture.rgb[..., :1], dtype=torch.float32)
     if model.scene.has_alpha:
         through = (1 - picture.accumulation.float().clamp(0, 1))[..., None]
         rgb = (rgb - through * background).clamp(0, 1)
-    return Shot(splat_camera(camera, near), rgb, through)
+    return Shot(view, rgb, through)
 
 
-def _photographs(model: RayModel[Any], dataset: Dataset, near: float) -> list[Callable[[], Shot]]:
+def _photographs(model: RendersRays, dataset: Dataset) -> list[Callable[[], Shot]]:
     """Return functions that load photographs; none where the field is not to show just what they show."""
     if dataset.times is not None or dataset.cameras.model not in DRAWN or dataset.scene.appearance_varies:
         return []
     cameras = refined_cameras(model, dataset.cameras)
-    return [partial(_photograph, dataset, cameras, index, near) for index in range(len(dataset))]
+    return [partial(_photograph, dataset, cameras, index) for index in range(len(dataset))]
 
 
-def _photograph(dataset: Dataset, cameras: Cameras, index: int, near: float) -> Shot:
+def _photograph(dataset: Dataset, cameras: Cameras, index: int) -> Shot:
     """Return a photograph, or a random part of a large one."""
     camera = cameras[index : index + 1]
     height, width = int(camera.heights[0]), int(camera.widths[0])
@@ -244,65 +302,5 @@ def _photograph(dataset: Dataset, cameras: Cameras, index: int, near: float) -> 
     where = slice(top, top + int(part.heights[0])), slice(left, left + int(part.widths[0]))
     image, kept = dataset.image(index)[where].float() / 255, dataset.kept_of(index)
     alpha = image[..., 3:] if image.shape[-1] == 4 else torch.ones_like(image[..., :1])
-    shot = splat_camera(part, near)
-    return Shot(shot, image[..., :3] * alpha, 1 - alpha, None if kept is None else kept[where].to(image.device))
-
-
-# -- steps --------------------------------------------------------------------------------------------------------
-
-
-def _rates(cameras: Cameras, seconds: float) -> dict[str, float]:
-    """Return the learning rates of a fit of so many seconds."""
-    factor = rate_factor(STEPS_PER_SECOND * seconds, MOST_RATE)
-    centers = cameras.camera_to_worlds[:, :, 3]
-    extent = 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
-    return {name: factor * rate * (extent if name == "means" else 1) for name, rate in RATES.items()}
-
-
-def _trained(
-    first: Gaussians, shots: list[Shot], photographs: list[Callable[[], Shot]], background: Tensor,
-    rates: dict[str, float], most: int, seconds: float,
-) -> Gaussians:  # fmt: skip
-    """Return Gaussians that have learnt the pictures for so many seconds."""
-    tables = [nn.Parameter(values.contiguous()) for values in as_tables(first)]
-    named = zip(vars(first), tables, strict=True)
-    groups = [{"params": [table], "name": name, "lr": rates[name], "sparse": True} for name, table in named]
-    optimizer = Adam(groups, {}, 1e-3, (0.9, 0.99), 1e-15)
-    start, step, dropped = time.perf_counter(), 0, 0
-    for percent in track(range(100), "Fitting Gaussians", total=100):
-        while (progress := (time.perf_counter() - start) / seconds) < (percent + 1) / 100:
-            optimizer.param_groups[0]["lr"] = rates["means"] * 0.1**progress
-            optimizer.bring_rates()
-            if step % 2 and photographs:
-                shot = photographs[int(torch.randint(len(photographs), ()))]()
-            else:
-                shot = shots[int(torch.randint(len(shots), ()))]
-            if backward(_loss(as_gaussians(tables), shot, background, progress), optimizer):
-                optimizer.step()
-            else:
-                dropped += 1
-            step += 1
-            if step % STEPS_PER_MOVE == 0 and progress < MOVES_END:
-                _move(tables, optimizer, most)
-    without = f", of which {dropped:,} were dropped, since their gradients were not finite" if dropped else ""
-    say(f"{len(tables[0]):,} Gaussians after {step:,} steps{without}")
-    return as_gaussians(tables).map(Tensor.detach)
-
-
-def _loss(gaussians: Gaussians, shot: Shot, background: Tensor, progress: float) -> Tensor:
-    """Return the difference () of Gaussians and a picture, over a random colour where the background is seen."""
-    behind = torch.rand_like(background) if bool(shot.through.any()) else background
-    target = shot.rgb + shot.through * behind
-    rgb = draw(on_image(gaussians, shot.camera, open_degree(progress)), shot.camera, behind).image
-    if shot.kept is not None:  # what does not count is as it should be
-        target = torch.where(shot.kept[..., None], target, rgb.detach())
-    return photometric_loss(rgb, target, SSIM_WEIGHT)
-
-
-@torch.no_grad()
-def _move(tables: list[nn.Parameter], optimizer: Adam, most: int) -> None:
-    """Move Gaussians that have become transparent, and add some."""
-    here = len(tables[0])
-    change = moved(as_gaussians(tables).map(Tensor.detach), max(min(most, int(GROWTH * here)) - here, 0))
-    for row_change in row_changes(tables, *change) if change is not None else ():
-        optimizer.change_rows(row_change)
+    shown = None if kept is None else kept[where].to(image.device)
+    return Shot(View(part), image[..., :3] * alpha, 1 - alpha, shown)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -13,6 +12,9 @@ from torch import Tensor
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
+from nerfloom.export.points import SurfacePoints, joined, surface_points
+from nerfloom.method import Method
+from nerfloom.training.trainer import Trainer
 
 PASSES = 16
 """Maximum number of times that rays are drawn, of which some end on no surface."""
@@ -34,13 +36,14 @@ class FoundSurfaces:
     """(N,) distance from that image's camera, scene units."""
 
 
-def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: float, count: int) -> FoundSurfaces:
+def found_surfaces(
+    method: Method, dataset: Dataset, config: TrainConfig, steps: int, seconds: float, count: int
+) -> FoundSurfaces:
     """Train a field for a few steps, and return points on the surfaces that it has found.
 
-    The field is that of instant-ngp, or that of nerfacto where there may be something outside the scene's box, which
-    instant-ngp does not see.
-
     Args:
+        method: the method of the field, which casts rays: instant-ngp, or nerfacto where there may be something outside
+            the scene's box, which instant-ngp does not see.
         dataset: the images.
         config: settings of the run that asks; machine and background are taken from it.
         steps: maximum number of training steps of the field.
@@ -50,26 +53,18 @@ def found_surfaces(dataset: Dataset, config: TrainConfig, steps: int, seconds: f
     Returns:
         The points; there are fewer than `count` where rays end on no surface, and possibly none.
     """
-    from nerfloom.export.points import SurfacePoints, joined, surface_points
-    from nerfloom.registry import load_method
-    from nerfloom.training.run import Run
-    from nerfloom.training.trainer import Trainer
-
-    method = "nerfacto" if dataset.scene.unbounded else "instant-ngp"
     # instant-ngp's settings and rates are those of its few seconds; nerfacto's are not (docs/notes/splatting.md).
-    limit = seconds if method == "instant-ngp" and seconds < math.inf else None
+    limit = None if dataset.scene.unbounded or seconds == math.inf else seconds
     settings = replace(
-        load_method(method).config,
+        method.config,
         max_num_iterations=steps,
         max_seconds=limit,
-        vis="none",
         machine=config.machine,
         background=config.background,
     )
-    trainer = Trainer(Run(method, settings, "", cast("Any", None), Path()), dataset, None)
-    for _ in track(range(steps), "Looking for surfaces", total=steps):
-        trainer.train_step()
-        if trainer.state.seconds >= seconds:
+    trainer = Trainer(method, settings, dataset)
+    for report in track(trainer.steps(), "Looking for surfaces", total=steps):
+        if report.seconds >= seconds:
             break
     model = trainer.model.eval()
     parts: list[SurfacePoints] = []

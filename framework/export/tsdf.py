@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.export.lattice import Lattice
 from nerfloom.geometry.lenses import project
-from nerfloom.model import Model
+from nerfloom.renderable import Renderable
 
 BLOCK = 16
 """Cells along an edge of a block."""
@@ -87,7 +86,7 @@ def stride_for(cameras: Cameras, lattice: Lattice, most_pixels: int = MAX_PIXELS
 
 @torch.no_grad()
 def rendered_views(
-    model: Model[Any], cameras: Cameras, times: Tensor | None, background: Tensor, stride: int
+    model: Renderable, cameras: Cameras, times: Tensor | None, background: Tensor, stride: int
 ) -> Iterator[DepthView]:
     """Render depth and colour of each camera.
 

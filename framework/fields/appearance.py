@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -27,11 +28,20 @@ class Appearance(nn.Module):
         count: number of images.
         optimised: settings of the optimiser; those of the containing module if None.
         mean_share: probability with which an image has the mean vector in a training step.
+        held_out: what held-out images are evaluated with: the mean vector, or one that is fitted to the left half of
+            each, and judged on its right half.
     """
 
-    def __init__(self, size: int, count: int, optimised: Optimised | None = None, mean_share: float = 0.0) -> None:
+    def __init__(
+        self,
+        size: int,
+        count: int,
+        optimised: Optimised | None = None,
+        mean_share: float = 0.0,
+        held_out: Literal["mean", "half"] = "mean",
+    ) -> None:
         super().__init__()
-        self.size, self.optimised, self.mean_share = size, optimised, mean_share
+        self.size, self.optimised, self.mean_share, self.held_out = size, optimised, mean_share, held_out
         self.vectors = nn.Parameter(torch.zeros(count, size))
         self._shown: Tensor | None = None
 

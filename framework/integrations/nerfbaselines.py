@@ -22,11 +22,9 @@ from torch import Tensor
 from nerfloom.base.config import TrainConfig, from_plain, to_plain
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
-from nerfloom.base.errors import CheckpointError, ConfigError, DataError
+from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cameras.view import View
-from nerfloom.data.dataset import DataParser, ParsedScene, Split
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.integrations.nerfbaselines_data import (
     CAMERA_MODELS,
     ArrayImages,
@@ -40,7 +38,7 @@ from nerfloom.integrations.nerfbaselines_data import (
 from nerfloom.integrations.nerfbaselines_settings import flattened, parse_overrides, with_matching_background
 from nerfloom.registry import load_method
 from nerfloom.training.checkpoint import FOLDER, load_newest
-from nerfloom.training.run import Run, write_json
+from nerfloom.training.run import write_json
 from nerfloom.training.trained import restored_model
 from nerfloom.training.trainer import Trainer
 
@@ -90,7 +88,7 @@ class NerfloomMethod:
             self._trainer, self._model, self._config = trainer, trainer.model, trainer.config
         elif saved is not None:
             self._frame, background, self._config = saved.frame, saved.background, config
-            self._model = restored_model(self.name, config, saved.content, choose_device(config.machine))
+            self._model = restored_model(load_method(self.name), config, saved.content, choose_device(config.machine))
         else:
             raise ConfigError(f"{self.name} needs training images or a checkpoint")
         self._background = background.to(self._model.device)
@@ -152,7 +150,7 @@ class NerfloomMethod:
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
         if self._trainer is not None:
-            self._trainer.run = replace(self._trainer.run, folder=folder)
+            self._trainer.folder = folder
             self._trainer.save()
         elif self._checkpoint is not None:  # the same bytes, as nerfbaselines stores their hash
             shutil.copytree(self._checkpoint / FOLDER, folder / FOLDER, dirs_exist_ok=True)
@@ -277,18 +275,6 @@ class Saved:
         return Frame.saved(self.content)
 
 
-@dataclass(frozen=True)
-class ReadByNerfbaselines(DataParser):
-    """Placeholder for a run's data format, as nerfbaselines has read the data."""
-
-    @classmethod
-    def recognizes(cls, path: Path) -> bool:
-        return False
-
-    def parse(self, path: Path | None, split: Split) -> ParsedScene:
-        raise DataError("nerfbaselines has read the data; there are no files to parse")
-
-
 def _begin(
     method: str, config: TrainConfig, flags: FrameFlags, data: DatasetDict, saved: Saved | None
 ) -> tuple[Trainer, Frame, Tensor]:
@@ -302,13 +288,13 @@ def _begin(
     background, has_alpha = background_of(data), dataset.scene.has_alpha
     if saved is None and has_alpha:
         config = with_matching_background(config, background)
-    trainer = Trainer(Run(method, config, "nerfbaselines", ReadByNerfbaselines(), Path()), dataset, None)
+    trainer = Trainer(load_method(method), config, dataset)
     if saved is not None:
         trainer.restore(saved.content)
         return trainer, frame, saved.background
     for line in trainer.profile.lines():
         say(line)
-    return trainer, frame, background if has_alpha else evaluation_background(trainer.model)
+    return trainer, frame, background if has_alpha else trainer.model.background
 
 
 def _defaults(method: str, saved: Saved | None) -> TrainConfig:

@@ -10,6 +10,7 @@ from torch import Tensor
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import every
+from nerfloom.data.scene import Scene
 from nerfloom.geometry.lenses import LENSES, Distortion
 from nerfloom.kernels.splats.blend import CHANNELS, Blended, blend
 from nerfloom.kernels.splats.project import SplatCamera, project_gaussians, sort_keys
@@ -24,6 +25,15 @@ DRAWN = ("pinhole", "opencv", "fisheye")
 """Camera models that Gaussians can be drawn for."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
+
+
+def smallest_depth(scene: Scene) -> float:
+    """Return the depth, scene units, below which the centres of Gaussians are not drawn.
+
+    Args:
+        scene: the scene.
+    """
+    return max(0.2 * scene.near, 1e-3)
 
 
 def splat_camera(

@@ -99,15 +99,3 @@ class RendersGaussians(HasGaussians, Protocol):
             gaussians: what is drawn, in the frame of the scene.
             view, background: as in `Model.render_view`.
         """
-
-
-@runtime_checkable
-class TakesGaussians(Protocol):
-    """A model that draws any Gaussians, such as those of a file."""
-
-    def set_gaussians(self, gaussians: Gaussians) -> None:
-        """Replace those of the model.
-
-        Args:
-            gaussians: the new ones, in the frame of the scene, with harmonics of the degree in the settings.
-        """

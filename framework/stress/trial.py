@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import fmean
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -22,7 +20,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.data.scene import Scene
 from nerfloom.data.sources import BatchSource, Request, make_source
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.kernels.adam.adam import all_finite
 from nerfloom.method import Method
@@ -106,12 +104,10 @@ def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Tri
     Raises:
         Stopped: if a signal stops the run.
     """
-    with TemporaryDirectory() as folder:
-        try:
-            return _trained_and_evaluated(condition, replace(run, folder=Path(folder)), views, budget)
-        except (Exception, SystemExit) as error:
-            line = in_a_line(error).replace(folder, "the run's folder")
-            return Trial(error=line, refused=isinstance(error, NerfloomError))
+    try:
+        return _trained_and_evaluated(condition, run, views, budget)
+    except (Exception, SystemExit) as error:
+        return Trial(error=in_a_line(error), refused=isinstance(error, NerfloomError))
 
 
 def _trained_and_evaluated(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:
@@ -120,7 +116,7 @@ def _trained_and_evaluated(condition: Condition, run: Run, views: Views, budget:
     config = from_plain(config, condition.settings(config), condition.name)
     changed = condition.change(views).to(choose_device(config.machine))
     source = StressedSource(make_source(method.model.batches, changed.train, config), condition)
-    trainer = Trainer(replace(run, config=config), changed.train, None, source)
+    trainer = Trainer(method, config, changed.train, source=source)
     if (number := trainer.train().stopped_by) is not None:
         raise Stopped(number)
     state = trainer.state
@@ -168,7 +164,7 @@ def blank_psnr(model: Model[Any], test: Dataset) -> float:
         model: the model, with its background.
         test: the test images.
     """
-    background = evaluation_background(model)
+    background = model.background
     images = (composite(test.image(index).float() / 255, background) for index in range(len(test)))
     return fmean(psnr(background.expand_as(image), image) for image in images)
 
@@ -187,7 +183,7 @@ def unsound(trainer: Trainer, test: Dataset) -> str | None:
             return f"the parameter {name} is not finite"
     if not math.isfinite(trainer.state.train_mse):
         return "the running mean of the training error is not finite"
-    picture = trainer.model.render_view(test.view(0), evaluation_background(trainer.model))
+    picture = trainer.model.render_view(test.view(0), trainer.model.background)
     for name, values in (("colour", picture.rgb), ("depth", picture.depth), ("opacity", picture.accumulation)):
         if not bool(torch.isfinite(values).all()):
             return f"the {name} of a test view is not finite"

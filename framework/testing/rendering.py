@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
-from nerfloom.model import Model, parts
+from nerfloom.model import Model
 from nerfloom.ray_model import RayModel
+from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.samplers.base import SkipsCells

@@ -17,8 +17,8 @@ from typing import Any, TypeAlias
 
 from nerfloom.base.device import runs_ahead
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import Measured, evaluation_background, measure_view, spread, views_to_judge
-from nerfloom.model import Model
+from nerfloom.evaluation.evaluator import Measured, measure_view, spread, views_to_judge
+from nerfloom.renderable import Renderable
 from nerfloom.training.progress import StepReport
 from nerfloom.training.run import finite_or_null
 
@@ -140,7 +140,7 @@ class FewImages:
         cameras = dataset.cameras
         self._sizes = [(int(cameras.heights[view]), int(cameras.widths[view])) for view in self._views]
 
-    def look_if_due(self, model: Model, looks: Sequence[Entry], report: StepReport, *, last: bool) -> Point | None:
+    def look_if_due(self, model: Renderable, looks: Sequence[Entry], report: StepReport, *, last: bool) -> Point | None:
         """Evaluate the images if it is time to.
 
         Args:
@@ -183,12 +183,12 @@ class FewImages:
         stride = pixel_stride(self._sizes, self._rays_per_pixel, rate * allowed)
         return stride, num_rays(self._sizes, stride, self._rays_per_pixel) / rate
 
-    def _measure(self, model: Model, stride: int) -> Measured:
+    def _measure(self, model: Renderable, stride: int) -> Measured:
         """Return the mean PSNR and SSIM of every `stride`-th row and column.
 
         Images are rendered with the mean appearance whatever --eval-appearance is: fitting one to each takes long.
         """
-        background = evaluation_background(model)
+        background = model.background
         measured = [measure_view(model, self._dataset, view, background, stride) for view in self._views]
         ssims = [image.ssim for image in measured if image.ssim is not None]
         return Measured(fmean(image.psnr for image in measured), fmean(ssims) if len(ssims) == len(measured) else None)

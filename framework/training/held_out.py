@@ -6,18 +6,20 @@ import math
 import time
 from collections.abc import Callable
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background, timed_view
+from nerfloom.evaluation.evaluator import evaluate, timed_view
 from nerfloom.evaluation.panels import composed, view_panels
 from nerfloom.model import Model
 from nerfloom.training.budget import evaluation_seconds
 from nerfloom.training.curve import FewImages, Point, in_order, rows
 from nerfloom.training.progress import StepReport, TensorBoard
-from nerfloom.training.run import Run, write_report
+from nerfloom.training.run import write_report
 from nerfloom.training.state import State
 
 PICTURE_SHARE = 0.1
@@ -30,16 +32,17 @@ class HeldOut:
     """Evaluations of held-out images between steps. Their time does not count as training.
 
     Args:
-        run: the run, with its settings decided.
+        config: the settings, decided.
         model: the model that is trained.
         dataset: the held-out images, or a few of them; None if nothing is to be evaluated.
+        folder: folder of the learning curve; None to write none.
     """
 
-    def __init__(self, run: Run, model: Model[Any], dataset: Dataset | None) -> None:
-        self.run, self.model, self._given = run, model, dataset
+    def __init__(self, config: TrainConfig, model: Model[Any], dataset: Dataset | None, folder: Path | None) -> None:
+        self.config, self.model, self._given, self._folder = config, model, dataset, folder
         self.load_all: Callable[[], Dataset | None] | None = None
         """Loads all held-out images, when they are first needed; None if `dataset` has them all."""
-        limit = run.config.max_eval_images
+        limit = config.max_eval_images
         self._few = None if dataset is None else FewImages(dataset, limit, model.rays_per_pixel)
         self._last = self._picture_seconds = 0.0
 
@@ -59,7 +62,7 @@ class HeldOut:
             state: the run's state, to whose curve an evaluation of all images is added.
             board: where pictures and results are shown.
         """
-        config, step = self.run.config, state.step
+        config, step = self.config, state.step
         if self._given is None or config.max_eval_images == 0:
             return
         affordable = self._picture_seconds + self._seconds_per_image(state) <= PICTURE_SHARE * state.seconds
@@ -73,7 +76,13 @@ class HeldOut:
         if (due or step % config.steps_per_eval_all_images == 0) and self.dataset is not None:
             self._last, start = state.seconds, time.perf_counter()
             limit = evaluation_seconds(config, state) if every is None else None
-            evaluation = evaluate(self.model, self.dataset, max_images=config.max_eval_images, seconds=limit)
+            evaluation = evaluate(
+                self.model,
+                self.dataset,
+                max_images=config.max_eval_images,
+                seconds=limit,
+                lpips_weights=config.lpips_weights,
+            )
             psnr, ssim, images = (evaluation.results[name] for name in ("psnr", "ssim", "num_images"))
             full = images == min(evaluation.results["num_images_in_split"], config.max_eval_images or math.inf)
             cost = time.perf_counter() - start
@@ -91,7 +100,7 @@ class HeldOut:
 
     def _show(self, index: int, dataset: Dataset, step: int, board: TensorBoard) -> None:
         """Show image `index` beside what the model renders of it."""
-        background = evaluation_background(self.model)
+        background = self.model.background
         picture, seconds = timed_view(self.model, dataset.view(index), background)
         target = composite(dataset.image(index).float() / 255, background)
         panels = view_panels(picture.rgb.clamp(0, 1), target, picture)
@@ -117,5 +126,6 @@ class HeldOut:
             self.write_curve(state)
 
     def write_curve(self, state: State) -> None:
-        """Write all evaluations of a `state` to the run's learning_curve.json."""
-        write_report(self.run.folder / "learning_curve.json", rows(in_order(state.curve, state.looks)))
+        """Write all evaluations of a `state` to learning_curve.json, if there is a folder."""
+        if self._folder is not None:
+            write_report(self._folder / "learning_curve.json", rows(in_order(state.curve, state.looks)))

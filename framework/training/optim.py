@@ -15,7 +15,8 @@ from nerfloom.kernels.adam.adam import all_finite, dense_adam, sparse_adam
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.planes import PlanesGradient
 from nerfloom.kernels.table_memory import require, table
-from nerfloom.model import Model, parts
+from nerfloom.model import Model
+from nerfloom.renderable import parts
 
 
 class Adam:

@@ -14,8 +14,8 @@ class Outcome:
     """Reason for which training stopped, for people."""
     stopped_by: int | None
     """Number of the signal that stopped training; None if no signal did."""
-    checkpoint: Path
-    """Path of the last checkpoint."""
+    checkpoint: Path | None
+    """Path of the last checkpoint; None without a folder."""
 
     @property
     def interrupted(self) -> bool:

@@ -20,9 +20,10 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import training_background
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.geometry.bounds import nested_boxes
-from nerfloom.model import HasAppearance, LearnsMotion, Model, RefinesPoses, RendersFromImages, parts
+from nerfloom.method import Method
+from nerfloom.model import LearnsMotion, Model
 from nerfloom.ray_model import RayModel
-from nerfloom.registry import load_method
+from nerfloom.renderable import HasAppearance, RefinesPoses, RendersFromImages, parts
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -37,13 +38,13 @@ from nerfloom.training.ray_starts import nearest_shown, starts_checked
 from nerfloom.training.speed import with_speed
 
 
-def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
+def decided(method: Method, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
     """Decide the settings that a method leaves to the data, and the box of a scene that moves.
 
     A method that learns motion and samples with an occupancy grid gets the smallest box that the silhouettes allow.
 
     Args:
-        method: the method's name.
+        method: the method.
         config: the run's settings.
         dataset: the training images.
 
@@ -53,10 +54,9 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
     Raises:
         ConfigError: if the method cannot draw the images' cameras.
     """
-    declared = load_method(method)
-    _check_cameras(method, declared.model.cameras, dataset)
+    _check_cameras(method.name, method.model.cameras, dataset)
     config, measured = with_speed(config)
-    settings, made = declared.decided(config, dataset.scene)
+    settings, made = method.decided(config, dataset.scene)
     made = measured + made
     settings, made = starts_checked(config, settings, made, dataset)
     times = dataset.times
@@ -77,9 +77,9 @@ def decided(method: str, config: TrainConfig, dataset: Dataset) -> tuple[Dataset
         box = moving_box(silhouettes, old, times, dataset.travel)
         share = float(((box[1] - box[0]) / (old[1] - old[0])).prod())
         shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
-        config = _with_steps_as_long(config, declared.config, settings, shorter)
+        config = _with_steps_as_long(config, method.config, settings, shorter)
         dataset = replace(dataset, scene=replace(dataset.scene, box=box.to(dataset.device)))
-        settings, made = declared.decided(config, dataset.scene)
+        settings, made = method.decided(config, dataset.scene)
         made = measured + made
         found.append(Decision("box", f"{100 * share:.0f}% of the data's", "alpha shows that nothing is ever outside"))
     return dataset, settings, [*found, *made]

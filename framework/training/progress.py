@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.progress import BarColumn, Progress, TextColumn
@@ -15,6 +16,9 @@ from torch import Tensor
 
 from nerfloom.base.console import SECONDS_BETWEEN_LINES, console, say
 from nerfloom.base.meter import UNKNOWN, left_text, time_text
+
+if TYPE_CHECKING:
+    from nerfloom.training.state import State
 
 SECONDS_BETWEEN_STATES = 0.1
 """Seconds between changes of the progress bar, which shows losses: reading them means to wait for a GPU."""
@@ -113,16 +117,38 @@ class ProgressBar:
             say(f"{report.seconds:5.0f} s  {share_and_time(self._first, report)}  {report.line()}")
 
 
+class Rate:
+    """Rays per second from one wait for the device to the next: a step that does not wait seems to be short."""
+
+    def __init__(self) -> None:
+        self.per_second = 0.0
+        self._rays, self._seconds = 0, 0.0
+
+    def count(self, rays: int, seconds: float, waited: bool) -> None:
+        """Count a step.
+
+        Args:
+            rays: number of its rays.
+            seconds: time that it took.
+            waited: whether it has waited for the device.
+        """
+        self._rays += rays
+        self._seconds += seconds
+        if waited or self.per_second == 0:
+            self.per_second = self._rays / self._seconds
+        if waited:
+            self._rays, self._seconds = 0, 0.0
+
+
 class TensorBoard:
     """A writer of curves and images for TensorBoard.
 
     Args:
-        folder: folder of the event files.
-        enabled: whether anything is written.
+        folder: folder of the event files; None to write nothing.
     """
 
-    def __init__(self, folder: Path, enabled: bool) -> None:
-        self._folder, self._enabled = folder, enabled
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
 
     @cached_property
     def _writer(self) -> Any:
@@ -132,9 +158,27 @@ class TensorBoard:
 
     def scalars(self, values: dict[str, float], step: int) -> None:
         """Write `values` by name, for a training `step`."""
-        if self._enabled:
+        if self._folder is not None:
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
+
+    def step(self, report: StepReport, state: State, groups: Sequence[Mapping[str, Any]]) -> None:
+        """Write what is known after a training step.
+
+        Args:
+            report: its report.
+            state: the state of the run.
+            groups: parameter groups of the optimiser, with their learning rates.
+        """
+        values = {
+            **{f"train/loss/{name}": value for name, value in report.losses.items()},
+            "train/psnr": report.psnr,
+            "train/rays_per_second": report.rays_per_second,
+            "train/samples_per_ray": state.samples_per_ray,
+            "train/skipped_steps": float(state.skipped),
+        }
+        rates = {f"learning_rate/{group.get('name', index)}": group["lr"] for index, group in enumerate(groups)}
+        self.scalars(values | rates, report.step)
 
     def image(self, name: str, image: Tensor, step: int) -> None:
         """Write an image.
@@ -144,7 +188,7 @@ class TensorBoard:
             image: (H, W, 3) colours in [0, 1].
             step: number of training steps done.
         """
-        if self._enabled:
+        if self._folder is not None:
             self._writer.add_image(name, image.clamp(0, 1), step, dataformats="HWC")
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ SUMMARY = "summary.json"
 """Name of the summary in a run's folder."""
 
 
-def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, device: torch.device) -> None:
+def write_evaluation(path: Path, run: Run, checkpoint: Path | None, found: Evaluation, device: torch.device) -> None:
     """Write the metrics of an evaluation as JSON: nerfstudio's keys, and the metrics of each image.
 
     Metrics that are not finite are null, and so are the means over them.
@@ -27,7 +27,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, 
     Args:
         path: file to write; its folder is created if missing.
         run: the evaluated run.
-        checkpoint: the evaluated checkpoint, of which the name is written.
+        checkpoint: the evaluated checkpoint, of which the name is written; None if there is no file of it.
         found: the metrics.
         device: device of the evaluation.
 
@@ -37,7 +37,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, 
     content = {
         "experiment_name": run.folder.parent.parent.name,
         "method_name": run.method,
-        "checkpoint": checkpoint.name,
+        "checkpoint": None if checkpoint is None else checkpoint.name,
         "kernels": kernels(device),
         "rays_per_pixel": getattr(run.config, "rays_per_pixel", 1),
         "eval_appearance": found.eval_appearance,
@@ -53,18 +53,19 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path, found: Evaluation, 
         raise ConfigError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def write_summary(trainer: Trainer, outcome: Outcome) -> None:
+def write_summary(path: Path, trainer: Trainer, outcome: Outcome) -> None:
     """Write summary.json: steps, seconds and memory of training, and the machine.
 
     Args:
+        path: file to write.
         trainer: the trainer, after training.
         outcome: reason for which training ended.
     """
     state = trainer.state
     write_report(
-        trainer.run.folder / SUMMARY,
+        path,
         {
-            "method": trainer.run.method,
+            "method": trainer.method.name,
             "stopped": outcome.reason,
             "interrupted": outcome.interrupted,
             "steps": state.step,

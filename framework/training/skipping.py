@@ -14,8 +14,9 @@ from nerfloom.base.device import wait_for
 from nerfloom.data.pixels.batch import draw_batch
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.occupancy import own_cells
-from nerfloom.model import evaluating, parts
+from nerfloom.model import evaluating
 from nerfloom.ray_model import RayModel
+from nerfloom.renderable import parts
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.splats.capacity import Room as SplatRoom

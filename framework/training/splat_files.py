@@ -1,14 +1,14 @@
-"""Files of Gaussians, loaded like runs: drawn by gaussian-splatting in the scene that the data format makes."""
+"""Files of Gaussians, opened as runs are: with their photographs, or alone."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
-from nerfloom.base.config import RaysPerPixel, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
@@ -18,85 +18,71 @@ from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.local_origin import local_origin, rounding
-from nerfloom.registry import load_dataparser, load_method
-from nerfloom.splats.files import is_splat_file, read_gaussians
-from nerfloom.splats.gaussians import Gaussians, TakesGaussians
+from nerfloom.registry import load_dataparser
+from nerfloom.splats.alone import Axis, placed_alone
+from nerfloom.splats.drawn import DrawnGaussians
+from nerfloom.splats.files import read_gaussians
+from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.training.data_folder import find_data
+from nerfloom.training.loaded import Loaded
 from nerfloom.training.run import Run
-from nerfloom.training.trained import Trained, build_model, load_trained
 
 METHOD = "gaussian-splatting"
-"""Method that draws the Gaussians of a file."""
+"""Method whose results such files hold, whichever program has written them."""
 LOOKED_AT = 4
 """Number of images that are decoded to know whether images have alpha, and how large they are."""
 DataFormat = tuple[str, DataParser]
 """Name of a data format, and its flags."""
 
 
-def load_run_or_splats(
-    path: Path,
-    checkpoint: Path | None = None,
-    device_type: Any = "auto",
-    data: Path | None = None,
-    rays_per_pixel: RaysPerPixel | None = None,
-    eval_appearance: Literal["mean", "half"] | None = None,
-    data_format: DataFormat | None = None,
-) -> Trained:
-    """Load a run with its trained model, or a file of Gaussians as one.
+def load_splats(
+    file: Path, data: Path | None, data_format: DataFormat | None, device_type: Any, up: Axis | None = None
+) -> Loaded:
+    """Load a file of Gaussians, in the scene that its data make; without data, in one that it makes itself.
 
     Args:
-        path: the run's config.yml, its folder, or a file of Gaussians (.ply, .spz, .splat) in the frame of the input.
-        checkpoint: as for `load_trained`; a file of Gaussians has none.
+        file: the file, in the frame of the input, or about a local origin that an offset beside it names.
+        data: folder of the photographs; None for none.
+        data_format: format of the data, and its flags; recognised if None.
         device_type: auto, cpu, cuda or mps.
-        data: folder of the data; that of the run if None.
-        rays_per_pixel: as for `load_trained`; of no use for Gaussians.
-        eval_appearance: as for `load_trained`; of no use for Gaussians.
-        data_format: format of the data of a file of Gaussians; recognised if None.
+        up: upward direction in the frame of the file, for a file without data; z if None.
 
     Raises:
-        ConfigError: if settings are missing or do not fit.
-        CheckpointError: if there is no readable checkpoint.
+        ConfigError: if the data do not fit.
         DataError: if the file or the data cannot be read.
     """
-    if not is_splat_file(path):
-        if data_format is not None:
-            raise ConfigError(f"'{data_format[0]}': the run knows its data format; leave it out, with its flags")
-        return load_trained(path, checkpoint, device_type, data, rays_per_pixel, eval_appearance)
-    useless = {"load-checkpoint": checkpoint, "rays-per-pixel": rays_per_pixel, "eval-appearance": eval_appearance}
-    for flag, value in useless.items():
-        if value is not None:
-            raise ConfigError(f"--{flag} is of no use with a file of Gaussians: leave it out")
-    return _load_splats(path, data, data_format, device_type)
-
-
-def _load_splats(file: Path, data: Path | None, data_format: DataFormat | None, device_type: Any) -> Trained:
-    """Return a run whose model draws the Gaussians of a file."""
     gaussians, look = read_gaussians(file)
     say(f"{file}: {look.words()}")
+    machine, offset = MachineConfig(device_type=device_type), read_offset(file)
     if data is None and data_format is None:
-        raise ConfigError(f"{file} is no run, and does not know its photographs: --data DIR")
+        source, (about, scene) = None, placed_alone(gaussians, up or "z")
+        if up is None:
+            say("without photographs, z is taken to point up (else: --up=-y, as in many captures, or --data DIR)")
+        placed = transformed(gaussians, *about.similarity())
+        placement = about.about(-offset)
+    elif up is not None:
+        raise ConfigError("--up is for files of Gaussians alone: the data know which way is up; leave it out")
+    else:
+        source = _source(file, data, data_format, machine)
+        parsed = source.parse("train")
+        scene, placement = _scene(parsed, source.config), parsed.placement
+        if scene.warped:
+            raise ConfigError(
+                f"{file}: normalised device coordinates (--ndc) have no place for Gaussians; leave out --ndc"
+            )
+        placed = transformed(gaussians, *placement.about(offset).similarity())
+        _check_place(file, gaussians, placed, parsed)
+    device = choose_device(machine)
+    model = DrawnGaussians(placed.map(lambda values: values.to(device)), look, scene.to(device))
+    return Loaded(model, placement, METHOD, file, file, source=source)
+
+
+def _source(file: Path, data: Path | None, data_format: DataFormat | None, machine: MachineConfig) -> Run:
+    """Return a run in name, which holds the data."""
     data, name = find_data(data, None if data_format is None else data_format[0])
     parser = load_dataparser(name)() if data_format is None else data_format[1]
-    method = load_method(METHOD)
-    settings: Any = method.config
-    machine = MachineConfig(device_type=device_type)
-    drawn = {"degree": gaussians.degree, **dataclasses.asdict(look)}
-    config: TrainConfig = dataclasses.replace(settings, data=data, machine=machine, vis="none", **drawn)
-    run, device = Run(METHOD, config, name, parser, file.parent), choose_device(machine)
-    parsed = run.parse("train")
-    scene = _scene(parsed, config)
-    if scene.warped:
-        raise ConfigError(f"{file}: normalised device coordinates (--ndc) have no place for Gaussians; leave out --ndc")
-    model = build_model(METHOD, config, scene)
-    if not isinstance(model, TakesGaussians):
-        raise ConfigError(f"the installed method {METHOD} cannot take the Gaussians of a file")
-    placement = parsed.placement
-    placed = transformed(gaussians, *placement.about(read_offset(file)).similarity())
-    _check_place(file, gaussians, placed, parsed)
-    model.set_gaussians(placed)
-    content = {"method": METHOD, "transform": placement.transform, "scale": placement.scale}
-    return Trained(run, model.to(device).eval(), file, content)
+    return Run(METHOD, TrainConfig(data=data, machine=machine, vis="none"), name, parser, file.parent)
 
 
 def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: ParsedScene) -> None:

@@ -6,7 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
+
 from nerfloom.base.processes import gathered, processes
+from nerfloom.evaluation.metrics import MAX_PSNR
 from nerfloom.training.curve import Entry
 
 FIRST_SAMPLES_PER_RAY = 256.0
@@ -47,6 +50,24 @@ class State:
         if newest is None or newest[1] <= first_step:
             return None
         return newest[2], self.seconds - newest[0]
+
+    @property
+    def train_psnr(self) -> float:
+        """PSNR of the batches, dB, by the running mean of their error."""
+        return min(-10 * float(torch.tensor(max(self.train_mse, 1e-12)).log10()), MAX_PSNR)
+
+    def account(self, rays: int, samples_per_ray: float, seconds: float) -> None:
+        """Count a training step.
+
+        Args:
+            rays: number of its rays, of all processes.
+            samples_per_ray: mean number of their samples; NaN if it is not known, or not yet.
+            seconds: time that it took.
+        """
+        self.step += 1
+        self.seconds += seconds
+        self.rays += rays
+        self.learn_samples_per_ray(samples_per_ray)
 
     def learn_samples_per_ray(self, found: float) -> None:
         """Take the samples per ray that a step has `found` into their mean; NaN if they are not known, or not yet."""

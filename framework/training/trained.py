@@ -3,43 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import AppearanceConfig, RayConfig, RaysPerPixel, TrainConfig
+from nerfloom.base.config import RaysPerPixel, TrainConfig
 from nerfloom.base.device import choose_device
-from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError, is_out_of_memory
+from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import Scene
-from nerfloom.model import Model, RendersFromImages
+from nerfloom.method import Method
+from nerfloom.model import Model
 from nerfloom.registry import load_method
+from nerfloom.renderable import RendersFromImages
 from nerfloom.training.checkpoint import FOLDER, find_newest, load_checkpoint
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
-from nerfloom.training.run import Run, read_run
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A run with its trained model."""
-
-    run: Run
-    """Method, settings, data and folder."""
-    model: Model[Any]
-    """Model in evaluation mode, on the device."""
-    checkpoint: Path
-    """File from which the parameters were read."""
-    content: dict[str, Any]
-    """Content of the checkpoint, with transform, scale and state."""
-
-    @property
-    def placement(self) -> Placement:
-        """Placement of the input in the run's scene."""
-        return Placement.of(self.content["transform"], self.content["scale"])
+from nerfloom.training.loaded import Loaded
+from nerfloom.training.run import read_run
 
 
 def load_trained(
@@ -49,7 +32,7 @@ def load_trained(
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
     eval_appearance: Literal["mean", "half"] | None = None,
-) -> Trained:
+) -> Loaded:
     """Load a run with its trained model.
 
     Args:
@@ -71,8 +54,7 @@ def load_trained(
         machine=machine,
         data=run.config.data if data is None else find_data(data, run.dataparser)[0],
     )
-    config = _changed(config, run.method, RayConfig, rays_per_pixel=rays_per_pixel)
-    config = _changed(config, run.method, AppearanceConfig, eval_appearance=eval_appearance)
+    config = _changed(config, run.method, rays_per_pixel=rays_per_pixel, eval_appearance=eval_appearance)
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
     if checkpoint is None:
@@ -82,52 +64,28 @@ def load_trained(
         path, content = newest
     else:
         path, content = checkpoint, load_checkpoint(checkpoint, device)
-    model = restored_model(run.method, config, content, device)
+    model = restored_model(load_method(run.method), config, content, device)
     if isinstance(model, RendersFromImages):
         model.show_images(load_split(run, "train").to(device))
-    return Trained(run, model, path, content)
+    placement, state = Placement.of(content["transform"], content["scale"]), content.get("state")
+    step = state.get("step") if isinstance(state, dict) else None
+    return Loaded(model, placement, run.method, run.folder, path, step if isinstance(step, int) else 0, run)
 
 
-def _changed(config: TrainConfig, method: str, kind: type[TrainConfig], **values: Any) -> TrainConfig:
+def _changed(config: TrainConfig, method: str, **values: Any) -> TrainConfig:
     """Return settings with the `values` that are not None; raise ConfigError if the method has no such settings."""
     given = {name: value for name, value in values.items() if value is not None}
-    if given and not isinstance(config, kind):
-        flag = next(iter(given)).replace("_", "-")
-        raise ConfigError(f"--{flag} is of no use with {method}: leave it out")
+    for name in given:
+        if not hasattr(config, name):
+            raise ConfigError(f"--{name.replace('_', '-')} has no effect with {method}: leave it out")
     return dataclasses.replace(config, **given)
 
 
-def build_model(method: str, config: TrainConfig, scene: Scene) -> Model[Any]:
-    """Return a method's model with fresh parameters.
-
-    Args:
-        method: the method's name.
-        config: the run's settings.
-        scene: properties of the data.
-
-    Raises:
-        ConfigError: if the model needs more memory than the machine has, or the data shows several scenes, and the
-            method learns one.
-    """
-    declared = load_method(method)
-    if scene.num_scenes > 1 and not issubclass(declared.model, RendersFromImages):
-        raise ConfigError(
-            f"the data shows {scene.num_scenes} scenes, and {method} learns one: choose a method that learns from "
-            "many, such as pixel-nerf, or data of one scene"
-        )
-    try:
-        return declared.build(config, scene)
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        raise ConfigError(f"the settings make a model of {method} that this machine has no memory for") from error
-
-
-def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:
+def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:
     """Return the model of a checkpoint, in evaluation mode.
 
     Args:
-        method: the method's name.
+        method: the method.
         config: the run's settings.
         checkpoint: content of the checkpoint, with the scene for which the model is built.
         device: device of the model.
@@ -141,12 +99,12 @@ def restored_model(method: str, config: TrainConfig, checkpoint: dict[str, Any],
     except ValueError as error:
         raise CheckpointError(f"the checkpoint lacks the scene: {error}") from error
     try:
-        model = build_model(method, config, scene).to(device).eval()
+        model = method.build(config, scene).to(device).eval()
     except NerfloomError:
         raise
     except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         raise CheckpointError(f"the settings make no model: {_short(error)}") from error
-    restore_model(model, checkpoint, method)
+    restore_model(model, checkpoint, method.name)
     return model
 
 

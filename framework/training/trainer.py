@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,10 @@ from nerfloom.base.pace import Pace
 from nerfloom.base.processes import alone, from_first, processes
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
-from nerfloom.evaluation.metrics import MAX_PSNR
 from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.method import Method
 from nerfloom.model import KeepsPace, StartsFromImages
+from nerfloom.registry import load_method
 from nerfloom.scene.profile import SceneProfile
 from nerfloom.training.batch_size import BatchSize
 from nerfloom.training.budget import reason_to_stop, spent
@@ -35,12 +35,12 @@ from nerfloom.training.held_out import HeldOut
 from nerfloom.training.optim import first_non_finite, make_optimizer
 from nerfloom.training.outcome import Outcome
 from nerfloom.training.preparation import decided, profile_of, show_images, skip_empty
-from nerfloom.training.progress import ProgressBar, StepReport, TensorBoard
+from nerfloom.training.progress import ProgressBar, Rate, StepReport, TensorBoard
 from nerfloom.training.run import Run
 from nerfloom.training.signals import stop_signals
 from nerfloom.training.state import State, agree
 from nerfloom.training.step import StepResult, learn, schedule, train_step
-from nerfloom.training.trained import build_model, restore_model
+from nerfloom.training.trained import restore_model
 
 STEPS_PER_LOG = 25
 """Steps between points of TensorBoard's curves, and between readings of errors from a device."""
@@ -53,29 +53,37 @@ BetweenSteps = Callable[[StepReport, Sequence[int]], None]
 
 
 class Trainer:
-    """Trainer of one run.
+    """Trainer of a method on a data set.
 
     Of several processes, each has a trainer. Only that of the first evaluates and writes.
 
     Args:
-        run: method, settings and folder.
+        method: the method.
+        config: its settings; those that are still open are decided by the data.
         train_set: training images, on the device.
         eval_set: images of the periodic evaluation; None for no evaluation.
+        folder: folder of checkpoints, learning curve and TensorBoard's files; None to write nothing.
         source: source of the batches; chosen by the model and the settings if None.
     """
 
     def __init__(
-        self, run: Run, train_set: Dataset, eval_set: Dataset | None, source: BatchSource | None = None
+        self,
+        method: Method,
+        config: TrainConfig,
+        train_set: Dataset,
+        eval_set: Dataset | None = None,
+        folder: Path | None = None,
+        source: BatchSource | None = None,
     ) -> None:
+        self.method, self.folder = method, folder
         self.config: TrainConfig
         start = time.perf_counter()
-        train_set, self.config, self.decisions = decided(run.method, run.config, train_set)
+        train_set, self.config, self.decisions = decided(method, config, train_set)
         self._deciding = time.perf_counter() - start  # which counts as training
-        self.run = replace(run, config=self.config)
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device
         torch.manual_seed(self.config.machine.seed)
-        self.model = build_model(run.method, self.config, train_set.scene).to(self.device)
+        self.model = method.build(self.config, train_set.scene).to(self.device)
         show_images(self.model, train_set, eval_set)
         self.optimizer = make_optimizer(self.model, self.config)
         self.source = make_source(self.model.batches, train_set, self.config) if source is None else source
@@ -84,38 +92,49 @@ class Trainer:
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
         """Steps after which the errors of batches are read from the device, which is waited for."""
         self._unread: list[Tensor] = []
-        self._unread_rays, self._unread_seconds, self._rays_per_second = 0, 0.0, 0.0
+        self._rate = Rate()
         mode = self.config.machine.cuda_graphs
         self.graphs = make_graphs(mode, self.device, self._learnt, lambda taken: taken[1].loss.total)
-        self.held_out = HeldOut(self.run, self.model, eval_set)
+        self.held_out = HeldOut(self.config, self.model, eval_set, folder)
         self.batch_size: BatchSize | None = None
         if isinstance(self.config, RayConfig):
             self.batch_size = BatchSize(self.config, recorded=self.graphs is not None)
-        self._bad_in_a_row = 0
-        self._prepared = False
+        self._bad_in_a_row, self._prepared = 0, False
         self._saved_step: int | None = None
         self._last_save = 0.0
+
+    @classmethod
+    def of(cls, run: Run, train_set: Dataset, eval_set: Dataset | None = None) -> Trainer:
+        """Return the trainer of a run, which writes into its folder.
+
+        Args:
+            run: method, settings and folder.
+            train_set, eval_set: its images.
+        """
+        return cls(load_method(run.method), run.config, train_set, eval_set, run.folder)
 
     # -- checkpoints ------------------------------------------------------------------------------------------
 
     @property
-    def checkpoint_folder(self) -> Path:
-        """Folder of the run's checkpoints."""
-        return self.run.folder / FOLDER
+    def checkpoint_folder(self) -> Path | None:
+        """Folder of the checkpoints; None if nothing is written."""
+        return None if self.folder is None else self.folder / FOLDER
 
-    def save(self) -> Path:
-        """Write a checkpoint, from which training continues with the same bits, and return its path."""
+    def save(self) -> Path | None:
+        """Write a checkpoint, from which training continues with the same bits, and return its path, if any."""
         self._read_errors(self.state.step)
         self._last_save = self.state.seconds
-        step, keep_all = self.state.step, not self.config.save_only_latest_checkpoint
-        path = save_checkpoint(self.checkpoint_folder, step, self._content(), keep_all, before=self._saved_step)
+        step, keep_all, folder = self.state.step, not self.config.save_only_latest_checkpoint, self.checkpoint_folder
+        if folder is None:
+            return None
+        path = save_checkpoint(folder, step, self._content(), keep_all, before=self._saved_step)
         self._saved_step = step
         return path
 
     def _content(self) -> dict[str, Any]:
         """Return the content of a checkpoint."""
         return {
-            "method": self.run.method,
+            "method": self.method.name,
             "config": to_plain(self.config),
             "scene": vars(self.model.scene.to("cpu")),
             "transform": self.train_set.transform.tolist(),  # float64, which not every device has
@@ -139,7 +158,7 @@ class Trainer:
         Raises:
             CheckpointError: if it is of another method, or its parameters have other sizes.
         """
-        restore_model(self.model, checkpoint, self.run.method)
+        restore_model(self.model, checkpoint, self.method.name)
         try:
             rates = [group["initial_lr"] for group in self.optimizer.param_groups]
             self.optimizer.load_state_dict(checkpoint["optimizer"])
@@ -157,11 +176,7 @@ class Trainer:
         self.held_out.resume(self.state)
 
     def restore_as_configured(self) -> None:
-        """Restore the checkpoint of --load-checkpoint or --load-dir, if given.
-
-        Raises:
-            CheckpointError: if there is no such checkpoint, or it does not fit.
-        """
+        """Restore the checkpoint of --load-checkpoint or --load-dir, if given; CheckpointError if it is impossible."""
         if self.config.load_checkpoint is not None:
             self.restore(load_checkpoint(self.config.load_checkpoint, self.device))
         elif self.config.load_dir is not None:
@@ -188,13 +203,14 @@ class Trainer:
         first = processes().first
         with (
             stop_signals() as received,
-            closing(TensorBoard(self.run.folder, first and "tensorboard" in self.config.vis)) as board,
-            ProgressBar(self.run.method) as bar,
+            closing(TensorBoard(self.folder if first and "tensorboard" in self.config.vis else None)) as board,
+            ProgressBar(self.method.name) as bar,
         ):
             while (reason := reason_to_stop(self.config, self.state, stopped := agree(self.state, received))) is None:
                 report = self.train_step()
                 bar.show(report)
-                self._log(report, board)
+                if report.step % STEPS_PER_LOG == 0:
+                    board.step(report, self.state, self.optimizer.param_groups)
                 self.held_out.evaluate_if_due(
                     self.state, board
                 )  # before saving, so that a resumed run does not repeat it
@@ -207,7 +223,17 @@ class Trainer:
             if first:
                 self.held_out.write_curve(self.state)
                 self.save()  # a first Ctrl-C does not interrupt it
-        return Outcome(reason, next(iter(stopped), None), checkpoint_path(self.checkpoint_folder, self.state.step))
+        saved = None if self.checkpoint_folder is None else checkpoint_path(self.checkpoint_folder, self.state.step)
+        return Outcome(reason, next(iter(stopped), None), saved)
+
+    def steps(self) -> Iterator[StepReport]:
+        """Take training steps until the budget is spent, and yield the report of each: a training within another task.
+
+        Unlike `train` it evaluates and saves nothing, and catches no signal. It raises what `train_step` raises.
+        """
+        self.prepare()
+        while reason_to_stop(self.config, self.state, ()) is None:
+            yield self.train_step()
 
     @property
     def progress(self) -> float:
@@ -217,27 +243,30 @@ class Trainer:
     @cached_property
     def profile(self) -> SceneProfile:
         """The scene's profile, with the settings chosen by it; computed once, as it looks at every image."""
-        return profile_of(self.run.method, self.config, self.model, self.train_set, self.decisions)
+        return profile_of(self.method.name, self.config, self.model, self.train_set, self.decisions)
 
-    def prepare(self) -> None:
+    def prepare(self, start: bool = True) -> None:
         """Mark space as empty by what the images show, and start from the images, once, before the first step.
 
         Its time counts as training time.
+
+        Args:
+            start: whether the model may start from the images; False if its parameters are set by others.
         """
         if self._prepared:
             return
         self._prepared = True
         self._join_first()
-        start, fresh = time.perf_counter(), self.state.step == 0
+        begun, fresh = time.perf_counter(), self.state.step == 0
         self.train_set = skip_empty(self.config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)
-        if fresh and isinstance(self.model, StartsFromImages):
+        if fresh and start and isinstance(self.model, StartsFromImages):
             seed_step(self.config.machine.seed, -1)  # before all steps, whatever was drawn since the model was made
             if processes().first:
                 with alone():
                     self.model.start(self.train_set)
             self._join_first()
-        seconds = time.perf_counter() - start + self._deciding
+        seconds = time.perf_counter() - begun + self._deciding
         if fresh:
             self.state.seconds += seconds
         if seconds >= TOLD_SECONDS:
@@ -271,15 +300,16 @@ class Trainer:
         if early or done % self.steps_per_read == 0:
             self._read_errors(done)
         seconds = time.perf_counter() - start
-        self._account(num_rays, math.nan if isinstance(per_ray, Tensor) else per_ray, seconds)
-        self._count_rays(num_rays * processes().count, seconds)
+        rays = num_rays * processes().count
+        state.account(rays, math.nan if isinstance(per_ray, Tensor) else per_ray, seconds)
+        self._rate.count(rays, seconds, waited=not self._unread)
         return StepReport(
             step=state.step,
             seconds=state.seconds,
             progress=self.progress,
             terms={name: value.detach() for name, value in result.loss.terms.items()},
-            psnr=self._train_psnr(),
-            rays_per_second=self._rays_per_second,
+            psnr=self.state.train_psnr,
+            rays_per_second=self._rate.per_second,
             held_out=state.newest_held_out(self.first_step),
         )
 
@@ -330,27 +360,12 @@ class Trainer:
         self._bad_in_a_row = 0 if finite else self._bad_in_a_row + 1
         self.state.skipped += not finite
         if self._bad_in_a_row >= MAX_BAD_STEPS:
+            saved = f"; the last good checkpoint is in {self.checkpoint_folder}" if self.folder else ""
             culprit = first_non_finite(self.model, self.optimizer) or "the loss"
             raise DivergenceError(
-                f"step {step}: {MAX_BAD_STEPS} steps in a row were not finite, first in {culprit}; "
-                f"the last good checkpoint is in {self.checkpoint_folder}. Lower --learning-rate, or check the data"
+                f"step {step}: {MAX_BAD_STEPS} steps in a row were not finite, first in {culprit}"
+                f"{saved}. Lower --learning-rate, or check the data"
             )
-
-    def _account(self, num_rays: int, samples_per_ray: float, seconds: float) -> None:
-        state = self.state
-        state.step += 1
-        state.seconds += seconds
-        state.rays += num_rays * processes().count
-        state.learn_samples_per_ray(samples_per_ray)
-
-    def _count_rays(self, num_rays: int, seconds: float) -> None:
-        """Measure the rate from one read to the next: a step that does not wait for the device seems to be short."""
-        self._unread_rays += num_rays
-        self._unread_seconds += seconds
-        if not self._unread or self._rays_per_second == 0:
-            self._rays_per_second = self._unread_rays / self._unread_seconds
-        if not self._unread:
-            self._unread_rays, self._unread_seconds = 0, 0.0
 
     def _read_errors(self, done: int) -> None:
         """Read of the last of `done` steps what was left on the device: errors, and whether they were finite."""
@@ -365,23 +380,7 @@ class Trainer:
                 self.optimizer.zero_grad()  # so that the loss is found to be the first that is bad
             self._count_bad(step - 1, bool(finite))
 
-    def _train_psnr(self) -> float:
-        return min(-10 * float(torch.tensor(max(self.state.train_mse, 1e-12)).log10()), MAX_PSNR)
-
     # -- reports and checkpoints between steps ----------------------------------------------------------------
-
-    def _log(self, report: StepReport, board: TensorBoard) -> None:
-        if report.step % STEPS_PER_LOG == 0:
-            values = {
-                **{f"train/loss/{name}": value for name, value in report.losses.items()},
-                "train/psnr": report.psnr,
-                "train/rays_per_second": report.rays_per_second,
-                "train/samples_per_ray": self.state.samples_per_ray,
-                "train/skipped_steps": float(self.state.skipped),
-            }
-            for index, group in enumerate(self.optimizer.param_groups):
-                values[f"learning_rate/{group.get('name', index)}"] = group["lr"]
-            board.scalars(values, report.step)
 
     def _due_to_save(self) -> bool:
         aged = self.state.seconds - self._last_save >= self.config.seconds_per_save

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,8 +11,7 @@ from nerfloom.cameras.cameras import CENTER, Cameras
 from nerfloom.cameras.view import View
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.rays import Rays
-from nerfloom.model import Model
-from nerfloom.ray_model import RayModel
+from nerfloom.renderable import Renderable, RendersRays
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import RendersGaussians
 from nerfloom.viewer.request import Crop
@@ -81,7 +79,7 @@ def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor
     )
 
 
-def picture_within(model: Model[Any], view: View, crop: Crop, background: Tensor) -> Picture:
+def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor) -> Picture:
     """Return a picture (H, W) of what lies within a crop, as `meaning` says for the kind of model.
 
     Args:
@@ -95,13 +93,13 @@ def picture_within(model: Model[Any], view: View, crop: Crop, background: Tensor
         found = model.gaussians()
         return model.render_gaussians(found[within(found.means, camera, crop)], view, background)
     rays = camera.pixel_rays(camera.image_pixels(0), model.scene.near, model.scene.far)
-    if not isinstance(model, RayModel):
+    if not isinstance(model, RendersRays):
         return without_outside(model.render_view(view, background), rays, crop, background, by_depth=True)
     picture = model.render_view(replace(view, camera=CroppedCameras.of(camera, crop)), background)
     return without_outside(picture, rays, crop, background, by_depth=False)
 
 
-def meaning(model: Model[Any]) -> str:
+def meaning(model: Renderable) -> str:
     """Return what a crop does to pictures of a model, for people.
 
     Args:
@@ -109,7 +107,7 @@ def meaning(model: Model[Any]) -> str:
     """
     if isinstance(model, RendersGaussians):
         return BY_CENTERS
-    return BY_RAYS if isinstance(model, RayModel) else BY_DEPTH
+    return BY_RAYS if isinstance(model, RendersRays) else BY_DEPTH
 
 
 def within(points: Tensor, camera: Cameras, crop: Crop) -> Tensor:

@@ -11,12 +11,12 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import NerfloomError
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.evaluation.outputs import Arrays
-from nerfloom.ray_model import RayModel
+from nerfloom.renderable import RendersRays
+from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.drawing import Truth, draw
 from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
 from nerfloom.viewer.request import Request, smaller
-from nerfloom.viewer.viewed import Subject
 
 REST = 0.15
 """Seconds without a new request after which a picture is refined."""
@@ -41,7 +41,7 @@ class Studio:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: Loaded,
         coarse_seconds: float = 0.1,
         piece_seconds: float = 0.1,
         ndc: Ndc | None = None,
@@ -136,7 +136,7 @@ class Studio:
 
     @property
     def _piece_seconds(self) -> float:
-        return self.piece_seconds if isinstance(self.subject.model, RayModel) else WHOLE
+        return self.piece_seconds if isinstance(self.subject.model, RendersRays) else WHOLE
 
     @property
     def _rays(self) -> Rays:

@@ -13,7 +13,6 @@ from nerfloom.base.device import wait_for
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.appearance import appearance_of, shown_appearance
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.evaluation.outputs import (
     ERROR,
     Arrays,
@@ -25,10 +24,10 @@ from nerfloom.evaluation.outputs import (
 )
 from nerfloom.rendering.outputs import FIXED, MEDIAN_DEPTH, RGB
 from nerfloom.rendering.rendered import Picture
+from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.crop import picture_within
 from nerfloom.viewer.pace import Piece
 from nerfloom.viewer.request import Request
-from nerfloom.viewer.viewed import Subject
 
 DEPTH, FLAWS = "depth", "error"
 """Outputs with a meaning of their own here: the median depth, and the difference from a photograph."""
@@ -36,7 +35,7 @@ Truth = Callable[[View, Tensor, Tensor], "Tensor | None"]
 """Function from a view, its picture (H, W, 3) and the background (3,) to the true image; None where it is unknown."""
 
 
-def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None) -> Arrays:
+def draw(subject: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None) -> Arrays:
     """Return what is kept of a piece of a view for the output that is asked for.
 
     Args:
@@ -50,7 +49,7 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
     camera = request.camera(piece.stride, (piece.top, piece.bottom), ndc).to(model.device)
     crop = request.crop if ndc is None else None
     view = View(camera, request.time if model.scene.moving else None, piece.rays)
-    background = evaluation_background(model)
+    background = model.background
     if request.background is not None:
         background = background.new_tensor(request.background)
     with _appearance(subject, request.appearance), torch.no_grad():
@@ -67,7 +66,7 @@ def draw(subject: Subject, request: Request, piece: Piece, ndc: Ndc | None, trut
 
 
 def _kept(
-    subject: Subject, request: Request, view: View, picture: Picture, background: Tensor, truth: Truth | None
+    subject: Loaded, request: Request, view: View, picture: Picture, background: Tensor, truth: Truth | None
 ) -> Arrays:
     if request.output == FLAWS:
         found = None if truth is None else truth(view, picture.rgb, background)
@@ -76,7 +75,7 @@ def _kept(
     return kept_outputs(picture, [known.get(request.output, RGB)], subject.unit)
 
 
-def _appearance(subject: Subject, image: int | None) -> AbstractContextManager[None]:
+def _appearance(subject: Loaded, image: int | None) -> AbstractContextManager[None]:
     appearance = appearance_of(subject.model)
     if appearance is None or image is None or not 0 <= image < len(appearance.vectors):
         return nullcontext()

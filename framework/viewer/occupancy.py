@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nerfloom.model import Model, parts
+from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import SkipsCells
 
 MOST_CELLS = 40_000
 """Maximum number of cells that are shown."""
 
 
-def shown_cells(model: Model, most: int = MOST_CELLS) -> tuple[Tensor, float] | None:
+def shown_cells(model: Renderable, most: int = MOST_CELLS) -> tuple[Tensor, float] | None:
     """Return the centres (N, 3) of occupied cells that have an empty neighbour, and the mean edge of a cell.
 
     What is inside would not be seen. Of nested boxes, the cells of the smallest are shown. Of more than `most` cells,

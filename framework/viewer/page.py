@@ -62,8 +62,9 @@ class Page:
         parts: list[Any] = []
         self._panels[number] = parts
         if not studio.subject.model.scene.warped:
-            with tabs.add_tab("Photographs"):
-                parts.append(CameraPanel(client, self._photographs))
+            if studio.subject.source is not None:
+                with tabs.add_tab("Photographs"):
+                    parts.append(CameraPanel(client, self._photographs))
             with tabs.add_tab("Path"):
                 parts.append(PathPanel(client, lambda: studio.subject, panel.request, self._renders))
         if number not in self._server.get_clients():  # it has left before it was welcomed
@@ -77,10 +78,11 @@ class Page:
     def refresh(self) -> None:
         """Show the run's step, PSNR and learning curve as they are now."""
         subject = self._studio.subject
-        content = heading(subject.run, subject.step)
+        content = heading(subject)
         if content != self._heading.content:
             self._heading.content = content
-        self.show_curve(*curve(subject.run.folder))
+        if subject.is_run:
+            self.show_curve(*curve(subject.folder))
 
     def show_curve(self, seconds: list[float], psnr: list[float]) -> None:
         """Show a learning curve.

@@ -44,7 +44,8 @@ class Panel:
         self._client, self._studio = client, studio
         scene = studio.subject.model.scene
         declared = [output.name for output in studio.subject.model.outputs]
-        self._outputs = [*OUTPUTS[:-1], *declared, *(() if scene.warped else OUTPUTS[-1:])]
+        has_photographs = studio.subject.source is not None and not scene.warped
+        self._outputs = [*OUTPUTS[:-1], *declared, *(OUTPUTS[-1:] if has_photographs else ())]
         gui = client.gui
         self._output = gui.add_dropdown("Output", self._outputs, initial_value="rgb")
         self._size = gui.add_dropdown(

@@ -17,10 +17,10 @@ import numpy as np
 from nerfloom.base.child import python_command
 from nerfloom.base.console import say
 from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
+from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.camera_panel import move_camera
 from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
 from nerfloom.viewer.request import Request, number_in
-from nerfloom.viewer.viewed import Subject
 
 if TYPE_CHECKING:
     import viser
@@ -46,7 +46,7 @@ class PathPanel:
     def __init__(
         self,
         client: viser.ClientHandle,
-        subject: Callable[[], Subject],
+        subject: Callable[[], Loaded],
         request: Callable[[], Request | None],
         renders: list[subprocess.Popen[bytes]] | None,
     ) -> None:
@@ -162,8 +162,8 @@ class PathPanel:
     # -- files ------------------------------------------------------------------------------------------------
 
     def _save(self) -> Path | None:
-        """Write the path into the run's folder, and return the file; None if that was not possible."""
-        path, folder = self._path(), self._subject().run.folder
+        """Write the path beside what is looked at, and return the file; None if that was not possible."""
+        path, folder = self._path(), self._subject().folder
         if path is None:
             self._note.content = "A path needs two cameras."
             return None
@@ -173,7 +173,8 @@ class PathPanel:
         except OSError as error:
             self._note.content = f"Cannot write {file.name}: {error.strerror or error}"
             return None
-        command = f"ns-render camera-path {shlex.quote(str(folder))} --camera-path-filename {shlex.quote(str(file))}"
+        words = map(shlex.quote, (str(self._subject().origin), "--camera-path-filename", str(file)))
+        command = f"ns-render camera-path {' '.join(words)}"
         say(f"viewer: saved {file}; render it with: {command} --output-path {video_suffix(file.stem)}")
         self._note.content = f"Saved {file.name}, {len(path)} frames."
         return file
@@ -189,7 +190,7 @@ class PathPanel:
             return
         output = file.with_name(video_suffix(file.stem))
         words = ["--camera-path-filename", file, "--output-path", output]
-        command = python_command("nerfloom.cli.render", "camera-path", self._subject().run.folder, *words)
+        command = python_command("nerfloom.cli.render", "camera-path", self._subject().origin, *words)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         self._renders[:] = [process]
         self._note.content = f"Rendering {output.name} ..."

@@ -37,10 +37,10 @@ class Photographs:
     """Training images of a run, of which nothing is read before it is needed, and no file twice at a time.
 
     Args:
-        run: the run, with the folder and the format of its data.
+        run: the run, with the folder and the format of its data; None for none.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run | None) -> None:
         self._run = run
         self._lock = threading.RLock()
         self._whole = lru_cache(maxsize=1)(self._read)
@@ -55,7 +55,7 @@ class Photographs:
     @cached_property
     def _parsed(self) -> ParsedScene | None:
         try:
-            return self._run.parse("train")
+            return None if self._run is None else self._run.parse("train")
         except (NerfloomError, OSError) as error:
             say(f"the photographs are not shown: {error}")
             return None

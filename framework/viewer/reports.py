@@ -7,21 +7,22 @@ import math
 from pathlib import Path
 from typing import Any
 
-from nerfloom.training.run import Run
+from nerfloom.training.loaded import Loaded
 
 LARGEST_REPORT = 2**24
 """Maximum size of a report, bytes."""
 
 
-def heading(run: Run, step: int) -> str:
-    """Return a run's method, folder, step and PSNR, as Markdown.
+def heading(loaded: Loaded) -> str:
+    """Return the method, the folder or file, the step and the PSNR of what is looked at, as Markdown.
 
     Args:
-        run: the run.
-        step: number of training steps done.
+        loaded: what is looked at.
     """
-    lines = [f"**{_plain(run.method)}** · {_plain(run.folder.name)} · step {step:,}"]
-    content = _read(run.folder / "eval.json")
+    step = f" · step {loaded.step:,}" if loaded.is_run else ""
+    lines = [f"**{_plain(loaded.method)}** · {_plain(loaded.origin.name)}{step}"]
+    origin = loaded.origin
+    content = _read(origin / "eval.json" if loaded.is_run else origin.with_suffix(".eval.json"))
     results = content.get("results") if isinstance(content, dict) else None
     if isinstance(results, dict) and (psnr := _finite(results.get("psnr"))) is not None:
         images = results.get("num_images")

@@ -1,4 +1,4 @@
-"""A viewer of a run that is trained, or is being trained in another process: `ns-viewer`."""
+"""A viewer of what is trained, or is being trained in another process: `ns-viewer`."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from pathlib import Path
 
 from nerfloom.base.console import say
 from nerfloom.cameras.ndc import Ndc
-from nerfloom.training.trained import Trained
+from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.server import close_server, open_server
-from nerfloom.viewer.viewed import newer_checkpoint, of_trained, reloaded
+from nerfloom.viewer.viewed import newer_checkpoint, reloaded
 
 SECONDS_PER_LOOK = 2.0
 """Seconds between looks for a newer checkpoint."""
 
 
-def view_trained(trained: Trained, host: str, port: int, follow: bool) -> None:
-    """Serve a run to browsers until Ctrl-C.
+def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
+    """Serve a run or a file of Gaussians to browsers until Ctrl-C.
 
     Args:
-        trained: the run.
+        loaded: what is looked at.
         host: interface to listen on.
         port: port to listen on; the next free one if it is taken.
         follow: whether newer checkpoints of the run are shown as they are written.
@@ -32,12 +32,12 @@ def view_trained(trained: Trained, host: str, port: int, follow: bool) -> None:
         ConfigError: if viser is missing, or the address cannot be used.
         KeyboardInterrupt: on Ctrl-C, after the server has ended.
     """
-    subject, photographs = of_trained(trained), Photographs(trained.run)
-    studio = Studio(subject, ndc=_ndc(subject.model.scene.warped, photographs), truth=photographs.truth)
+    photographs = Photographs(loaded.source)
+    studio = Studio(loaded, ndc=_ndc(loaded.model.scene.warped, photographs), truth=photographs.truth)
     server = open_server(host, port, "nerfloom")
     page = Page(server, studio, photographs, may_render=follow)
     say("Ctrl-C ends it")
-    seen, looked = trained.checkpoint, time.monotonic()
+    seen, looked = loaded.checkpoint, time.monotonic()
     try:
         while True:
             if studio.work() is None:
@@ -52,7 +52,7 @@ def view_trained(trained: Trained, host: str, port: int, follow: bool) -> None:
 
 def _follow(studio: Studio, page: Page, seen: Path) -> Path:
     """Show the newest checkpoint, if it is new, and return the newest one that was seen."""
-    folder = studio.subject.run.folder
+    folder = studio.subject.folder
     newer = newer_checkpoint(folder, seen)
     if newer is None:
         page.refresh()

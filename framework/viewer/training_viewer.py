@@ -9,18 +9,21 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from nerfloom.cameras.ndc import NdcCameras
+from nerfloom.training.checkpoint import FOLDER
 from nerfloom.training.curve import in_order
+from nerfloom.training.loaded import Loaded
 from nerfloom.training.progress import StepReport
+from nerfloom.training.run import Run
 from nerfloom.training.trainer import BetweenSteps, Trainer
 from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.pace import Share
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.server import close_server, open_server
-from nerfloom.viewer.viewed import of_trainer
 
 if TYPE_CHECKING:
     import viser
@@ -60,7 +63,7 @@ class Turns:
             self._ended = start
             return
         self._share = self._share.earned(start - self._ended)
-        self._studio.subject = of_trainer(self._trainer)
+        self._studio.subject = replace(self._studio.subject, step=self._trainer.state.step)
         self._studio.hurried = True
         while self._share.credit > 0 and (seconds := self._studio.work()) is not None:
             self._share = self._share.spent(seconds)
@@ -105,7 +108,7 @@ class Status:
         self._told = now
         loss = sum(report.losses.values())
         self._text.content = (
-            f"**{self._trainer.run.method}** · step {report.step:,} · {report.seconds:.0f} s  \n"
+            f"**{self._trainer.method.name}** · step {report.step:,} · {report.seconds:.0f} s  \n"
             f"loss {loss:.5f} · PSNR of batches {report.psnr:.2f} dB  \n{report.held_out_text}"
         )
         state = self._trainer.state
@@ -113,11 +116,23 @@ class Status:
         self._page.show_curve([one.seconds for one in points], [one.psnr for one in points])
 
 
+def in_training(run: Run, trainer: Trainer) -> Loaded:
+    """Return a run in training, at its present step, as something to look at.
+
+    Args:
+        run: the run.
+        trainer: its trainer.
+    """
+    placement, checkpoints = trainer.train_set.placement, run.folder / FOLDER
+    return Loaded(trainer.model, placement, run.method, run.folder, checkpoints, trainer.state.step, run)
+
+
 @contextmanager
-def training_viewer(trainer: Trainer) -> Iterator[BetweenSteps]:
+def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     """Serve a run in training to browsers, within a `with` block.
 
     Args:
+        run: the run.
         trainer: the run's trainer.
 
     Yields:
@@ -127,9 +142,9 @@ def training_viewer(trainer: Trainer) -> Iterator[BetweenSteps]:
         ConfigError: if viser is missing, or the address cannot be used.
     """
     config, cameras = trainer.config, trainer.train_set.cameras
-    photographs = Photographs(trainer.run)
+    photographs = Photographs(run)
     ndc = cameras.ndc if isinstance(cameras, NdcCameras) else None
-    studio = Studio(of_trainer(trainer), PIECE, PIECE, ndc, photographs.truth)
+    studio = Studio(in_training(run, trainer), PIECE, PIECE, ndc, photographs.truth)
     turns = Turns(trainer, studio, config.viewer_share)
     server = open_server(config.viewer.websocket_host, config.viewer.websocket_port, "nerfloom")
     page = Page(server, studio, photographs, may_render=False)

@@ -24,7 +24,7 @@ def ball(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "run"
     trainer = tiny_trainer("instant-ngp", shared_tiny, folder, max_num_iterations=200)
     trainer.train()
-    return trainer.run.config_path
+    return trainer.folder / "config.yml"
 
 
 def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:

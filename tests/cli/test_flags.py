@@ -162,7 +162,7 @@ def test_help_is_no_error() -> None:
 def test_warnings_are_passed_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def cli(kind: type, **_: object) -> object:
         print("careful", file=sys.stderr)
-        return kind(Path("x"))
+        return kind(load_config=Path("x"))
 
     monkeypatch.setattr(tyro, "cli", cli)
     assert read_flags(ViewerFlags, "ns-viewer", []).load_config == Path("x")

@@ -22,7 +22,7 @@ def moving_run(tiny: Path, edit_json: EditJson, tmp_path: Path) -> Path:
     trainer = tiny_trainer("kplanes", tiny, tmp_path / "run", max_num_iterations=20)
     assert trainer.model.scene.moving
     trainer.train()
-    return trainer.run.config_path
+    return trainer.folder / "config.yml"
 
 
 def render(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
@@ -51,7 +51,7 @@ def test_a_circle_at_one_time(moving_run: Path, tmp_path: Path, monkeypatch: pyt
 def test_what_cannot_be_is_refused(moving_run: Path, shared_tiny: Path, tmp_path: Path, refused: Refused) -> None:
     still = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "still", max_num_iterations=1)
     still.train()
-    standing = ("--load-config", still.run.config_path)
+    standing = ("--load-config", still.folder / "config.yml")
     assert "have no times" in refused(main, "time", *standing)
     assert "have no times" in refused(main, "orbit", *standing, "--time", 0.5)
     assert "must be from 0 to 1" in refused(main, "orbit", "--load-config", moving_run, "--time", 2, status=2)

@@ -270,7 +270,7 @@ def test_a_camera_path_is_rendered_at_its_times_and_speed(
         "perspective", 48, 32, cameras, torch.full((3,), 53.13010235), 0.75, times=torch.tensor([0.5, 0.25, 1.0])
     )  # fmt: skip
     write_camera_path(tmp_path / "camera_path.json", path)
-    words = ("camera-path", trainer.run.folder, "--camera-path-filename", tmp_path / "camera_path.json")
+    words = ("camera-path", trainer.folder, "--camera-path-filename", tmp_path / "camera_path.json")
     done = called("ns-render", *words, "--output-path", tmp_path / "a.gif", "--downscale-factor", 2)
     assert done.returncode == 0, done.stderr
     assert [view.time for view in asked] == [0.5, 0.25, 1.0]

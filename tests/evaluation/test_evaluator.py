@@ -16,7 +16,7 @@ from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.data.sources import PixelSource, Request
 from nerfloom.evaluation import evaluator
-from nerfloom.evaluation.evaluator import Evaluation, evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import Evaluation, evaluate
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
@@ -162,7 +162,7 @@ def test_means_over_pixels_are_means() -> None:
 def test_pictures_are_over_what_training_was_over(asked: Any, alpha: bool, expected: float) -> None:
     model = disc(RayConfig(background=asked))
     model.scene = replace(model.scene, has_alpha=alpha)
-    assert evaluation_background(model).tolist() == [expected] * 3
+    assert model.background.tolist() == [expected] * 3
 
 
 def test_pictures_are_of_views_evenly_spaced_and_of_the_worst(shared_tiny: Path, tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ from nerfloom.processing.listing import find_images
 from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, Look
-from nerfloom.training.checkpoint import FOLDER, load_newest
+from nerfloom.training.checkpoint import FOLDER, load_checkpoint, load_newest
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder, read_run
 from nerfloom.training.trained import load_trained
@@ -272,7 +272,7 @@ def write_run(folder: Path) -> None:
     run = tiny_run("instant-ngp", data, folder / "run", **SMALL)
     create_folder(run)
     without_place(run.folder)
-    trainer = Trainer(run, load_split(run, "train"), None)
+    trainer = Trainer.of(run, load_split(run, "train"))
     trainer.config = replace(trainer.config, data=Path("photographs"))
     for _ in range(2):
         trainer.train_step()
@@ -317,7 +317,7 @@ def _photographs(folder: Path) -> tuple[Run, Dataset]:
 def restore(folder: Path, scratch: Path) -> None:
     """As ns-eval does, and as --resume does."""
     trained = load_trained(folder / "run" / "config.yml", device_type="cpu")
-    Trainer(*_photographs(scratch.parent / "photographs"), None).restore(trained.content)
+    Trainer.of(*_photographs(scratch.parent / "photographs")).restore(load_checkpoint(trained.checkpoint))
 
 
 def write_pixel_cache(folder: Path) -> None:

@@ -250,7 +250,7 @@ def captured(method: str, data: Path, folder: Path, **facts: object) -> Trainer:
     (folder / "run").mkdir()
     scene = dataclasses.replace(still.scene, unbounded=True, far=100.0, **facts)
     run = tiny_run(method, data, folder / "run", **settings, max_eval_images=0, samples_per_batch=2**14)
-    return Trainer(run, dataclasses.replace(still, scene=scene), None)
+    return Trainer.of(run, dataclasses.replace(still, scene=scene))
 
 
 @pytest.mark.medium

@@ -18,8 +18,8 @@ EXAMPLES = ("my-method", "voxels")
 """Methods that the documents let their readers write."""
 UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
 """Commands of others, and those that no parser here knows."""
-TAKE_RUNS = ("evaluate", "export", "render", "viewer")
-"""Commands that take a trained run, and look whether it is there."""
+TAKE_RUNS = ("run_flags",)
+"""What looks whether a trained run is there."""
 FORMATS = {"lego": "blender", "balls": "dnerf", "ring": "blender"}
 """Name of a folder in the documents -> its format; of any other, nerfstudio."""
 
@@ -64,8 +64,7 @@ class Checker:
             },
             "nerfloom.cli.session.start": begin,
             "nerfloom.cli.session.resume": begin,
-            "nerfloom.training.splat_files.load_run_or_splats": begin,
-            "nerfloom.training.trained.load_trained": begin,
+            "nerfloom.training.load.load": begin,
             "nerfloom.cli.process_data._process": begin,
             "nerfloom.cli.compare.compare": begin,
             "nerfloom.cli.stress.stress": stress,

@@ -565,9 +565,9 @@ UTM = torch.tensor([512345.678, 5403210.987, 432.1], dtype=torch.float64)
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, model: object, placement: Placement, method: str) -> None:
-    trained = SimpleNamespace(model=model, placement=placement, run=SimpleNamespace(method=method))
-    monkeypatch.setattr("nerfloom.cli.export.trained_run", lambda path, *_: path)
-    monkeypatch.setattr("nerfloom.training.trained.load_trained", lambda *_: trained)
+    loaded = SimpleNamespace(model=model, placement=placement, method=method)
+    monkeypatch.setattr("nerfloom.cli.run_flags.trained_run", lambda path, *_: path)
+    monkeypatch.setattr("nerfloom.training.load.load", lambda *_, **__: loaded)
 
 
 def exported(monkeypatch: pytest.MonkeyPatch, folder: Path, suffix: str, *flags: str) -> None:

@@ -10,8 +10,8 @@ from nerfloom.cameras.view import View
 from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.export.surfaces import found_surfaces
 from nerfloom.methods.gaussian_splatting import GaussianSplattingConfig, decide
+from nerfloom.registry import load_method
 from nerfloom.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
-from nerfloom.training.datasets import load_split
 from tests.splats.test_method import SCENE, ball, camera
 from tests.splats.test_what_images_differ_in import model_of
 from tests.training.helpers import tiny_trainer
@@ -66,8 +66,8 @@ def test_a_checkpoint_has_as_many_as_it_has() -> None:
 
 def test_what_a_field_finds_lies_on_the_rays_of_its_pixels(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, start="random", num_gaussians=100)
-    dataset = load_split(trainer.run, "train")
-    found = found_surfaces(dataset, trainer.run.config, 10, 60.0, 500)
+    dataset = trainer.train_set
+    found = found_surfaces(load_method("instant-ngp"), dataset, trainer.config, 10, 60.0, 500)
     assert len(found.positions) > 100
     cameras = dataset.cameras
     rays = cameras.pixel_rays(cameras.offsets[found.images] + found.pixels, 0.0, 1.0)

@@ -104,7 +104,7 @@ def test_a_model_forgets_when_it_changes(shared_tiny: Path, tmp_path: Path) -> N
 def test_frames_are_measured(method: str, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer(method, shared_tiny, tmp_path / "run", max_num_iterations=3)
     trainer.train()
-    rows = measure(trainer.run.folder, (20, 30), (1, 2), 3)
+    rows = measure(trainer.folder, (20, 30), (1, 2), 3)
     assert [(row.width, row.height, row.threads) for row in rows] == [
         (20, 20, 1),
         (20, 20, 2),

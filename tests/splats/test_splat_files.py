@@ -14,7 +14,7 @@ from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.splats.look import Look
 from nerfloom.splats.transform import transformed
-from nerfloom.training.splat_files import load_run_or_splats
+from nerfloom.training.load import load
 from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.dataparsers.captures import moved, poses, write_capture
@@ -49,7 +49,7 @@ def psnr(file: Path) -> float:
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", ["ply", "spz"])
 def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: Path, tmp_path: Path) -> None:
-    placement = load_run_or_splats(capture_run).placement
+    placement = load(capture_run).placement
     assert placement.scale < 0.5
     assert not torch.allclose(placement.transform.float(), torch.eye(4)[:3], atol=0.1)
     called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path, "--format", kind)
@@ -88,11 +88,11 @@ def test_a_survey_is_trained_exported_and_read_back(
     said = refused(eval_command.main, tmp_path / "splat.ply", "--data", data)
     assert "in another frame than the data; a file about a local origin needs splat.ply.offset.json" in said
     # Another program's file, in the frame of the survey and in float32.
-    read = load_run_or_splats(tmp_path / "splat.spz", data=data)
+    read = load(tmp_path / "splat.spz", data=data)
     inside = transformed(read.model.gaussians(), *read.placement.original_similarity())  # type: ignore[attr-defined]
     write_gaussians(tmp_path / "rounded.ply", inside)
     capsys.readouterr()
-    load_run_or_splats(tmp_path / "rounded.ply", data=data)
+    load(tmp_path / "rounded.ply", data=data)
     assert "float32 has rounded its centres by up to 0.3" in " ".join(capsys.readouterr().err.split())
 
 
@@ -103,7 +103,7 @@ def test_a_file_is_drawn_as_its_run(kind: str, capture: Path, tmp_path: Path) ->
     flags = ("--antialiased", True, "--blur", 0.5, "--sort", "depth")
     run = trained(capture, tmp_path / "out", *flags)
     called("ns-export", "gaussian-splat", run, "--output-dir", tmp_path, "--format", kind)
-    model = load_run_or_splats(tmp_path / f"splat.{kind}", data=capture).model
+    model = load(tmp_path / f"splat.{kind}", data=capture).model
     assert isinstance(model, HasGaussians)
     assert model.look() == Look(True, 0.5, "depth")
     for words in ((run,), (tmp_path / f"splat.{kind}", "--data", capture)):
@@ -123,13 +123,13 @@ def test_files_of_other_programs_stand_for_a_run(capture: Path, capture_run: Pat
     called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path)
     given = read_gaussians(tmp_path / "splat.ply").gaussians
     write_splat(tmp_path / "a.splat", given)
-    model = load_run_or_splats(tmp_path / "a.splat", data=capture).model
+    model = load(tmp_path / "a.splat", data=capture).model
     assert isinstance(model, HasGaussians)
     assert len(model.gaussians()) == len(given)
     assert model.look() == Look(sort="depth")
     (tmp_path / "a.ksplat").write_bytes(bytes(10))
     with pytest.raises(DataError, match=r"a\.ksplat is of GaussianSplats3D's format; Gaussians are read from"):
-        load_run_or_splats(tmp_path / "a.ksplat", data=capture)
+        load(tmp_path / "a.ksplat", data=capture)
 
 
 def test_the_format_and_its_flags_may_be_named(shared_tiny: Path, tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_the_format_and_its_flags_may_be_named(shared_tiny: Path, tmp_path: Path
     done = called("ns-eval", tmp_path / "splat.ply", "--data", shared_tiny, "blender", "--downscale-factor", 2)
     assert done.returncode == 0, done.stderr
     assert psnr(tmp_path / "splat.eval.json") == pytest.approx(psnr(run / "eval.json"), abs=0.01)
-    loaded = load_run_or_splats(tmp_path / "splat.ply", data=shared_tiny)
+    loaded = load(tmp_path / "splat.ply", data=shared_tiny)
     assert loaded.model.scene.has_alpha
     assert loaded.model.scene.num_cameras == 10
 
@@ -169,7 +169,7 @@ def test_what_does_not_fit_is_refused(capture: Path, capture_run: Path, tmp_path
     data = ("--data", capture)
     for flag, value in (("--rays-per-pixel", 4), ("--load-checkpoint", file), ("--eval-appearance", "half")):
         said = refused(eval_command.main, file, *data, flag, value)
-        assert said == f"error: {flag} is of no use with a file of Gaussians: leave it out"
+        assert said == f"error: {flag} has no effect with a file of Gaussians: leave it out"
     assert "No such file" in refused(eval_command.main, tmp_path / "none.ply", *data)
     file.write_bytes(b"ply\nformat")
     assert str(file) in refused(eval_command.main, file, *data)

@@ -14,8 +14,9 @@ from nerfloom.kernels.math import cross_matrix
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.datasets import load_split
+from nerfloom.training.trainer import Trainer
 from tests.splats.test_method import SCENE, ball, camera
-from tests.training.helpers import tiny_trainer
+from tests.training.helpers import tiny_run
 
 
 def model_of(gaussians: Gaussians, cameras: Cameras, **settings: object) -> GaussianSplatting:
@@ -78,10 +79,11 @@ def test_pictures_show_the_appearance_that_is_set() -> None:
 
 @pytest.mark.medium
 def test_the_appearance_of_a_held_out_image_is_found_by_its_half(shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", appearance=True)
+    run = tiny_run("gaussian-splatting", shared_tiny, tmp_path / "run", appearance=True)
+    trainer = Trainer.of(run, load_split(run, "train"))
     for _ in range(20):
         trainer.train_step()
-    dataset = load_split(trainer.run, "test")
+    dataset = load_split(run, "test")
     darker = dataclasses.replace(dataset, pixels=(dataset.pixels.float() * torch.tensor([0.5, 0.5, 0.5, 1])).byte())
     pixels = dataset.cameras.image_pixels(1)
     background = torch.zeros(3)

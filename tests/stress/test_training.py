@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.errors import ConfigError
 from nerfloom.encodings.hash_grid import HashGrid
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.fields.base import Field
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField
@@ -111,7 +110,7 @@ def test_counts_and_means_after_a_hundred_thousand_steps() -> None:
     )
     error = torch.tensor([0.01, 1, math.nan], dtype=torch.float64)  # finite, and its samples are known
     for done in range(1, 100_001):
-        Trainer._account(run, 4097, 3, 1e-3)  # type: ignore[arg-type]
+        run.state.account(4097, 3, 1e-3)
         run._unread.append(error)
         if done % 1000 == 0:
             Trainer._read_errors(run, done)  # type: ignore[arg-type]
@@ -294,7 +293,7 @@ def test_rays_begin_and_end_alike_in_training_and_evaluation(shared_tiny: Path, 
 
     trainer.model.render, trainer.model.plain = spy, False
     trainer.train_step()
-    trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model))
+    trainer.model.render_view(trainer.eval_set.view(0), trainer.model.background)
     assert {training for training, _, _ in seen} == {True, False}
     assert {(*nears, *fars) for _, nears, fars in seen} == {(scene.near, scene.far)}
 
@@ -312,7 +311,7 @@ def test_a_depth_map_does_not_depend_on_the_chunks(backend: str, kind: str, shar
     views = []
     for chunk in (57, 8192):
         trainer.model.config = dataclasses.replace(trainer.model.config, eval_num_rays_per_chunk=chunk)
-        views.append(trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model)))
+        views.append(trainer.model.render_view(trainer.eval_set.view(0), trainer.model.background))
     apart = (views[0].median_depth - views[1].median_depth).abs()
     assert views[0].median_depth.unique().numel() > 1
     assert (apart > 1e-3).float().mean().item() <= 0.01

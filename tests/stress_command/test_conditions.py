@@ -99,7 +99,7 @@ def stressed(run: Run, condition: Condition) -> Trainer:
     """A trainer on the ball, of whose batches the condition is made."""
     create_folder(run)
     source = StressedSource(make_source("pixels", BALL.train, run.config), condition)
-    return Trainer(run, BALL.train, None, source)
+    return Trainer(load_method(run.method), run.config, BALL.train, source=source)
 
 
 @pytest.mark.parametrize(("name", "rays"), [("1-ray", 1), ("8192-rays", 8192)])

@@ -172,7 +172,7 @@ def tiny_trainer(kind: str, data: Path, folder: Path, evaluated: bool = False, *
     """A trainer whose folder exists."""
     run = tiny_run(kind, data, folder, **changes)
     create_folder(run)
-    return Trainer(run, load_split(run, "train"), load_split(run, "val") if evaluated else None)
+    return Trainer.of(run, load_split(run, "train"), load_split(run, "val") if evaluated else None)
 
 
 def tensors(trainer: Trainer) -> dict[str, torch.Tensor]:
@@ -201,7 +201,7 @@ def said_otherwise(method: str, data: Path, folder: Path, facts: dict[str, Any],
     still = tiny_trainer(method, data, folder / "still").train_set
     (folder / "run").mkdir()
     changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
-    return Trainer(tiny_run(method, data, folder / "run", max_eval_images=0, **settings), changed, None)
+    return Trainer.of(tiny_run(method, data, folder / "run", max_eval_images=0, **settings), changed)
 
 
 def chosen(trainer: Trainer) -> dict[str, str]:

@@ -12,7 +12,7 @@ import torch
 
 from nerfloom.base.checked import checked
 from nerfloom.cameras.view import every
-from nerfloom.evaluation.evaluator import Measured, evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import Measured, evaluate
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.registry import load_method, registered
 from nerfloom.training.checkpoint import load_checkpoint
@@ -34,7 +34,7 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 
 def written(trainer: Trainer) -> list[dict[str, Any]]:
-    return json.loads((trainer.run.folder / "learning_curve.json").read_text())
+    return json.loads((trainer.folder / "learning_curve.json").read_text())
 
 
 @pytest.mark.parametrize("seconds", [4.0, 3600.0])
@@ -99,7 +99,7 @@ def test_a_look_is_what_its_pixels_say(shared_tiny: Path, tmp_path: Path) -> Non
     assert found is not None
     assert (found.psnr, found.ssim) == (whole.results["psnr"], whole.results["ssim"])
     assert (found.images, found.pixel_stride, found.full) == (2, 1, False)
-    background = evaluation_background(model)
+    background = model.background
     full = model.render_view(dataset.view(0), background)
     part = model.render_view(dataset.view(0, stride=3), background)
     for name in ("rgb", "depth", "accumulation"):  # bfloat16 products differ by the number of rays

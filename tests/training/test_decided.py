@@ -56,7 +56,7 @@ def test_the_trainers_run_is_of_what_was_decided(shared_tiny: Path, tmp_path: Pa
     asked = tiny_run("nerfacto", shared_tiny, tmp_path / "run")
     assert asked.config.contraction == "auto"
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run")
-    assert trainer.run.config == trainer.config == trainer.model.config
+    assert trainer.config == trainer.model.config
     assert trainer.config.contraction is False
     assert trainer.config.camera_optimizer == "off"
     assert {decision.option: decision.choice for decision in trainer.decisions}["contraction"] == "off"

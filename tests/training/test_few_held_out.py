@@ -21,7 +21,7 @@ def test_a_few_are_evenly_spaced_and_the_same_images(shared_tiny: Path, tmp_path
 
 def test_all_are_loaded_once_where_all_are_evaluated(shared_tiny: Path, tmp_path: Path) -> None:
     run = tiny_run("instant-ngp", shared_tiny, tmp_path, max_num_iterations=4, steps_per_eval_all_images=2)
-    trainer = Trainer(run, load_split(run, "train"), first_split(run, ("val", "test"), 1))
+    trainer = Trainer.of(run, load_split(run, "train"), first_split(run, ("val", "test"), 1))
     loaded = []
 
     def load_all():  # type: ignore[no-untyped-def]
@@ -37,6 +37,6 @@ def test_all_are_loaded_once_where_all_are_evaluated(shared_tiny: Path, tmp_path
 @pytest.mark.parametrize("count", [1, 2])
 def test_without_a_loader_those_given_are_all(count: int, shared_tiny: Path, tmp_path: Path) -> None:
     run = tiny_run("instant-ngp", shared_tiny, tmp_path, max_num_iterations=2, steps_per_eval_all_images=2)
-    trainer = Trainer(run, load_split(run, "train"), load_split(run, "val", count))
+    trainer = Trainer.of(run, load_split(run, "train"), load_split(run, "val", count))
     trainer.train()
     assert [point[4] for point in trainer.state.curve] == [count]

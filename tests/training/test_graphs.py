@@ -65,9 +65,9 @@ def small(folder: Path, method: str = "nerfacto", moving: bool = False, **settin
     found = idle(method, moving)
     sizes = {"num_levels": 4, "num_proposal_samples": (16, 12), "num_nerf_samples": 8, "mixed_precision": False}
     rays = {"num_rays_per_batch": 24, "samples_per_batch": None}
-    known: dict[str, Any] = {name: value for name, value in (sizes | rays).items() if hasattr(found.run.config, name)}
-    config = dataclasses.replace(found.run.config, **(known | settings))
-    return Trainer(dataclasses.replace(found.run, config=config, folder=folder), found.train_set, None)
+    known: dict[str, Any] = {name: value for name, value in (sizes | rays).items() if hasattr(found.config, name)}
+    config = dataclasses.replace(found.config, **(known | settings))
+    return Trainer(found.method, config, found.train_set, folder=folder)
 
 
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import evaluation_background, measure_view
+from nerfloom.evaluation.evaluator import measure_view
 from nerfloom.training.trainer import Trainer
 from tests.other_device import OTHER, There, other_device
 from tests.training.test_graphs import VARIANTS, small
@@ -40,16 +40,16 @@ CASES: dict[str, dict[str, Any]] = {
 def test_every_method_trains_and_renders_there(case: str, tmp_path: Path) -> None:
     here = small(tmp_path, **CASES[case])
     with other_device():
-        there = Trainer(here.run, here.train_set.to(OTHER), None)
+        there = Trainer(here.method, here.config, here.train_set.to(OTHER))
         for _ in range(2):
             losses = there.train_step().losses
         assert isinstance(next(there.model.parameters()), There)
-        picture = measure_view(there.model, there.train_set, 0, evaluation_background(there.model), STRIDE)
+        picture = measure_view(there.model, there.train_set, 0, there.model.background, STRIDE)
     for _ in range(2):
         expected = here.train_step().losses
     assert losses.keys() == expected.keys()
     assert losses["rgb"] == pytest.approx(expected["rgb"], rel=5e-3)  # gradients are thinned at random
-    same = measure_view(here.model, here.train_set, 0, evaluation_background(here.model), STRIDE)
+    same = measure_view(here.model, here.train_set, 0, here.model.background, STRIDE)
     assert picture.psnr == pytest.approx(same.psnr, abs=0.05)
 
 
@@ -63,7 +63,7 @@ def test_steps_of_captures_with_bent_lenses_do_not_wait(tmp_path: Path) -> None:
     """A recording of them would fail: how often a lens's inverse is improved is found out before."""
     here = small(tmp_path, draw_by_error=False)
     with other_device() as mode:
-        trainer = Trainer(here.run, bent(here.train_set).to(OTHER), None)
+        trainer = Trainer(here.method, here.config, bent(here.train_set).to(OTHER))
         for _ in range(2):
             trainer.train_step()
         mode.waits.clear()

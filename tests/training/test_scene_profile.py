@@ -42,7 +42,7 @@ def test_times_that_a_still_method_ignores_are_announced(shared_tiny: Path, tmp_
     still = trainer.train_set
     moving = replace(still, times=torch.linspace(0, 1, len(still)), scene=replace(still.scene, moving=True))
     (tmp_path / "run").mkdir()
-    found = decisions(Trainer(run, moving, None))
+    found = decisions(Trainer.of(run, moving))
     assert found["times"][0] == "ignored"
     assert "instant-ngp" in found["times"][1]
     assert found["silhouettes"][0] == "not used"
@@ -57,7 +57,7 @@ def test_without_alpha_the_background_is_black_and_no_silhouette_used(shared_tin
         pixels=trainer.train_set.pixels[:, :3].contiguous(),
         scene=replace(trainer.train_set.scene, has_alpha=False),
     )
-    found = Trainer(trainer.run, opaque, None)
+    found = Trainer(trainer.method, trainer.config, opaque)
     assert decisions(found)["background"] == ("black", "no photograph has alpha")
     assert decisions(found)["silhouettes"] == ("not used", "no photograph has alpha")
     assert found.profile.transparent is None
@@ -89,7 +89,7 @@ def test_poses_that_seem_to_be_folded_are_warned_of(shared_tiny: Path, tmp_path:
             names=tuple(f"{index}.jpg" for index in range(count)),
             scene=replace(data.scene, **photographs),  # type: ignore[arg-type]
         )
-        return decisions(Trainer(trainer.run, walk, None)).get("warning, poses")
+        return decisions(Trainer(trainer.method, trainer.config, walk)).get("warning, poses")
 
     folded = warning(angles % 180)
     assert folded is not None

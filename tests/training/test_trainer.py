@@ -17,9 +17,10 @@ from torch import Tensor
 from nerfloom import Loss, Model, PixelBatch, RayModel, Rays, Rendered, registry
 from nerfloom.base.errors import CheckpointError, ConfigError, DivergenceError
 from nerfloom.dataparsers.blender import Blender
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.methods import instant_ngp
 from nerfloom.methods.instant_ngp import InstantNGPConfig
+from nerfloom.registry import load_method
 from nerfloom.training import trainer as trainer_file
 from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint
 from nerfloom.training.datasets import first_split, load_split
@@ -262,7 +263,7 @@ def test_a_picture_does_not_depend_on_the_chunks(kind: str, shared_tiny: Path, t
     assert trainer.eval_set is not None
     for chunk in (57, 8192):
         in_chunks_of(trainer, chunk)
-        view = trainer.model.render_view(trainer.eval_set.view(0), evaluation_background(trainer.model))
+        view = trainer.model.render_view(trainer.eval_set.view(0), trainer.model.background)
         pictures.append((view.rgb, view.median_depth))
     torch.testing.assert_close(pictures[0][0], pictures[1][0], atol=2e-3, rtol=0)  # bfloat16 products differ by size
     assert isinstance(trainer.model, Model)
@@ -317,7 +318,7 @@ def test_metrics_do_not_depend_on_the_chunks(kind: str, shared_tiny: Path, tmp_p
 def test_a_small_picture_has_no_ssim_and_no_lpips_and_says_so(tiny: Path, tmp_path: Path) -> None:
     run = dataclasses.replace(tiny_run("instant-ngp", tiny, tmp_path / "run"), parser=Blender(downscale_factor=2))
     create_folder(run)
-    trainer = Trainer(run, load_split(run, "train"), load_split(run, "val"))
+    trainer = Trainer.of(run, load_split(run, "train"), load_split(run, "val"))
     assert trainer.eval_set is not None
     found = evaluate(trainer.model, trainer.eval_set)
     assert found.results["ssim"] is None
@@ -364,7 +365,7 @@ def test_what_was_evaluated_is_not_forgotten_by_a_run_that_goes_on(shared_tiny: 
         again.restore(load_checkpoint(checkpoint))
         again.train()
         assert [entry[1:6] for entry in again.state.curve] == [entry[1:6] for entry in whole.state.curve]
-        written = json.loads((again.run.folder / "learning_curve.json").read_text())
+        written = json.loads((again.folder / "learning_curve.json").read_text())
         written = [row for row in written if row["full"]]  # when a few images are looked at follows the clock
         assert [row["step"] for row in written] == [4, 8, 12]
         assert [row["seconds"] for row in written] == sorted(row["seconds"] for row in written)
@@ -417,3 +418,37 @@ def test_rays_per_second_are_those_since_errors_were_read(
     rates = [trainer.train_step().rays_per_second for _ in range(8)]
     first, then, last = 30 / 3.0, 4 * 30 / 6.0, 4 * 30 / 3.0
     assert rates == pytest.approx([first, first, first, then, then, then, then, last])
+
+
+# -- without a run ------------------------------------------------------------------------------------------------
+
+
+def test_a_trainer_without_a_folder_learns_the_same_and_writes_nothing(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=20, steps_per_save=5)
+    create_folder(run)
+    written = Trainer.of(run, load_split(run, "train"))
+    written.train()
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    config = dataclasses.replace(run.config, vis="tensorboard")
+    alone = Trainer(load_method("instant-ngp"), config, load_split(run, "train"), load_split(run, "val"))
+    assert alone.train().checkpoint is None
+    assert alone.save() is None
+    nested = Trainer(load_method("instant-ngp"), config, load_split(run, "train"))
+    assert [report.step for report in nested.steps()] == list(range(1, 21))
+    assert list(nested.steps()) == []
+    for trainer in (alone, nested):
+        assert_same_bits(tensors(trainer), tensors(written))
+    assert list((tmp_path / "empty").rglob("*")) == []
+
+
+def test_what_others_have_set_is_not_started_anew(shared_tiny: Path, tmp_path: Path) -> None:
+    """As the Gaussians of a web page, which are set where a field has its surfaces."""
+    run = tiny_run("gaussian-splatting", shared_tiny, tmp_path, max_num_iterations=1, start="random")
+    trainer = Trainer(load_method(run.method), run.config, load_split(run, "train"))
+    trainer.prepare(start=False)
+    before = trainer.model.state_dict()["means.values"].clone()
+    trainer.prepare()
+    assert torch.equal(trainer.model.state_dict()["means.values"], before)

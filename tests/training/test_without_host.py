@@ -55,7 +55,7 @@ def test_a_step_neither_asks_the_device_nor_brings_it_tensors(
     monkeypatch.setattr(torch, "_fused_adam_", updated)  # likewise
     here = small(tmp_path, **{**VARIANTS[variant], "draw_by_error": False})  # whose map has as many tiles as a sum
     assert here.train_set.resident
-    trainer = Trainer(here.run, here.train_set.to(NOWHERE), None)
+    trainer = Trainer(here.method, here.config, here.train_set.to(NOWHERE))
     assert trainer.device == NOWHERE
     assert trainer.steps_per_read > 20
     monkeypatch.setattr(SharedSpace, "leave_out", lambda *cells: None)  # before the first step it may wait

@@ -13,7 +13,7 @@ from PIL import Image
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.pixels.batch import gather_batch, gather_colors_reference
 from nerfloom.dataparsers.blender import Blender
-from nerfloom.evaluation.evaluator import evaluate, evaluation_background
+from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run
 from tests.test_nerfacto import captured
@@ -80,7 +80,7 @@ def test_a_photograph_with_alpha_is_judged_over_white_and_one_without_over_black
         (False, "white", 1.0),
     ):
         trainer = captured(shared_tiny, tmp_path / f"{has_alpha} {asked}", {"has_alpha": has_alpha}, background=asked)
-        assert evaluation_background(trainer.model).tolist() == [expected] * 3
+        assert trainer.model.background.tolist() == [expected] * 3
         trained_over = asked if asked != "auto" else {True: "random", False: "black"}[has_alpha]
         assert trainer.source.background == trained_over
 

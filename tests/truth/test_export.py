@@ -39,7 +39,7 @@ def untrained(tmp_path: Path) -> Trainer:
     still = tiny_run("nerfacto", write_polycam(tmp_path / "ball"), tmp_path / "run")
     run = replace(still, dataparser="polycam", parser=Polycam())
     create_folder(run)
-    return Trainer(run, load_split(run, "train"), None)
+    return Trainer.of(run, load_split(run, "train"))
 
 
 def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(untrained: Trainer) -> None:

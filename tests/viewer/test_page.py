@@ -16,7 +16,6 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from nerfloom.cameras.camera_path import read_camera_path
 from nerfloom.cameras.view import View
-from nerfloom.evaluation.evaluator import evaluation_background
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import TINY_NGP, command, train
@@ -85,7 +84,7 @@ def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None
     matrix = torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
     model = load_trained(run, device_type="cpu").model
     request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height, time=time)
-    picture = model.render_view(View(request.camera(), time=time), evaluation_background(model))
+    picture = model.render_view(View(request.camera(), time=time), model.background)
     return picture.rgb.clamp(0, 1).numpy()[PICTURE] * 255
 
 
@@ -246,7 +245,7 @@ def blue_with_time(tmp_path: Path) -> Path:
         file.write_text(json.dumps(content))
     trainer = tiny_trainer("kplanes", data, tmp_path / "run", max_num_iterations=200)
     trainer.train()
-    return trainer.run.config_path.parent
+    return trainer.folder
 
 
 def test_time(browser: Chromium, blue_with_time: Path) -> None:

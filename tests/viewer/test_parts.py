@@ -23,10 +23,11 @@ from nerfloom.cli import train as train_command
 from nerfloom.cli import viewer as viewer_command
 from nerfloom.data.scene import Scene
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom.renderable import Renderable
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.checkpoint import list_checkpoints
-from nerfloom.training.run import Run
+from nerfloom.training.loaded import Loaded
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.crop import CroppedCameras, picture_within
@@ -36,7 +37,7 @@ from nerfloom.viewer.pace import Speed
 from nerfloom.viewer.photographs import THUMBNAIL, Photographs, small_picture
 from nerfloom.viewer.reports import curve, heading
 from nerfloom.viewer.request import Crop, Pose, Request
-from nerfloom.viewer.viewed import Subject, newer_checkpoint, of_trained, reloaded
+from nerfloom.viewer.viewed import newer_checkpoint, reloaded
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -104,8 +105,8 @@ def test_gaussians_are_drawn_as_a_whole_however_slow_that_is() -> None:
     whole = model.render_view(View(request.camera()), torch.ones(3)).rgb
     strips = [model.render_view(View(request.camera(rows=rows)), torch.ones(3)).rgb for rows in ((0, 32), (32, 64))]
     assert float((torch.cat(strips) - whole).abs().max()) > 0.1  # so it matters
-    subject = Subject(cast(Run, None), model, Placement(torch.eye(4)[:3].double(), 1.0), 0)
-    studio = Studio(subject)
+    placement, file = Placement(torch.eye(4)[:3].double(), 1.0), Path("splat.ply")
+    studio = Studio(Loaded(model, placement, "gaussian-splatting", file, file))
     studio._speed = Slow(((64 * 64, 100.0),))
     studio.enter(1, Browser(lambda image, quality: shown.append(image)))
     studio.ask(1, lambda _: request)
@@ -176,20 +177,26 @@ def test_cells_are_those_on_the_surface() -> None:
     assert shown_cells(nn.Linear(2, 2)) is None  # type: ignore[arg-type]
 
 
+def at_step_7(folder: Path) -> Loaded:
+    """A run without a model, of which no more is asked than what its panel says."""
+    placement = Placement(torch.eye(4)[:3].double(), 1.0)
+    return Loaded(cast(Renderable, None), placement, "instant-ngp", folder, folder / "step-7.ckpt", 7)
+
+
 @pytest.mark.parametrize("content", ["", "nonsense", "[1, 2]", '{"results": 3}', "[" * 10_000, '[{"seconds": "x"}]'])
-def test_reports_that_make_no_sense(content: str, shared_tiny: Path, tmp_path: Path) -> None:
+def test_reports_that_make_no_sense(content: str, tmp_path: Path) -> None:
     for name in ("learning_curve.json", "eval.json"):
         (tmp_path / name).write_text(content)
     assert curve(tmp_path) == ([], [])
-    assert "step 7" in heading(tiny_run("instant-ngp", shared_tiny, tmp_path), 7)
+    assert "step 7" in heading(at_step_7(tmp_path))
 
 
-def test_reports(shared_tiny: Path, tmp_path: Path) -> None:
+def test_reports(tmp_path: Path) -> None:
     rows = [{"seconds": 2, "psnr": 20.5}, {"seconds": 1, "psnr": 10}, {"seconds": 3, "psnr": None}]
     (tmp_path / "learning_curve.json").write_text(json.dumps(rows))
     assert curve(tmp_path) == ([1, 2], [10, 20.5])
     (tmp_path / "eval.json").write_text('{"results": {"psnr": 31.234, "num_images": 5}}')
-    assert "31.23 dB on 5 images" in heading(tiny_run("instant-ngp", shared_tiny, tmp_path), 7)
+    assert "31.23 dB on 5 images" in heading(at_step_7(tmp_path))
 
 
 def test_newer_checkpoints_are_loaded(shared_tiny: Path, tmp_path: Path) -> None:
@@ -198,20 +205,19 @@ def test_newer_checkpoints_are_loaded(shared_tiny: Path, tmp_path: Path) -> None
         trainer.train_step()
     trainer.save()
     trained = load_trained(tmp_path / "run", device_type="cpu")
-    subject = of_trained(trained)
     assert newer_checkpoint(tmp_path / "run", trained.checkpoint) is None
     for _ in range(10):
         trainer.train_step()
     trainer.save()
     newer = newer_checkpoint(tmp_path / "run", trained.checkpoint)
     assert newer is not None
-    found = reloaded(subject, newer)
+    found = reloaded(trained, newer)
     assert not isinstance(found, str)
-    assert (subject.step, found.step) == (10, 20)
+    assert (trained.step, found.step) == (10, 20)
     for name, value in trainer.model.state_dict().items():
         assert torch.equal(found.model.state_dict()[name], value)
     list_checkpoints(trainer.checkpoint_folder)[-1].write_bytes(b"damaged")
-    assert "cannot be shown" in str(reloaded(subject, newer))
+    assert "cannot be shown" in str(reloaded(trained, newer))
 
 
 def test_what_is_missing_is_named(

@@ -12,14 +12,16 @@ import pytest
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
-from nerfloom.evaluation.evaluator import evaluation_background
+from nerfloom.training.datasets import load_split
+from nerfloom.training.run import create_folder
+from nerfloom.training.trainer import Trainer
 from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.request import pose_of
 from nerfloom.viewer.server import free_port, is_allowed
-from nerfloom.viewer.viewed import of_trainer
-from tests.training.helpers import tiny_trainer
+from nerfloom.viewer.training_viewer import in_training
+from tests.training.helpers import tiny_run
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 
@@ -31,11 +33,13 @@ class Served:
     """A viewer of a tiny trained model, whose pictures are drawn in a thread of their own."""
 
     def __init__(self, folder: Path, data: Path) -> None:
-        trainer = tiny_trainer("instant-ngp", data, folder, max_num_iterations=60)
+        run = tiny_run("instant-ngp", data, folder, max_num_iterations=60)
+        create_folder(run)
+        trainer = Trainer.of(run, load_split(run, "train"))
         for _ in range(60):
             trainer.train_step()
-        self.photographs = Photographs(trainer.run)
-        self.studio = Studio(of_trainer(trainer), truth=self.photographs.truth)
+        self.photographs = Photographs(run)
+        self.studio = Studio(in_training(run, trainer), truth=self.photographs.truth)
         self.folder, self.model = folder, trainer.model
         self._server = open_server("127.0.0.1", 17007, "test")
         self.port = self._server.get_port()
@@ -90,7 +94,7 @@ def truth(served: Served, longest: int, **changes: Any) -> np.ndarray:
     from nerfloom.viewer.request import Request
 
     request = Request(pose, longest, longest * look["image_height"] // look["image_width"])
-    picture = served.model.render_view(View(request.camera()), evaluation_background(served.model))
+    picture = served.model.render_view(View(request.camera()), served.model.background)
     return picture.rgb.numpy() * 255
 
 

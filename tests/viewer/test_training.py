@@ -10,9 +10,8 @@ from nerfloom.training.progress import StepReport
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.request import Request, pose_of
-from nerfloom.viewer.training_viewer import Turns
-from nerfloom.viewer.viewed import of_trainer
-from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
+from nerfloom.viewer.training_viewer import Turns, in_training
+from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
 KINDS = [
     pytest.param(kind, marks=() if kind in ("instant-ngp", "gaussian-splatting") else pytest.mark.slow) for kind in TINY
@@ -36,7 +35,7 @@ def test_the_same_bits_with_and_without(kind: str, shared_tiny: Path, tmp_path: 
     plain.train()
 
     watched = tiny_trainer(kind, shared_tiny, tmp_path / "watched", max_num_iterations=STEPS)
-    studio = Studio(of_trainer(watched), 0.01, 0.01)
+    studio = Studio(in_training(tiny_run(kind, shared_tiny, tmp_path / "watched"), watched), 0.01, 0.01)
     turns, pictures = Turns(watched, studio, share=0.9), list[np.ndarray]()
 
     def between_steps(report: StepReport, stopped: list[int]) -> None:
@@ -53,7 +52,7 @@ def test_the_same_bits_with_and_without(kind: str, shared_tiny: Path, tmp_path: 
 
 def test_nothing_is_drawn_for_nobody(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=20)
-    studio = Studio(of_trainer(trainer))
+    studio = Studio(in_training(tiny_run("instant-ngp", shared_tiny, tmp_path / "run"), trainer))
     turns = Turns(trainer, studio, share=0.5)
     trainer.train(turns.take)
     assert turns.waited == 0
@@ -61,7 +60,7 @@ def test_nothing_is_drawn_for_nobody(shared_tiny: Path, tmp_path: Path) -> None:
 
 def test_a_pause_ends_by_the_button_or_by_a_signal(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=20)
-    studio = Studio(of_trainer(trainer), 0.01, 0.01)
+    studio = Studio(in_training(tiny_run("instant-ngp", shared_tiny, tmp_path / "run"), trainer), 0.01, 0.01)
     turns, pictures = Turns(trainer, studio, share=0.1), list[np.ndarray]()
 
     report = trainer.train_step()

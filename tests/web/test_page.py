@@ -204,7 +204,7 @@ def splats(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "run"
     trainer = tiny_trainer("gaussian-splatting", shared_tiny, folder, max_num_iterations=20)
     trainer.train()
-    return trainer.run.config_path
+    return trainer.folder / "config.yml"
 
 
 def export(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
@@ -242,7 +242,7 @@ def test_a_field_gets_gaussians_that_look_like_it(
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=200)
     trainer.train()
     capsys.readouterr()
-    export(monkeypatch, trainer.run.config_path, "--output-dir", tmp_path / "out", "--fit-seconds", 12)
+    export(monkeypatch, trainer.folder / "config.yml", "--output-dir", tmp_path / "out", "--fit-seconds", 12)
     close = float(capsys.readouterr().err.split("PSNR ")[1].split(" dB")[0])
     print(f"PSNR of the page against the field's pictures: {close} dB")
     assert close > 20  # a white picture has 8
@@ -254,7 +254,7 @@ def moving_run(tiny: Path, edit_json: EditJson, tmp_path: Path) -> Path:
     edit_json(lambda content: [frame.update(time=i / 9) for i, frame in enumerate(content["frames"])])
     trainer = tiny_trainer("kplanes", tiny, tmp_path / "run", max_num_iterations=150)
     trainer.train()
-    return trainer.run.config_path
+    return trainer.folder / "config.yml"
 
 
 @pytest.mark.slow

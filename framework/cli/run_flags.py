@@ -1,0 +1,54 @@
+"""Flags of every command that opens something to look at: a trained run or a file of Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from nerfloom.training.run_path import trained_run
+
+if TYPE_CHECKING:
+    from nerfloom.training.loaded import Loaded
+
+OPENS = "RUN_FOLDER or FILE"
+"""What such a command takes before its flags, for its help."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags:
+    """The trained run, or the file of Gaussians."""
+
+    load_config: Path
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
+    flag's name may be left out."""
+    load_checkpoint: Path | None = None
+    """Checkpoint to load; the newest if not given."""
+    data: Path | None = None
+    """Folder of the data, if it has moved since training; that of a file of Gaussians, which may have none."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis of a file of Gaussians without data that points up, as in --up=-y; z if not given."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to render on."""
+
+    def check(self) -> Path:
+        """Return the config.yml of the run, or the file of Gaussians, after a look at what is there, without torch.
+
+        Raises:
+            ConfigError, CheckpointError, DataError: if something is missing.
+        """
+        return trained_run(self.load_config, self.load_checkpoint, self.data)
+
+    def load(self, found: Path, **others: Any) -> Loaded:
+        """Load what `check` has found.
+
+        Args:
+            found: the result of `check`.
+            others: further arguments of `nerfloom.training.load.load`.
+
+        Raises:
+            ConfigError, CheckpointError, DataError: if it cannot be used.
+        """
+        from nerfloom.training.load import load
+
+        return load(found, self.load_checkpoint, self.device_type, self.data, up=self.up, **others)

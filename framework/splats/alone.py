@@ -1,0 +1,68 @@
+"""The frame of Gaussians that come without images: where they are, how large, and which way is up."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+
+from nerfloom.base.errors import DataError
+from nerfloom.cameras.poses import NEAR, Placement, rotation_between
+from nerfloom.data.scene import Scene
+from nerfloom.splats.gaussians import Gaussians
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+"""An axis of a file's frame, and its direction."""
+FAINT = 0.1
+"""Opacity below which Gaussians say nothing about where the scene is."""
+HALF_WITHIN = 0.5
+"""Distance from the middle, scene units, within which half of the Gaussians are placed."""
+OUTSIDE = 0.01
+"""Share of the Gaussians outside the box above which the scene has surroundings."""
+IMAGE_SIZE = 800
+"""Longer side of pictures, pixels, where no image says it."""
+
+
+def placed_alone(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, Scene]:
+    """Return the placement of Gaussians of which no images are known, and the scene that they make.
+
+    The median of their centres becomes the origin, and half of them are then within `HALF_WITHIN` of it: the few that
+    are far away do not count. What is not faint decides.
+
+    Args:
+        gaussians: N Gaussians in the frame of their file.
+        up: the direction in that frame that becomes +z.
+
+    Returns:
+        The placement of the file's frame in the scene's, and a scene without cameras, whose box is from -1 to 1. It is
+        unbounded, and its background black, if more than `OUTSIDE` of the Gaussians are outside the box.
+
+    Raises:
+        DataError: if no Gaussian is finite.
+    """
+    finite = gaussians[gaussians.finite()]
+    if not len(finite):
+        raise DataError("the file has no Gaussians whose numbers are finite: export it again")
+    dense = finite[torch.sigmoid(finite.logits) >= FAINT]
+    means = (dense if len(dense) else finite).means.double().cpu()
+    middle = means.median(0).values
+    distances = (means - middle).norm(dim=-1)
+    half = float(distances.median()) or finite.typical_size or 1.0
+    scale = HALF_WITHIN / half
+    direction = torch.zeros(3, dtype=torch.float64)
+    direction[get_args(Axis).index(up) % 3] = -1.0 if up.startswith("-") else 1.0
+    rotation = rotation_between(direction, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    placement = Placement(torch.cat([rotation, -(rotation @ middle)[:, None]], dim=-1), scale)
+    bounded = float((scale * distances > 1).double().mean()) <= OUTSIDE
+    scene = Scene(
+        box=torch.tensor([[-1.0] * 3, [1.0] * 3]),
+        near=NEAR,
+        far=10 + 2 * scale * float(distances.max()),
+        num_cameras=0,
+        has_alpha=bounded,
+        moving=False,
+        image_size=IMAGE_SIZE,
+        unbounded=not bounded,
+        poses="exact",
+    )
+    return placement, scene

@@ -1,0 +1,55 @@
+"""The one function that opens what a user names: a run, a folder of runs, or a file of Gaussians."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from nerfloom.base.config import RaysPerPixel
+from nerfloom.base.errors import ConfigError
+from nerfloom.splats.alone import Axis
+from nerfloom.splats.files import is_splat_file
+from nerfloom.training.loaded import Loaded
+from nerfloom.training.splat_files import DataFormat, load_splats
+from nerfloom.training.trained import load_trained
+
+
+def load(
+    path: Path,
+    checkpoint: Path | None = None,
+    device_type: Any = "auto",
+    data: Path | None = None,
+    rays_per_pixel: RaysPerPixel | None = None,
+    eval_appearance: Literal["mean", "half"] | None = None,
+    data_format: DataFormat | None = None,
+    up: Axis | None = None,
+) -> Loaded:
+    """Load a trained run or a file of Gaussians.
+
+    Args:
+        path: the run's folder, its config.yml, a folder above it, whose newest run is taken, or a file of Gaussians
+            (.ply, .spz, .splat) in the frame of the input.
+        checkpoint: checkpoint of a run; the newest readable one if None.
+        device_type: auto, cpu, cuda or mps.
+        data: folder of the data: where that of a run is now, or that of a file of Gaussians, which may have none.
+        rays_per_pixel: rays per rendered pixel; the run's if None.
+        eval_appearance: appearance of held-out images; the run's if None.
+        data_format: format of the data of a file of Gaussians, and its flags; recognised if None.
+        up: upward direction of a file of Gaussians without data, along z if None.
+
+    Raises:
+        ConfigError: if settings are missing or do not fit.
+        CheckpointError: if there is no readable checkpoint, or it does not fit the settings.
+        DataError: if the file or the data cannot be read.
+    """
+    if not is_splat_file(path):
+        if data_format is not None:
+            raise ConfigError(f"'{data_format[0]}': the run knows its data format; leave it out, with its flags")
+        if up is not None:
+            raise ConfigError("--up is for files of Gaussians: the run knows which way is up; leave it out")
+        return load_trained(path, checkpoint, device_type, data, rays_per_pixel, eval_appearance)
+    useless = {"load-checkpoint": checkpoint, "rays-per-pixel": rays_per_pixel, "eval-appearance": eval_appearance}
+    for flag, value in useless.items():
+        if value is not None:
+            raise ConfigError(f"--{flag} has no effect with a file of Gaussians: leave it out")
+    return load_splats(path, data, data_format, device_type, up)

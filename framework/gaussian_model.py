@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import ClassVar, Generic, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfloom.base.device import HostValue
-from nerfloom.base.optimised import Optimised, RowChange
+from nerfloom.base.optimised import RowChange
 from nerfloom.base.pace import Pace
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
@@ -20,54 +19,54 @@ from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.model import Model
 from nerfloom.rendering.outputs import NORMALS, Output
 from nerfloom.rendering.rendered import Picture
-from nerfloom.splats.capacity import Room
-from nerfloom.splats.density_control import RESET, GradientMean, grown
-from nerfloom.splats.drawing import DRAWN, draw_view, on_image, smallest_depth, splat_camera
+from nerfloom.splats.capacity import Capacity
+from nerfloom.splats.density_control import DensityControl
+from nerfloom.splats.drawing import DRAWN, draw_view, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.learning import as_gaussians, as_tables, row_changes, steps_per_move
+from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
-from nerfloom.splats.mcmc import moved, shaken
+from nerfloom.splats.mcmc import Mcmc, shaken
+from nerfloom.splats.rasteriser import RASTERISER, Projected, Rasteriser
 from nerfloom.splats.redrawn import Redrawn
 from nerfloom.splats.resolution import ImageSizes, most_octaves
-from nerfloom.splats.settings import SplattingConfigT
+from nerfloom.splats.settings import SplattingConfig, SplattingConfigT
 from nerfloom.splats.start import from_points, scene_size
-from nerfloom.splats.table import Table
+from nerfloom.splats.strategy import Strategy
+from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, usual_columns
 
 WITHOUT_IMAGES = 1_000
 """Maximum number of Gaussians of a model that has seen no images yet."""
+STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
+    "adc": lambda config: DensityControl(config.steps_per_reset),
+    "mcmc": lambda config: Mcmc(),
+}
+"""Strategies by the name that the setting `strategy` has for them."""
 
 
 class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     """A model of Gaussians that are drawn onto whole images.
 
-    A method adds its `start` and `loss`, and may change `lit` and `camera`.
+    A method adds its `start` and `loss`. It may change how images look (`lit`, `camera`), what Gaussians consist of
+    (`declared_columns`), where they are at a time (`at_time`), how they come and go (`make_strategy`), and how they are
+    drawn (`rasteriser`).
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
     cameras: ClassVar[tuple[str, ...] | None] = DRAWN
+    rasteriser: ClassVar[Rasteriser] = RASTERISER
+    """How Gaussians are drawn."""
     extent: Tensor
     """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
 
     def __init__(self, config: SplattingConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
-        higher, factor = (config.degree + 1) ** 2 - 1, config.rate_factor
-        rate = factor * config.learning_rate
-
-        def table(width: int, name: str, times: float, schedule: Literal["constant"] | None = "constant") -> Table:
-            return Table(width, Optimised(name, times * rate, schedule=schedule, sparse=True))
-
-        self.position_rate = factor * config.position_rate
-        self.means = table(3, "means", self.position_rate / rate, None)
-        self.log_scales = table(3, "scales", 1.0)
-        self.rotations = table(4, "rotations", 0.2)
-        self.logits = table(1, "opacities", 10.0)
-        self.colors = table(3, "colors", 0.5)
-        self.harmonics = table(3 * higher, "harmonics", 0.025)
+        self.position_rate = config.rate_factor * config.position_rate
+        self.columns = self.declared_columns()
+        for name, column in self.columns.items():
+            self.add_module(name, column)
         self.register_buffer("extent", torch.tensor(scene_size(scene)))
-        self.gradients, self.room = GradientMean(), Room()
+        self.strategy, self.capacity = self.make_strategy(), Capacity()
         self.near = smallest_depth(scene)
-        self._on_image: Tensor | None = None
-        self._longer_side = scene.image_size
         self._redrawn: Redrawn | None = None
         self._extent = HostValue()
         most = most_octaves(scene.image_pixels or scene.image_size**2)
@@ -86,18 +85,46 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
 
     # -- the Gaussians ----------------------------------------------------------------------------------------
 
-    def parameters_of_gaussians(self) -> list[nn.Parameter]:
-        """Return the six tables."""
-        tables = (self.means, self.log_scales, self.rotations, self.logits, self.colors, self.harmonics)
-        return [table.values for table in tables]
+    def declared_columns(self) -> dict[str, Column]:
+        """Return the parameters of Gaussians by name, each with its shape, learning rate and schedule.
 
-    def learnt_gaussians(self) -> Gaussians:
-        """Return them, with gradient."""
-        return as_gaussians(self.parameters_of_gaussians(), self.extent)
+        A method adds columns to these. They grow, move, and are saved as the others are.
+        """
+        config = self.config
+        return usual_columns(config.degree, config.rate_factor * config.learning_rate, self.position_rate)
 
-    def gaussians(self) -> Gaussians:
-        """Return them, without gradient."""
-        return self.learnt_gaussians().map(Tensor.detach)
+    def make_strategy(self) -> Strategy:
+        """Return how Gaussians come and go: here as the setting `strategy` says."""
+        return STRATEGIES[self.config.strategy](self.config)
+
+    def at_time(self, gaussians: Gaussians, time: float | None) -> Gaussians:
+        """Return Gaussians as they are at a time, with gradient: here as they are at rest.
+
+        Args:
+            gaussians: N Gaussians at rest, with all columns.
+            time: in [0, 1]; None for a still scene.
+        """
+        return gaussians
+
+    def at_rest(self) -> Gaussians:
+        """Return them as their columns hold them, with gradient."""
+        return as_gaussians(self.columns, self.extent)
+
+    def learnt_gaussians(self, time: float | None = None) -> Gaussians:
+        """Return them as they are at a time, with gradient.
+
+        Args:
+            time: in [0, 1]; None for a still scene.
+        """
+        return self.at_time(self.at_rest(), time)
+
+    def gaussians(self, time: float | None = None) -> Gaussians:
+        """Return them as they are at a time, without gradient.
+
+        Args:
+            time: in [0, 1]; None for a still scene.
+        """
+        return self.learnt_gaussians(time).map(Tensor.detach)
 
     def look(self) -> Look:
         """Return how they are drawn."""
@@ -107,10 +134,10 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         """Replace them.
 
         Args:
-            gaussians: the new ones, with harmonics of the settings' degree.
+            gaussians: the new ones at rest, with harmonics of the settings' degree. A column that they lack is 0.
         """
-        for parameter, values in zip(self.parameters_of_gaussians(), as_tables(gaussians, self.extent), strict=True):
-            parameter.data = values.contiguous()
+        for name, rows in as_rows(self.columns, gaussians, self.extent).items():
+            self.columns[name].values.data = rows.contiguous()
         self._redrawn = None
 
     # -- training ---------------------------------------------------------------------------------------------
@@ -126,31 +153,28 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
             return
         self.sizes.learn(pace)
         steps = self.sizes.steps_until(pace, config.growth_end)
-        self._first = self._first or len(self.means.values)
+        self._first = self._first or len(self.columns["means"].values)
         if steps is not None:
-            self.steps_per_move = steps_per_move(pace.step + steps, self._first, config.num_gaussians, config.strategy)
+            per_doubling = self.strategy.changes_per_doubling
+            self.steps_per_move = steps_per_move(pace.step + steps, self._first, config.num_gaussians, per_doubling)
 
     def before_step(self, step: int, progress: float) -> None:
         self._redrawn = None
 
-    def on_image(self, gaussians: Gaussians, camera: SplatCamera, degree: int) -> Tensor:
-        """Return what a training image shows of Gaussians (N, RECORD); growth by gradients looks at its gradient.
+    def on_image(self, gaussians: Gaussians, camera: SplatCamera, degree: int) -> Projected:
+        """Return what a training image shows of Gaussians, which the strategy watches.
 
         Args:
-            gaussians: N Gaussians.
+            gaussians: N Gaussians, as many as there are, in their order.
             camera: of the image.
             degree: highest degree of the harmonics that count.
         """
-        records = on_image(gaussians, camera, degree)
-        if self.config.strategy == "adc" and records.requires_grad:
-            records.retain_grad()
-            self._on_image, self._longer_side = records, max(camera.width, camera.height)
-        return records
+        shown = self.rasteriser.project(gaussians, camera, degree)
+        self.strategy.watch(shown.records, camera)
+        return shown
 
-    @torch.no_grad()
     def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
-        self.gradients.add(self._on_image, self._longer_side, finite)
-        self._on_image = None
+        self.strategy.after_every_step(finite)
 
     @torch.no_grad()
     def shake(self, size: float | Tensor) -> None:
@@ -160,32 +184,24 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
             size: the noise of a transparent Gaussian, in its standard deviations squared per extent of the scene;
                 possibly () on the device.
         """
-        which, by = shaken(self.gaussians(), size * self._extent.of(self.extent))
-        self.means.values.data[which] += by / self.extent
+        which, by = shaken(self.at_rest(), size * self._extent.of(self.extent))
+        self.columns["means"].values.data[which] += by / self.extent
 
     def changes_rows(self, step: int, progress: float) -> bool:
         return step % self.steps_per_move == self.steps_per_move - 1 and progress <= self.config.growth_end
 
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
-        config = self.config
-        if config.strategy == "adc":
-            return self._densify(step, config.num_gaussians)
-        here = len(self.means.values)
-        change = moved(self.gaussians(), max(min(config.num_gaussians, int(1.05 * here)) - here, 0))
-        return () if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
-
-    def _densify(self, step: int, most: int) -> list[RowChange]:
-        mean = self.gradients.take(len(self.means.values))
-        if step % self.config.steps_per_reset == self.config.steps_per_reset - 1:
-            lowered = self.logits.values.clamp(max=math.log(RESET / (1 - RESET)))
-            none = torch.zeros(0, dtype=torch.long, device=lowered.device)
-            return [RowChange(self.logits.values, none, lowered)]  # new rows, as Adam's state is reset too
-        change = grown(self.gaussians(), mean, most, self._extent.of(self.extent))
-        return [] if change is None else row_changes(self.parameters_of_gaussians(), *change, self.extent)
+        gaussians = self.at_rest()
+        if values := self.strategy.reset(gaussians, step):
+            none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, as Adam's state is reset too
+            columns = {name: self.columns[name] for name in values}
+            return [RowChange(c.values, none, c.rows(values[name], self.extent)) for name, c in columns.items()]
+        change = self.strategy.grow(gaussians, self.config.num_gaussians, self._extent.of(self.extent))
+        return () if change is None else row_changes(self.columns, *change, self.extent)
 
     def read_counts(self) -> None:
-        self.room.read()
+        self.capacity.read()
 
     # -- pictures ---------------------------------------------------------------------------------------------
 
@@ -212,18 +228,20 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         return (NORMALS,)
 
     def render_view(self, view: View, background: Tensor) -> Picture:
-        return self.render_gaussians(self.gaussians(), view, background)
+        return self.render_gaussians(self.gaussians(view.time), view, background)
 
     def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
         """Render given Gaussians, such as some of its own, as `render_view` does all of them.
 
         Args:
-            gaussians: what is drawn, in the frame of the scene.
+            gaussians: what is drawn, in the frame of the scene, at the time of the view.
             view, background: as in `render_view`.
         """
-        picture = draw_view(gaussians, self.camera(view.camera), view.stride, background, self.scene.far)
+        camera = self.camera(view.camera)
+        picture = draw_view(gaussians, camera, view.stride, background, self.scene.far, self.rasteriser)
         return replace(picture, rgb=self.lit(picture.rgb, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        self._redrawn = self._redrawn or Redrawn(self.gaussians())
+        if self._redrawn is None or self._redrawn.time != view.time:
+            self._redrawn = Redrawn(self.gaussians(view.time), self.rasteriser, view.time)
         return self.lit(self._redrawn.colors(self.camera(view.camera), view.stride, background), None)

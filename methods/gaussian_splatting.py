@@ -24,11 +24,11 @@ from nerfloom.export.surfaces import found_surfaces
 from nerfloom.fields.appearance import AFFINE, Appearance, affine_colors
 from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.splats.blend import CHANNELS
-from nerfloom.kernels.splats.project import SplatCamera, sort_keys
+from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.losses.functions import mean_depth_error
 from nerfloom.registry import load_method
 from nerfloom.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
-from nerfloom.splats.drawing import draw, splat_camera
+from nerfloom.splats.drawing import splat_camera
 from nerfloom.splats.guide import GUIDE, FoundDistances
 from nerfloom.splats.learning import open_degree
 from nerfloom.splats.resolution import enlarged, reduced, reduced_distances
@@ -155,12 +155,11 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
         octaves = self.sizes.next(self.progress)
         camera, target = splat_camera(seen, self.near, self.look(), pose, 1 << octaves), reduced(batch.rgb, octaves)
-        gaussians = self.learnt_gaussians()
-        records = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
+        gaussians = self.learnt_gaussians(batch.view.time)
+        shown = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         content = CHANNELS["rgb" if known is None else "distance"]
-        keys = sort_keys(gaussians.means, camera)
-        drawn = draw(records, camera, self._behind(batch), content, self.room, keys)
+        drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
         rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         if batch.kept is not None:  # what does not count is as it should be
             kept = reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1

@@ -28,7 +28,7 @@ from nerfloom.kernels.march.fixed_slots import Placed, fill, reach, share_out
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves import march, sort_by_ray
 from nerfloom.kernels.splats.blend import blend
-from nerfloom.kernels.splats.project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, RGB, SplatCamera, project_gaussians
+from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
 
 Inputs = dict[str, Tensor]
@@ -42,6 +42,9 @@ STEPS, CELLS = 40, 8
 """Steps along the diagonal of a marched box, and its cells along an axis."""
 STEP = float((BOX[1] - BOX[0]).norm()) / STEPS
 WIDTH, HEIGHT = 37, 30
+BOUNDS = slice(Record.CUT, Record.RED)
+"""Columns of records whose gradients are sums of absolute ones."""
+WIDTHS, REACHES = [Record.U_X, Record.V_Y], [Record.REACH_X, Record.REACH_Y]
 
 
 @dataclass(frozen=True)
@@ -259,7 +262,7 @@ def _projected() -> Iterator[Family]:
     def projected(pose: Tensor, **rows: Tensor) -> Sequence[Tensor]:
         camera = SplatCamera(pose, (30.0, 32.0, 20.0, 15.0), WIDTH, HEIGHT)
         records = project_gaussians(**rows, camera=camera, degree=2)[0]
-        return records[:, :CUT], records[:, CUT:RGB].detach(), records[:, RGB : RGB + 4]
+        return records[:, : Record.CUT], records[:, BOUNDS].detach(), records[:, Record.RED : Record.NORMAL_X]
 
     hard = gaussians(12)
     hard["means"][0], hard["means"][1] = torch.tensor([0.0, 0, -9]), torch.tensor([90.0, 0, 1])
@@ -276,9 +279,10 @@ def _on_images() -> Iterator[Family]:
         """Gaussians on the image, each with a circle of radius 4 around it."""
         found = torch.zeros(count, RECORD)
         found[:, :2] = torch.rand(count, 2) * torch.tensor([WIDTH, HEIGHT])
-        found[:, [2, 4]], found[:, 5] = 0.3, 0.1 + 0.8 * torch.rand(count)
-        found[:, CUT], found[:, [REACH_X, REACH_Y]] = (found[:, 5] * 255).log(), 6.0
-        found[:, RGB : RGB + 3], found[:, DISTANCE] = torch.rand(count, 3), torch.rand(count) + 1
+        found[:, WIDTHS], found[:, Record.OPACITY] = 0.3, 0.1 + 0.8 * torch.rand(count)
+        found[:, Record.CUT], found[:, REACHES] = (found[:, Record.OPACITY] * 255).log(), 6.0
+        found[:, Record.RED : Record.DISTANCE] = torch.rand(count, 3)
+        found[:, Record.DISTANCE] = torch.rand(count) + 1
         return found
 
     def listed(records: Tensor) -> Sequence[Tensor]:
@@ -286,7 +290,7 @@ def _on_images() -> Iterator[Family]:
         lists: TileLists = tile_lists(records, WIDTH, HEIGHT)
         sizes, last = lists.offsets.diff().long(), len(lists.ids)
         tiles = torch.repeat_interleave(sizes, output_size=last)
-        near = records[:, DISTANCE].index_select(0, lists.ids.long()).float()
+        near = records[:, Record.DISTANCE].index_select(0, lists.ids.long()).float()
         sorted_ = (near.diff() >= 0) | (tiles.diff() > 0)
         own = records[:, 0].div(16).floor().long() + 3 * records[:, 1].div(16).floor().long()
         there = torch.zeros(len(sizes), len(records), device=records.device)
@@ -294,15 +298,15 @@ def _on_images() -> Iterator[Family]:
         return sorted_.all().float(), there.gather(0, own.clamp(0, len(sizes) - 1)[None])
 
     walls = records(30)
-    walls[:, :2], walls[:, [2, 4]], walls[:, DISTANCE] = torch.tensor([8.5, 7.5]), 0.05, 1.0
-    walls[:, 5] = torch.tensor([0.004, 0.9, 1.0, 0.5, 0.99, 0.3] * 5)
-    walls[:, CUT], walls[:, [REACH_X, REACH_Y]] = (walls[:, 5] * 255).log(), 40.0
+    walls[:, :2], walls[:, WIDTHS], walls[:, Record.DISTANCE] = torch.tensor([8.5, 7.5]), 0.05, 1.0
+    walls[:, Record.OPACITY] = torch.tensor([0.004, 0.9, 1.0, 0.5, 0.99, 0.3] * 5)
+    walls[:, Record.CUT], walls[:, REACHES] = (walls[:, Record.OPACITY] * 255).log(), 40.0
     usual, hard, none = ({"records": rows} for rows in (records(50), walls, records(0)))
     yield "tile_lists", listed, "", (usual, hard, none)
 
     def blended(records: Tensor, background: Tensor) -> Sequence[Tensor]:
         lists = tile_lists_reference(records, WIDTH, HEIGHT)
-        records = torch.cat([records[:, :CUT], records[:, CUT:RGB].detach(), records[:, RGB:]], 1)
+        records = torch.cat([records[:, : Record.CUT], records[:, BOUNDS].detach(), records[:, Record.RED :]], 1)
         return blend(records, lists, WIDTH, HEIGHT, background, 4, False)[:2]
 
     usual, hard, none = ({**each, "background": torch.tensor([0.2, 0.5, 1.0])} for each in (usual, hard, none))

@@ -15,14 +15,7 @@ from nerfloom.benchmarks.ceilings import Work
 from nerfloom.benchmarks.compared import Errors, Kernel, errors
 from nerfloom.benchmarks.timing import differentiated, once
 from nerfloom.kernels.splats.blend import Blended, blend, blend_reference, blended_pairs
-from nerfloom.kernels.splats.project import (
-    CUT,
-    REACH_X,
-    REACH_Y,
-    SplatCamera,
-    project_gaussians,
-    project_reference,
-)
+from nerfloom.kernels.splats.project import Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
 
 COUNT, WIDTH, HEIGHT = 20_000, 300, 300
@@ -78,7 +71,7 @@ def _blending(records: Tensor) -> Kernel:
         wide = _wide(records)
         listed = tile_lists(wide, WIDTH, HEIGHT)
         kept = torch.ones(wide.shape[1])
-        kept[[CUT, REACH_X, REACH_Y]] = 0  # the gradient has sums of absolute gradients there
+        kept[[Record.CUT, Record.REACH_X, Record.REACH_Y]] = 0  # the gradient has sums of absolute gradients there
 
         def colored(form: Callable[..., Blended]) -> Callable[[Tensor], Tensor]:
             run = image(form, listed)
@@ -100,9 +93,9 @@ def _blending(records: Tensor) -> Kernel:
 
 def _wide(records: Tensor) -> Tensor:
     """Return records with a cutoff so far out that alpha is nothing there."""
-    wide, visible = records.clone(), records[:, CUT] > 0
-    stretch = (1 + BOUND / records[:, CUT]).sqrt()
-    wide[:, CUT] = torch.where(visible, records[:, CUT] + BOUND, 0)
-    for column in (REACH_X, REACH_Y):
+    wide, visible = records.clone(), records[:, Record.CUT] > 0
+    stretch = (1 + BOUND / records[:, Record.CUT]).sqrt()
+    wide[:, Record.CUT] = torch.where(visible, records[:, Record.CUT] + BOUND, 0)
+    for column in (Record.REACH_X, Record.REACH_Y):
         wide[:, column] = torch.where(visible, records[:, column] * stretch, 0)
     return wide

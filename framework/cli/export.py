@@ -80,6 +80,8 @@ class SplatFlags(ExportFlags):
     """ply: 32 bits a number, read by every program. spz: 8 to 24 bits, compressed; about a tenth of the size."""
     max_megabytes: float | None = None
     """Make the file at most this large, in millions of bytes: fewer harmonics first, fewer Gaussians last."""
+    time: float | None = None
+    """Moment that is written of a scene that moves, 0 to 1; 0 if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,6 +217,7 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
     from nerfloom.base.console import say
     from nerfloom.data.offsets import write_offset
+    from nerfloom.export.run_page import moment_of
     from nerfloom.geometry.local_origin import local_origin
     from nerfloom.splats.files import write_gaussians
     from nerfloom.splats.gaussians import HasGaussians
@@ -224,7 +227,8 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         raise ConfigError(
             f"ns-export gaussian-splat: {loaded.method} has no Gaussians; ns-train gaussian-splatting makes them"
         )
-    found = loaded.model.gaussians().map(lambda values: values.detach().cpu())
+    moment = moment_of(loaded.model.scene.moving, flags.time)
+    found = loaded.model.gaussians(moment).map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")

@@ -84,7 +84,7 @@ def export_page(
     """
     check_size(max_megabytes)
     model = loaded.model
-    moment = _moment(model.scene.moving, moment)
+    moment = moment_of(model.scene.moving, moment)
     dataset = None if loaded.source is None else _at(loaded.dataset("train"), moment)
     if dataset is None:
         cameras = around(model.scene)
@@ -93,7 +93,7 @@ def export_page(
         cameras, names = pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
     near = smallest_depth(model.scene)
     if isinstance(model, HasGaussians):
-        found, look = model.gaussians(), model.look()
+        found, look = model.gaussians(moment), model.look()
     elif isinstance(model, RendersRays) and dataset is not None:
         if not fit_seconds > 0:
             raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
@@ -185,8 +185,17 @@ def closeness(
     return Closeness(views, fmean(own), fmean(page), fmean(method))
 
 
-def _moment(moving: bool, asked: float | None) -> float | None:
-    """Return the time that a page shows; None of a static scene."""
+def moment_of(moving: bool, asked: float | None) -> float | None:
+    """Return the time that an export shows; None of a static scene.
+
+    Args:
+        moving: whether the photographs have times.
+        asked: the time that was asked for.
+
+    Raises:
+        ConfigError: if a static scene was asked for a time.
+        FlagError: if the time is not from 0 to 1.
+    """
     if asked is not None and not moving:
         raise ConfigError(f"--time {asked:g}: the photographs of this run have no times")
     if asked is not None and not 0 <= asked <= 1:

@@ -6,15 +6,17 @@ cancel where the pixels of one Gaussian pull in different directions.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from nerfloom.base.processes import add_up
 from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y
-from nerfloom.kernels.splats.project import OPACITY, rotation_matrices
+from nerfloom.kernels.splats.project import Record, SplatCamera, rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.strategy import Change, Strategy
 
 GRADIENT = 8e-4
 """Mean gradient of the image position, of images whose longer side is 2 units, from which a Gaussian is not enough."""
@@ -28,17 +30,11 @@ RESET = 0.01
 """Opacity to which all are lowered now and then, so that those which nothing needs stay transparent."""
 
 
-class Growth(NamedTuple):
-    """Gaussians that stay, and those that are added."""
-
-    kept: Tensor
-    """(K,) int64 which of them stay as they are."""
-    fresh: Gaussians
-    """Those that are added behind them."""
-
-
 class GradientMean(nn.Module):
-    """The mean size of the gradients of image positions, over the images that show a Gaussian."""
+    """The mean size of the gradients of image positions, over the images that show a Gaussian.
+
+    An image is watched before its backward pass, and added after it.
+    """
 
     sums: Tensor
     """(N, 2) sum of the sizes, and number of images; empty before the first."""
@@ -46,20 +42,33 @@ class GradientMean(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("sums", torch.zeros(0, 2))
+        self._watched: Tensor | None = None
+        self._longer_side = 1
 
-    def add(self, records: Tensor | None, longer_side: int, finite: bool | Tensor = True) -> None:
-        """Add an image; without effect if there is none, or it has no gradient.
+    def watch(self, records: Tensor, camera: SplatCamera) -> None:
+        """Keep the gradient of an image; without effect if there will be none.
 
         Args:
-            records: (N, RECORD) Gaussians on the image, which retain their gradient.
-            longer_side: of the image, pixels.
+            records: (N, RECORD) Gaussians on the image.
+            camera: of the image.
+        """
+        if records.requires_grad:
+            records.retain_grad()
+            self._watched, self._longer_side = records, max(camera.width, camera.height)
+
+    @torch.no_grad()
+    def add(self, finite: bool | Tensor = True) -> None:
+        """Add the image that was watched last; without effect if there is none, or it has no gradient.
+
+        Args:
             finite: whether the step counts, possibly () bool on the device, where nothing is added if it does not.
         """
+        records, self._watched = self._watched, None
         if records is None or records.grad is None:
             return
         if len(self.sums) != len(records):
             self.sums = records.new_zeros(len(records), 2)
-        sizes, shown = image_gradients(records.grad, longer_side), records[:, OPACITY] > 0
+        sizes, shown = image_gradients(records.grad, self._longer_side), records[:, Record.OPACITY] > 0
         if isinstance(finite, Tensor):
             sizes, shown = torch.where(finite, sizes, 0), shown & finite
         self.sums[:, 0] += sizes
@@ -82,6 +91,33 @@ class GradientMean(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
+class DensityControl(Strategy):
+    """Adaptive density control of 3D Gaussian Splatting.
+
+    Args:
+        steps_per_reset: steps after which all Gaussians become nearly transparent.
+    """
+
+    def __init__(self, steps_per_reset: int) -> None:
+        super().__init__()
+        self.steps_per_reset, self.gradients = steps_per_reset, GradientMean()
+
+    def watch(self, records: Tensor, camera: SplatCamera) -> None:
+        self.gradients.watch(records, camera)
+
+    def after_every_step(self, finite: bool | Tensor) -> None:
+        self.gradients.add(finite)
+
+    def reset(self, gaussians: Gaussians, step: int) -> dict[str, Tensor]:
+        if step % self.steps_per_reset != self.steps_per_reset - 1:
+            return {}
+        self.gradients.take(len(gaussians))
+        return {"logits": gaussians.logits.clamp(max=math.log(RESET / (1 - RESET)))}
+
+    def grow(self, gaussians: Gaussians, most: int, extent: float) -> Change | None:
+        return grown(gaussians, self.gradients.take(len(gaussians)), most, extent)
+
+
 def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
     """Return how much the pixels pull at each Gaussian's position, (N,), on an image whose longer side is 2 units.
 
@@ -92,7 +128,7 @@ def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
     return torch.hypot(gradient[:, ABSOLUTE_X], gradient[:, ABSOLUTE_Y]) * (longer_side / 2)
 
 
-def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Growth | None:
+def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Change | None:
     """Clone or split the Gaussians with the largest gradients, and drop transparent ones and those that are not finite.
 
     Args:
@@ -116,7 +152,7 @@ def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> 
     if len(kept) == len(gaussians) and not bool(cloned.any()):
         return None
     children = [_child(gaussians[split]) for _ in range(CHILDREN)]
-    return Growth(kept, _joined([gaussians[cloned], *children]))
+    return Change(kept, Gaussians.joined([gaussians[cloned], *children]))
 
 
 def _child(gaussians: Gaussians) -> Gaussians:
@@ -125,9 +161,4 @@ def _child(gaussians: Gaussians) -> Gaussians:
     offset = torch.randn_like(g.means) * g.log_scales.exp()
     means = g.means + (rotation_matrices(g.rotations) @ offset[:, :, None])[:, :, 0]
     shrunk = g.log_scales - torch.tensor(SHRUNK).log().to(g.log_scales)
-    return Gaussians(means, shrunk, g.rotations, g.logits, g.colors, g.harmonics)
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    columns = zip(*(vars(part).values() for part in parts), strict=True)
-    return Gaussians(*(torch.cat(column) for column in columns))
+    return replace(g, means=means, log_scales=shrunk)

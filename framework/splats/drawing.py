@@ -12,14 +12,13 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import every
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.lenses import LENSES, Distortion
-from nerfloom.kernels.splats.blend import CHANNELS, Blended, blend
-from nerfloom.kernels.splats.project import SplatCamera, project_gaussians, sort_keys
-from nerfloom.kernels.splats.tiles import tile_lists
+from nerfloom.kernels.splats.blend import CHANNELS
+from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.rendered import Picture
-from nerfloom.splats.capacity import Room
-from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
+from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
+from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
 
 DRAWN = ("pinhole", "opencv", "fisheye")
 """Camera models that Gaussians can be drawn for."""
@@ -84,52 +83,10 @@ def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
     return Distortion.of(model, torch.tensor([coefficients], dtype=torch.float64))
 
 
-def on_image(gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> Tensor:
-    """Return the Gaussians on an image, records (N, RECORD) as `project_gaussians` gives them, with a gradient.
-
-    Args:
-        gaussians: what is drawn.
-        camera: the image.
-        degree: highest degree of the harmonics that counts.
-    """
-    g = gaussians
-    return project_gaussians(
-        g.means, g.log_scales, g.rotations, g.logits, g.colors, g.harmonics, camera=camera, degree=degree
-    )[0]
-
-
-def draw(
-    records: Tensor,
-    camera: SplatCamera,
-    background: Tensor,
-    channels: int = CHANNELS["rgb"],
-    room: Room | None = None,
-    keys: Tensor | None = None,
-) -> Blended:
-    """Blend Gaussians on an image, with a gradient.
-
-    Args:
-        records: (N, RECORD) from `on_image`.
-        camera: the image.
-        background: (3,) colour behind everything.
-        channels: number of channels, a value of `CHANNELS`.
-        room: how many entries of lists a device that runs ahead of Python gets, which would be waited for otherwise.
-        keys: (N,) what they are sorted by, from `sort_keys`; None for distance.
-
-    Raises:
-        ValueError: if the camera sorts by depth, and there are no keys.
-    """
-    if camera.by_depth and keys is None:
-        raise ValueError("this camera sorts Gaussians by depth: give the keys that `sort_keys` returns")
-    given = None if room is None else room.of(records, camera.width * camera.height)
-    lists = tile_lists(records, camera.width, camera.height, torch.is_grad_enabled(), given, keys)
-    if room is not None:
-        room.note(records, camera.width * camera.height, lists)
-    return blend(records, lists, camera.width, camera.height, background, channels)
-
-
 @torch.no_grad()
-def draw_colors(gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor) -> Tensor:
+def draw_colors(
+    gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor, rasteriser: Rasteriser = RASTERISER
+) -> Tensor:
     """Draw the colours (H, W, 3) of a picture alone, which takes less time than `draw_view`.
 
     Args:
@@ -137,13 +94,16 @@ def draw_colors(gaussians: Gaussians, camera: SplatCamera, stride: int, backgrou
         camera: the whole image.
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
+        rasteriser: how it is drawn.
     """
-    keys = sort_keys(gaussians.means, camera)
-    return every(draw(on_image(gaussians, camera), camera, background, keys=keys).image, stride)
+    return every(rasteriser.draw(rasteriser.project(gaussians, camera), camera, background).image, stride)
 
 
 @torch.no_grad()
-def draw_view(gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor, far: float) -> Picture:
+def draw_view(
+    gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor, far: float,
+    rasteriser: Rasteriser = RASTERISER,
+) -> Picture:  # fmt: skip
     """Draw a picture with depth, opacity and normals.
 
     Args:
@@ -152,12 +112,10 @@ def draw_view(gaussians: Gaussians, camera: SplatCamera, stride: int, background
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
         far: depth where nothing is seen, scene units.
+        rasteriser: how it is drawn.
     """
-    records, keys = on_image(gaussians, camera), sort_keys(gaussians.means, camera)
-    lists = tile_lists(records, camera.width, camera.height, for_gradients=False, keys=keys)
-    image, through, median = blend(
-        records, lists, camera.width, camera.height, background, CHANNELS["normals"], median=True
-    )
+    shown = rasteriser.project(gaussians, camera)
+    image, through, median = rasteriser.draw(shown, camera, background, CHANNELS["normals"], median=True)
     assert median is not None
     opacity = 1 - through
     depth = torch.where(opacity > 1e-6, image[..., 3] / opacity.clamp(min=1e-6), far)

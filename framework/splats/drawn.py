@@ -15,6 +15,7 @@ from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.drawing import DRAWN, draw_view, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
+from nerfloom.splats.rasteriser import RASTERISER
 from nerfloom.splats.redrawn import Redrawn
 
 
@@ -31,7 +32,7 @@ class DrawnGaussians(Renderable):
 
     def __init__(self, gaussians: Gaussians, look: Look, scene: Scene) -> None:
         self.scene = scene
-        self._look, self._redrawn = look, Redrawn(gaussians)
+        self._look, self._redrawn = look, Redrawn(gaussians, RASTERISER)
 
     @property
     def device(self) -> torch.device:
@@ -41,8 +42,8 @@ class DrawnGaussians(Renderable):
     def outputs(self) -> tuple[Output, ...]:
         return (NORMALS,)
 
-    def gaussians(self) -> Gaussians:
-        """Return the Gaussians."""
+    def gaussians(self, time: float | None = None) -> Gaussians:
+        """Return the Gaussians, which are the same at any time."""
         return self._redrawn.gaussians
 
     def look(self) -> Look:

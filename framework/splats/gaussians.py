@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -16,11 +16,16 @@ from nerfloom.splats.look import Look
 
 MAX_DEGREE = max(DEGREES)
 """Highest degree of the spherical harmonics that colours are made of."""
+COLUMNS = ("means", "log_scales", "rotations", "logits", "colors", "harmonics")
+"""Names of the columns that all Gaussians have."""
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians of 3D Gaussian Splatting (Kerbl et al. 2023), before their activations."""
+    """N Gaussians of 3D Gaussian Splatting (Kerbl et al. 2023), before their activations.
+
+    Their parameters are columns with names: six that drawing needs, and those that a method adds.
+    """
 
     means: Tensor
     """(N, 3) centres, scene coordinates; float64 if a file holds them so."""
@@ -36,6 +41,33 @@ class Gaussians:
     harmonics: Tensor
     """(N, 3, K) coefficients of degrees 1 to D for each channel, in the order of `spherical_harmonics`; K is 0, 3, 8
     or 15."""
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+    """Further columns (N, ...) by name, such as velocities. Files hold none of them."""
+
+    @classmethod
+    def of(cls, columns: Mapping[str, Tensor]) -> Gaussians:
+        """Return Gaussians of columns.
+
+        Args:
+            columns: the six, and any others, by name.
+        """
+        extras = {name: values for name, values in columns.items() if name not in COLUMNS}
+        return cls(**{name: columns[name] for name in COLUMNS}, extras=extras)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Gaussians]) -> Gaussians:
+        """Return several Gaussians as one, those of the first part first.
+
+        Args:
+            parts: at least one, all with the same columns.
+        """
+        columns = [part.columns for part in parts]
+        return cls.of({name: torch.cat([each[name] for each in columns]) for name in columns[0]})
+
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """All parameters by name: the six, then the others."""
+        return {name: getattr(self, name) for name in COLUMNS} | dict(self.extras)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -51,12 +83,12 @@ class Gaussians:
         return float(self.log_scales.exp().median()) if len(self) else 0.0
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """Return what a function makes of every tensor.
+        """Return what a function makes of every column.
 
         Args:
-            function: is applied to each of the six.
+            function: is applied to each.
         """
-        return Gaussians(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
+        return Gaussians.of({name: function(values) for name, values in self.columns.items()})
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """Return the Gaussians selected by a slice, a mask or an index tensor."""
@@ -64,8 +96,8 @@ class Gaussians:
 
     def finite(self) -> Tensor:
         """Return (N,) whether all parameters of a Gaussian are finite."""
-        values = (getattr(self, field.name) for field in fields(self))
-        return torch.stack([each.flatten(1).isfinite().all(1) for each in (v.unsqueeze(-1) for v in values)]).all(0)
+        values = (each.unsqueeze(-1).flatten(1) for each in self.columns.values())
+        return torch.stack([each.isfinite().all(1) for each in values]).all(0)
 
 
 class Splats(NamedTuple):
@@ -81,8 +113,12 @@ class Splats(NamedTuple):
 class HasGaussians(Protocol):
     """A model that consists of Gaussians."""
 
-    def gaussians(self) -> Gaussians:
-        """Return them, without gradient."""
+    def gaussians(self, time: float | None = None) -> Gaussians:
+        """Return them as they are at a time, without gradient.
+
+        Args:
+            time: in [0, 1]; None for a still scene.
+        """
 
     def look(self) -> Look:
         """Return how they are drawn."""

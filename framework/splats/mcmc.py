@@ -6,22 +6,37 @@ stays as it was; noise moves those that are nearly transparent, and so looks for
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from nerfloom.base import device as devices
 from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.strategy import Change, Strategy
 
 DEAD = 0.005
-"""Opacity from which on a Gaussian is of no use."""
+"""Opacity at or below which a Gaussian counts as dead."""
+GROWTH = 1.05
+"""Ratio of the number of Gaussians after a change to that before it, until there are as many as there may be."""
 MOST_COPIES = 51
 """Gaussians that one may become at a time."""
 NOISE_SHARPNESS, NOISE_FROM = 100.0, 0.005
 """How steeply noise ends with opacity, and at which opacity half of it is left."""
 
 
-def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
+class Mcmc(Strategy):
+    """Dead Gaussians move to live ones, and a few are added each time."""
+
+    changes_per_doubling = 15.0
+
+    def grow(self, gaussians: Gaussians, most: int, extent: float) -> Change | None:
+        here = len(gaussians)
+        return moved(gaussians, max(min(most, int(GROWTH * here)) - here, 0))
+
+
+def moved(gaussians: Gaussians, added: int) -> Change | None:
     """Move dead Gaussians to live ones, and add more.
 
     Args:
@@ -29,8 +44,8 @@ def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
         added: how many more there are to be.
 
     Returns:
-        which Gaussians (K,) stay as they are, and those that are added behind them: each that was chosen, as many
-        times as it is to be there. None where nothing is to be done.
+        Which of them stay, and those that are added: each that was chosen, as many times as it is to be there. None
+        if nothing is to be done.
     """
     opacity = torch.sigmoid(gaussians.logits)
     alive = (opacity > DEAD) & gaussians.finite()
@@ -45,9 +60,8 @@ def moved(gaussians: Gaussians, added: int) -> tuple[Tensor, Gaussians] | None:
     count = copies[chosen] + 1
     logits, log_scales = shared(gaussians.logits[chosen], gaussians.log_scales[chosen], count)
     index = torch.repeat_interleave(torch.arange(len(chosen), device=count.device), count)
-    fresh = gaussians[chosen[index]]
-    fresh = Gaussians(fresh.means, log_scales[index], fresh.rotations, logits[index], fresh.colors, fresh.harmonics)
-    return (alive & (copies == 0)).nonzero()[:, 0], fresh
+    fresh = replace(gaussians[chosen[index]], log_scales=log_scales[index], logits=logits[index])
+    return Change((alive & (copies == 0)).nonzero()[:, 0], fresh)
 
 
 def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:

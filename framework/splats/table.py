@@ -1,28 +1,124 @@
-"""A parameter of Gaussians, of which there may be any number."""
+"""Gaussians as an optimiser changes them: a column for each parameter, by name, and a row for each Gaussian."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TypeAlias
 
 import torch
 from torch import Tensor, nn
 
-from nerfloom.base.optimised import Optimised
+from nerfloom.base.optimised import Optimised, RowChange
+from nerfloom.splats.gaussians import Gaussians
 
 
-class Table(nn.Module):
+class Column(nn.Module):
     """One parameter of every Gaussian, with its optimiser settings.
 
     Args:
-        width: numbers of a Gaussian.
+        shape: shape of one Gaussian's values.
         optimised: settings of the optimiser.
+        in_extents: whether the values are lengths, stored in units of the scene's extent. One learning rate then suits
+            scenes of any size.
     """
 
-    def __init__(self, width: int, optimised: Optimised) -> None:
+    def __init__(self, shape: tuple[int, ...], optimised: Optimised, in_extents: bool = False) -> None:
         super().__init__()
-        self.values = nn.Parameter(torch.zeros(0, width))
+        self.shape, self.in_extents = shape, in_extents
+        self.values = nn.Parameter(torch.zeros(0, math.prod(shape)))
         self.optimised = optimised
+
+    def read(self, extent: Tensor | float) -> Tensor:
+        """Return the values (N, *shape), lengths in scene units.
+
+        Args:
+            extent: size of the scene, scene units.
+        """
+        values = self.values.view(len(self.values), *self.shape)
+        return values * extent if self.in_extents else values
+
+    def rows(self, values: Tensor, extent: Tensor | float) -> Tensor:
+        """Return rows (N, width) as they are stored: the inverse of `read`.
+
+        Args:
+            values: (N, *shape), lengths in scene units.
+            extent: size of the scene, scene units.
+        """
+        rows = values.reshape(len(values), self.values.shape[1])
+        return rows / extent if self.in_extents else rows
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
         saved = state_dict.get(prefix + "values")
         if saved is not None and saved.ndim == 2 and saved.shape[1] == self.values.shape[1]:
             self.values.data = self.values.new_zeros(saved.shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+Columns: TypeAlias = Mapping[str, Column]
+
+
+def usual_columns(degree: int, rate: float, position_rate: float) -> dict[str, Column]:
+    """Return the columns of 3D Gaussian Splatting, by the names that `Gaussians` has for them.
+
+    Args:
+        degree: highest degree of the harmonics.
+        rate: learning rate of scales; those of the others are in a fixed ratio to it.
+        position_rate: learning rate of centres, extents of the scene. The run's schedule applies to it alone.
+    """
+
+    def column(shape: tuple[int, ...], name: str, factor: float) -> Column:
+        return Column(shape, Optimised(name, factor * rate, schedule="constant", sparse=True))
+
+    return {
+        "means": Column((3,), Optimised("means", position_rate, sparse=True), in_extents=True),
+        "log_scales": column((3,), "scales", 1.0),
+        "rotations": column((4,), "rotations", 0.2),
+        "logits": column((), "opacities", 10.0),
+        "colors": column((3,), "colors", 0.5),
+        "harmonics": column((3, (degree + 1) ** 2 - 1), "harmonics", 0.025),
+    }
+
+
+def as_gaussians(columns: Columns, extent: Tensor | float = 1.0) -> Gaussians:
+    """Return the Gaussians whose parameters are in columns.
+
+    Args:
+        columns: N rows of each column, by name.
+        extent: size of the scene, scene units.
+    """
+    return Gaussians.of({name: column.read(extent) for name, column in columns.items()})
+
+
+def as_rows(columns: Columns, gaussians: Gaussians, extent: Tensor | float = 1.0) -> dict[str, Tensor]:
+    """Return the parameters of N Gaussians as rows of columns: the inverse of `as_gaussians`.
+
+    Args:
+        columns: the columns.
+        gaussians: N Gaussians. A column that they lack is 0.
+        extent: size of the scene, scene units.
+
+    Raises:
+        ValueError: if they have a column that is not among `columns`.
+    """
+    given = gaussians.columns
+    if unknown := given.keys() - columns.keys():
+        raise ValueError(f"there is no column {', '.join(sorted(unknown))}, only {', '.join(columns)}")
+
+    def zeros(column: Column) -> Tensor:
+        return gaussians.log_scales.new_zeros(len(gaussians), *column.shape)
+
+    return {name: column.rows(given.get(name, zeros(column)), extent) for name, column in columns.items()}
+
+
+def row_changes(columns: Columns, kept: Tensor, fresh: Gaussians, extent: Tensor | float = 1.0) -> list[RowChange]:
+    """Return the changes of columns after which some Gaussians stay and others follow them.
+
+    Args:
+        columns: the columns.
+        kept: (K,) int64 which of them stay.
+        fresh: those that are added.
+        extent: size of the scene, scene units.
+    """
+    rows = as_rows(columns, fresh, extent)
+    return [RowChange(column.values, kept, rows[name]) for name, column in columns.items()]

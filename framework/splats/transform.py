@@ -20,6 +20,7 @@ def transformed(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Ten
     """Return Gaussians moved by the similarity x -> scale * rotation @ x + shift.
 
     They look the same from a camera that is moved likewise: what a direction d showed, `rotation @ d` shows now.
+    Columns that a method added are left out, since it is not known how they turn.
 
     Args:
         gaussians: N Gaussians.

@@ -19,7 +19,7 @@ from nerfloom.ray_model import RayModel
 from nerfloom.renderable import parts
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.splats.capacity import Room as SplatRoom
+from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.resolution import ImageSizes
 
 if TYPE_CHECKING:
@@ -67,8 +67,8 @@ def skip_report(trainer: Trainer) -> list[Rung]:
         share = sum(room.left_out for room in rooms) / rays
         says = f"rays of batches for whose samples there was no room on the device: {share:.1%}"
         rungs.append(Rung("rays of batches, for want of room", share, None, "no switch", says))
-    splats = getattr(model, "room", None)
-    if isinstance(splats, SplatRoom) and splats.entries:
+    splats = getattr(model, "capacity", None)
+    if isinstance(splats, Capacity) and splats.entries:
         share = splats.left_out / splats.entries
         says = f"entries of lists of Gaussians for which there was no room on the device: {share:.1%}"
         rungs.append(Rung("entries of tiles' lists, for want of room", share, None, "no switch", says))

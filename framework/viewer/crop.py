@@ -90,7 +90,7 @@ def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor
     """
     camera = view.camera
     if isinstance(model, RendersGaussians):
-        found = model.gaussians()
+        found = model.gaussians(view.time)
         return model.render_gaussians(found[within(found.means, camera, crop)], view, background)
     rays = camera.pixel_rays(camera.image_pixels(0), model.scene.near, model.scene.far)
     if not isinstance(model, RendersRays):

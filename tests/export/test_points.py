@@ -48,7 +48,7 @@ def test_normals_of_a_ball_point_to_who_sees_them() -> None:
 class Drawn(Ball):
     """A method that draws whole images, and casts no rays."""
 
-    config = SimpleNamespace(background="white")
+    background = torch.ones(3)
     device = torch.device("cpu")
     scene = SimpleNamespace(far=100.0, near=0.0, has_alpha=True, box=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 

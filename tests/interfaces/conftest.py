@@ -15,6 +15,8 @@ METHODS = {
     "cones": "methods.cones",
     "surface": "methods.surface",
     "doubtful": "methods.doubtful",
+    "fittest": "methods.fittest",
+    "drift": "methods.drift",
 }
 HERE = Path(__file__).parent
 

@@ -33,7 +33,7 @@ from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarc
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.kernels.networks.mlp import mlp, mlp_reference
 from nerfloom.kernels.splats.blend import blend, blend_reference
-from nerfloom.kernels.splats.project import RECORD, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists, tile_lists_reference
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels import test_trace
@@ -67,9 +67,10 @@ def seen_by(pose: Tensor) -> SplatCamera:
 def wide_records(count: int) -> Tensor:
     """Records so wide that alpha at their bounds is nothing: whether a pixel is within does not matter."""
     records = torch.zeros(count, RECORD)
-    records[:, :2], records[:, 2:5] = 150 * torch.rand(count, 2), 0.5 + torch.rand(count, 3) / 5
-    records[:, 5], records[:, 6], records[:, [7, 15]] = torch.rand(count) / 2, 60.0, 25.0
-    records[:, 8:12] = torch.rand(count, 4)
+    records[:, :2], records[:, Record.U_X : Record.OPACITY] = 150 * torch.rand(count, 2), 0.5 + torch.rand(count, 3) / 5
+    records[:, Record.OPACITY], records[:, Record.CUT] = torch.rand(count) / 2, 60.0
+    records[:, [Record.REACH_X, Record.REACH_Y]] = 25.0
+    records[:, Record.RED : Record.NORMAL_X] = torch.rand(count, 4)
     return records
 
 
@@ -78,7 +79,8 @@ def on_image(form: Callable[..., object]) -> Callable[..., Tensor]:
 
     def run(records: Tensor) -> Tensor:
         # What bounds a Gaussian has no gradient, whose place the compiled form uses for something else.
-        records = torch.cat([records[:, :6], records[:, 6:8].detach(), records[:, 8:]], -1)
+        shape, bounds, rest = records.split([Record.CUT, Record.RED - Record.CUT, RECORD - Record.RED], -1)
+        records = torch.cat([shape, bounds.detach(), rest], -1)
         found = form(records, tile_lists(records.float(), 150, 140), 150, 140, torch.ones(3), 4, False)
         return torch.cat([found.image, found.transmittance[..., None]], -1).flatten(0, 1)  # type: ignore[attr-defined]
 

@@ -41,16 +41,7 @@ from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, NETWORK
 from nerfloom.kernels.rows import GATHER_ROWS
 from nerfloom.kernels.splats.blend import BLEND
 from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
-from nerfloom.kernels.splats.project import (
-    CUT,
-    DISTANCE,
-    PROJECT,
-    REACH_X,
-    REACH_Y,
-    RECORD,
-    SplatCamera,
-    project_gaussians,
-)
+from nerfloom.kernels.splats.project import PROJECT, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TILES, tile_lists
 from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
 from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
@@ -138,9 +129,9 @@ def projected() -> Tensor:
 def everywhere(left: int, right: int) -> Tensor:
     """Records on an image of 32 x 32, all of whose tiles they meet; some are not visible, and many as far as others."""
     records = torch.zeros(60, RECORD)
-    records[:, :2], records[:, [2, 4]] = 32 * torch.rand(60, 2), 1.0
-    records[:, CUT], records[:, [REACH_X, REACH_Y]] = 1e5 * torch.rand(60) - 2e4, 40.0
-    records[:, DISTANCE] = torch.randint(left, right, (60,)).float()
+    records[:, :2], records[:, [Record.U_X, Record.V_Y]] = 32 * torch.rand(60, 2), 1.0
+    records[:, Record.CUT], records[:, [Record.REACH_X, Record.REACH_Y]] = 1e5 * torch.rand(60) - 2e4, 40.0
+    records[:, Record.DISTANCE] = torch.randint(left, right, (60,)).float()
     return records
 
 

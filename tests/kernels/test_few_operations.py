@@ -20,16 +20,7 @@ from nerfloom.kernels.march.waves import ReferenceMarch
 from nerfloom.kernels.rows import gather_rows
 from nerfloom.kernels.splats import blend
 from nerfloom.kernels.splats.blend import BLEND, CHANNELS, blend_reference
-from nerfloom.kernels.splats.project import (
-    CUT,
-    DISTANCE,
-    NORMAL,
-    OPACITY,
-    PROJECT,
-    RGB,
-    SplatCamera,
-    project_reference,
-)
+from nerfloom.kernels.splats.project import PROJECT, Record, SplatCamera, project_reference
 from nerfloom.kernels.splats.tiles import TILES, TileLists, tile_lists_reference
 from tests.kernels.test_march import occupancy, random_rays
 
@@ -193,8 +184,8 @@ def test_lists_of_tiles_with_little_room(room: int) -> None:
     assert torch.equal(found.slots[:entries], truth.slots)
     assert found.needed == truth.needed == len(tile_lists_reference(records, camera.width, camera.height).ids)
     assert (entries == truth.needed) == (room == 5000)
-    distances = records[:, DISTANCE][records[:, CUT] > 0].sort().values
-    listed = records[truth.ids.long().unique(), DISTANCE].sort().values
+    distances = records[:, Record.DISTANCE][records[:, Record.CUT] > 0].sort().values
+    listed = records[truth.ids.long().unique(), Record.DISTANCE].sort().values
     assert torch.equal(listed, distances[: len(listed)])
     pictures = [few(BLEND)(records, lists, 70, 50, torch.ones(3), 3, False).image for lists in (found, truth)]
     same(*([picture] for picture in pictures))
@@ -213,11 +204,11 @@ def test_projection(basis: int) -> None:
         leaves = [values.clone().requires_grad_() for values in (*given, torch.eye(3, 4).double())]
         camera = SplatCamera(leaves[-1], (60.0, 62.0, 35.0, 25.0), 70, 50, antialiased=True)
         records, dropped = form(*leaves[:-1], camera, basis)
-        columns = torch.cat([records[:, :CUT], records[:, RGB:NORMAL]], 1)
+        columns = torch.cat([records[:, : Record.CUT], records[:, Record.RED : Record.NORMAL_X]], 1)
         (columns * torch.linspace(-1, 1, 10).double().cos()).square().sum().backward()
         found.append([records, torch.as_tensor(dropped), *(leaf.grad for leaf in leaves)])
-    assert bool((found[1][0][:, OPACITY] > 0).any())
-    assert bool((found[1][0][:, OPACITY] == 0).any())
+    assert bool((found[1][0][:, Record.OPACITY] > 0).any())
+    assert bool((found[1][0][:, Record.OPACITY] == 0).any())
     assert int(found[0][1]) == (4 if basis else 3)
     same(*found)
 

@@ -42,7 +42,7 @@ from nerfloom.kernels.histograms.step_functions import blurred_excess, blurred_e
 from nerfloom.kernels.images.ssim import photometric_loss, photometric_reference
 from nerfloom.kernels.networks.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
 from nerfloom.kernels.splats.blend import blend, blend_reference
-from nerfloom.kernels.splats.project import SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
@@ -156,7 +156,8 @@ def on_image(form: Function) -> Function:
     def run(pose: Tensor, **rows: Tensor) -> Tensor:
         camera = SplatCamera(pose, (20.0, 22.0, 10.0, 8.0), 20, 17, antialiased=True)
         records = form(*rows.values(), camera, 3)[0]
-        return torch.cat([records[:, :6], records[:, 8:12]], -1)  # what gradients go through
+        # What gradients go through.
+        return torch.cat([records[:, : Record.CUT], records[:, Record.RED : Record.NORMAL_X]], -1)
 
     return run
 
@@ -164,7 +165,8 @@ def on_image(form: Function) -> Function:
 def blended(form: Function) -> Function:
     def run(records: Tensor) -> Tensor:
         # What bounds a Gaussian has no gradient, whose place the compiled form uses for something else.
-        records = torch.cat([records[:, :6], records[:, 6:8].detach(), records[:, 8:]], -1)
+        shape, bounds, rest = records.split([Record.CUT, Record.RED - Record.CUT, RECORD - Record.RED], -1)
+        records = torch.cat([shape, bounds.detach(), rest], -1)
         found = form(records, tile_lists(records, 20, 17), 20, 17, torch.ones(3), 4, False)
         return torch.cat([found.image.flatten(), found.transmittance.flatten()])
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfloom.geometry.lenses import Distortion
 from nerfloom.kernels.splats.blend import MAX_ALPHA, OPAQUE, blend
-from nerfloom.kernels.splats.project import MIN_ALPHA, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.project import MIN_ALPHA, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.splat_truth import NAMES, camera, compared, drawn, leaves, scene, true_image
@@ -141,7 +141,7 @@ def test_normals_are_of_the_shortest_axis_and_face_the_camera(axis: int) -> None
         (2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)),
         (2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z),
     )
-    normals = records[:, 12:15].double()
+    normals = records[:, Record.NORMAL_X : Record.REACH_Y].double()
     assert (normals * means).sum(-1).amax() <= 0
     alike = (normals * torch.stack(columns[axis], -1)).sum(-1).abs()
     torch.testing.assert_close(alike, torch.ones_like(alike), rtol=0, atol=1e-5)
@@ -199,7 +199,7 @@ def test_what_is_behind_the_camera_or_too_near_is_not_drawn() -> None:
     rows[0] = torch.tensor([[0.0, 0.0, depth] for depth in depths])
     view = replace(straight(9, 9), near=near)
     records, dropped = project_gaussians(*rows[:6], view)
-    assert (records[:, 6] > 0).tolist() == [False] * 6 + [True] * 2
+    assert (records[:, Record.CUT] > 0).tolist() == [False] * 6 + [True] * 2
     assert not records[:6].any()
     assert dropped == 0
     ours = leaves(rows)
@@ -245,8 +245,8 @@ def test_opacities_of_nothing_and_of_all() -> None:
     view = straight(17, 17)
     records, dropped = project_gaussians(*rows[:6], view)
     assert dropped == 2
-    assert (records[:, 6] > 0).tolist() == [False, True, False, False]
-    assert records[1, 5] == 1
+    assert (records[:, Record.CUT] > 0).tolist() == [False, True, False, False]
+    assert records[1, Record.OPACITY] == 1
     ours = leaves(rows)
     found = drawn(ours, view)
     assert float(found.transmittance.detach().amin()) == pytest.approx(1 - MAX_ALPHA, rel=1e-3)
@@ -411,7 +411,7 @@ def test_beyond_a_lenss_reach_nothing_is_drawn() -> None:
     records, dropped = project_gaussians(*rows[:3], torch.zeros(8), rows[3], torch.zeros(8, 3, 0), view)
     within = across.abs() < 0.9**-0.5
     assert dropped == 0
-    assert torch.equal(records[:, 6] > 0, within)
+    assert torch.equal(records[:, Record.CUT] > 0, within)
     bent = 40 + 50 * (across - 0.3 * across**3)
     torch.testing.assert_close(records[within, 0], bent[within])
     assert not records[~within].any()

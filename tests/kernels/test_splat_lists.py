@@ -7,13 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splats.project import CUT, DISTANCE, OPACITY, RECORD, U_X, project_gaussians
+from nerfloom.kernels.splats.project import RECORD, Record, project_gaussians
 from nerfloom.kernels.splats.tiles import TILE, TILES, TileLists, tile_lists, tile_lists_reference
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, scene
 from tests.kernels.test_few_operations import few
 
 Form = Callable[[Tensor, int, int], TileLists]
+WIDTHS, REACHES = [Record.U_X, Record.V_Y], [Record.REACH_X, Record.REACH_Y]
 SIZES = [(1, 1), (16, 16), (17, 33), (64, 48), (130, 7)]
 FORMS = pytest.mark.parametrize("form", [pytest.param(tile_lists, marks=needs_kernels), tile_lists_reference])
 
@@ -35,8 +36,8 @@ def needed(records: Tensor, width: int, height: int) -> Tensor:
     tile = (y // TILE * columns + x // TILE).flatten()
     r = records.double()[:, :, None]
     dx, dy = x.flatten() + 0.5 - r[:, 0], y.flatten() + 0.5 - r[:, 1]
-    q = (r[:, U_X] * dx + r[:, U_X + 1] * dy) ** 2 + (r[:, U_X + 2] * dy) ** 2
-    alpha = r[:, OPACITY] * torch.exp(-q)
+    q = (r[:, Record.U_X] * dx + r[:, Record.U_Y] * dy) ** 2 + (r[:, Record.V_Y] * dy) ** 2
+    alpha = r[:, Record.OPACITY] * torch.exp(-q)
     found = torch.zeros(len(records), columns * rows)
     found.index_add_(1, tile, (alpha * 255 > 1 + 1e-3).float())
     return found > 0
@@ -56,8 +57,8 @@ def check(lists: TileLists, records: Tensor, width: int, height: int) -> Tensor:
     listed = torch.zeros(count, tiles, dtype=torch.bool)
     listed[ids, tile] = True
     assert int(listed.sum()) == entries  # none twice
-    assert bool((records[ids, CUT] > 0).all())
-    near, far = records[ids[:-1], DISTANCE], records[ids[1:], DISTANCE]
+    assert bool((records[ids, Record.CUT] > 0).all())
+    near, far = records[ids[:-1], Record.DISTANCE], records[ids[1:], Record.DISTANCE]
     ordered = (near < far) | ((near == far) & (ids[:-1] < ids[1:]))
     assert bool((ordered | (tile[:-1] != tile[1:])).all())
     # Slots: sorted by Gaussian, and those of each by tile.
@@ -103,10 +104,10 @@ def test_lists_are_sorted_by_keys_that_are_given(form: Callable[..., TileLists])
     records = records_of(scene(300), 64, 48)
     keys = torch.rand(300) + 1e-3
     given = torch.stack([torch.zeros(300), keys], 1)[:, 1]  # not next to each other in memory
-    found, same = form(records, 64, 48, keys=given), form(records, 64, 48, keys=records[:, DISTANCE].clone())
+    found, same = form(records, 64, 48, keys=given), form(records, 64, 48, keys=records[:, Record.DISTANCE].clone())
     assert all(torch.equal(one, other) for one, other in zip(same[:4], form(records, 64, 48)[:4], strict=True))
     assert not torch.equal(found.ids, same.ids)
-    records[:, DISTANCE] = keys
+    records[:, Record.DISTANCE] = keys
     check(found, records, 64, 48)
     with pytest.raises(ValueError, match="300 Gaussians are sorted by as many keys"):
         tile_lists(records, 64, 48, keys=keys[:4])
@@ -117,7 +118,7 @@ def test_ties_are_in_the_order_of_the_indices(form: Form) -> None:
     torch.manual_seed(2)
     given = scene(500)
     records = records_of(given, 40, 40)
-    records[:, DISTANCE] = torch.randint(1, 4, (500,)).float()
+    records[:, Record.DISTANCE] = torch.randint(1, 4, (500,)).float()
     check(form(records, 40, 40), records, 40, 40)
 
 
@@ -126,11 +127,11 @@ def test_distances_of_all_magnitudes_are_sorted() -> None:
     """All bits of the keys count."""
     torch.manual_seed(3)
     records = torch.zeros(4000, RECORD)
-    records[:, :2], records[:, U_X], records[:, U_X + 2] = 8.0, 0.1, 0.1
-    records[:, OPACITY], records[:, CUT], records[:, [7, 15]] = 0.5, 4.8, 22.0
+    records[:, :2], records[:, WIDTHS], records[:, REACHES] = 8.0, 0.1, 22.0
+    records[:, Record.OPACITY], records[:, Record.CUT] = 0.5, 4.8
     distances = torch.logspace(-30, 30, 4000)
     distances[1000:2000] = 1 + torch.arange(1000) * 2.0**-23
-    records[:, DISTANCE] = distances[torch.randperm(4000)]
+    records[:, Record.DISTANCE] = distances[torch.randperm(4000)]
     check(tile_lists(records, 16, 16), records, 16, 16)
 
 
@@ -169,6 +170,6 @@ def test_lists_of_nothing(form: Form, count: int) -> None:
 def test_more_entries_than_indices_are_refused() -> None:
     """Each of 8192 Gaussians fills an image of 2^18 tiles."""
     records = torch.zeros(8192, RECORD)
-    records[:, [U_X, U_X + 2]], records[:, [CUT, DISTANCE]], records[:, [7, 15]] = 1e-6, 1.0, 1e6
+    records[:, WIDTHS], records[:, [Record.CUT, Record.DISTANCE]], records[:, REACHES] = 1e-6, 1.0, 1e6
     with pytest.raises(ValueError, match="more than 2\\^31 Gaussians on the image's tiles"):
         tile_lists(records, 512 * TILE, 512 * TILE)

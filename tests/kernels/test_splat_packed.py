@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from nerfloom.kernels.splats.packed import PACK, PackedGaussians, pack_gaussians, project_packed
-from nerfloom.kernels.splats.project import CUT, SplatCamera, project_gaussians
+from nerfloom.kernels.splats.project import Record, SplatCamera, project_gaussians
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import camera, scene
 
@@ -31,11 +31,11 @@ def test_records_are_those_of_rows(lens: str, count: int, harmonics: int, degree
     found = project_packed(pack_gaussians(*rows), seen, degree)
     truth = project_gaussians(*rows, camera=seen, degree=degree)[0]
     assert found.shape == (-(-count // PACK) * PACK, truth.shape[1])
-    shown = truth[:, CUT] > 0
+    shown = truth[:, Record.CUT] > 0
     assert count < 16 or 0 < int(shown.sum()) < count
     torch.testing.assert_close(found[:count][shown], truth[shown], rtol=1e-4, atol=1e-5)
-    assert not bool((found[:count, CUT] > 0)[~shown].any())
-    assert not bool((found[count:, CUT] > 0).any())
+    assert not bool((found[:count, Record.CUT] > 0)[~shown].any())
+    assert not bool((found[count:, Record.CUT] > 0).any())
 
 
 def test_bfloat16_changes_colours_by_its_rounding() -> None:
@@ -65,14 +65,14 @@ def test_blocks_whose_balls_the_image_does_not_show_are_not_read() -> None:
     torch.manual_seed(0)
     seen, packed = camera(57, 43), pack_gaussians(*ring(64))
     truth = project_packed(packed, seen)
-    shows = (truth[:, CUT] > 0).view(-1, PACK).any(1)
+    shows = (truth[:, Record.CUT] > 0).view(-1, PACK).any(1)
     assert 4 < int(shows.sum()) < 20
     away = ~(shows | shows.roll(1) | shows.roll(-1))
     values = packed.values.clone()
     values[away] = packed.values[0]
     found = project_packed(PackedGaussians(values, packed.harmonics, packed.balls), seen)
-    shown = truth[:, CUT] > 0
-    assert torch.equal(found[:, CUT] > 0, shown)
+    shown = truth[:, Record.CUT] > 0
+    assert torch.equal(found[:, Record.CUT] > 0, shown)
     assert torch.equal(found[shown], truth[shown])
 
 
@@ -88,6 +88,6 @@ def test_any_number_of_threads(threads: int) -> None:
         found = project_packed(packed, seen)
     finally:
         torch.set_num_threads(before)
-    shown = truth[:, CUT] > 0
-    assert torch.equal(found[:, CUT] > 0, shown)
+    shown = truth[:, Record.CUT] > 0
+    assert torch.equal(found[:, Record.CUT] > 0, shown)
     assert torch.equal(found[shown], truth[shown])

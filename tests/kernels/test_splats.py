@@ -1,5 +1,6 @@
 """Gaussian splatting, from parameters to images and back, against a float64 truth that looks at each pixel."""
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -7,8 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.splats.blend import blend
-from nerfloom.kernels.splats.project import SplatCamera, project_gaussians
+from nerfloom.kernels.native import SOURCES
+from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y, blend
+from nerfloom.kernels.splats.project import Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import tile_lists
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.splat_truth import (
@@ -34,6 +36,13 @@ def threads() -> Iterator[Callable[[int], None]]:
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+def test_cpp_has_the_same_columns_of_a_record() -> None:
+    declared = re.search(r"enum Record \{(.*?)\};", (SOURCES / "splat.h").read_text(encoding="utf-8"), re.DOTALL)
+    assert declared is not None
+    names = re.sub(r"//.*", "", declared[1]).replace(",", " ").split()
+    assert names == [*(column.name for column in Record), "RECORD"]
 
 
 def test_the_truths_harmonics_are_scipys() -> None:
@@ -132,7 +141,7 @@ def test_what_the_channels_hold(lens: str) -> None:
 
 @needs_kernels
 def test_the_sum_of_the_pixels_absolute_gradients() -> None:
-    """In the columns CUT and REACH_X, whatever comes from outside: those of x and of y."""
+    """In the columns ABSOLUTE_X and ABSOLUTE_Y, whatever comes from outside: those of x and of y."""
     torch.manual_seed(5)
     given, view = scene(80), camera(37, 41)
     *parameters, pose = given
@@ -143,9 +152,9 @@ def test_the_sum_of_the_pixels_absolute_gradients() -> None:
     (gradient,) = gradients(found.image, found.transmittance, truth.certain, [records])
     (of_offsets,) = gradients(truth.image[..., :4], truth.transmittance, truth.certain, [truth.offsets])
     order = drawn_indices(given, view)
-    assert relative_error(gradient[order, 6:8], of_offsets.abs().sum(0)) < BOUND
+    assert relative_error(gradient[order][:, [ABSOLUTE_X, ABSOLUTE_Y]], of_offsets.abs().sum(0)) < BOUND
     assert relative_error(gradient[order, :2], -of_offsets.sum(0)) < BOUND
-    assert not gradient[:, 12:].any()
+    assert not gradient[:, Record.NORMAL_X :].any()
 
 
 def drawn_indices(given: list[Tensor], view: SplatCamera) -> Tensor:

@@ -6,9 +6,8 @@ import math
 import pytest
 import torch
 
-from nerfloom import View
 from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y
-from nerfloom.kernels.splats.project import RECORD, X
+from nerfloom.kernels.splats.project import RECORD, Record
 from nerfloom.splats.density_control import (
     CHILDREN,
     GRADIENT,
@@ -18,8 +17,9 @@ from nerfloom.splats.density_control import (
     grown,
     image_gradients,
 )
-from nerfloom.splats.drawing import draw, on_image, splat_camera
+from nerfloom.splats.drawing import draw_colors, splat_camera
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.rasteriser import RASTERISER, Projected
 from tests.splats.test_method import ball, camera
 
 EXTENT = 2.0
@@ -44,7 +44,7 @@ def test_small_ones_are_cloned_and_large_ones_split() -> None:
     assert change is not None
     assert change.kept.tolist() == [0, 1, 2, 4]
     assert len(change.fresh) == 1 + CHILDREN
-    for ours, theirs in zip(vars(change.fresh[:1]).values(), vars(given[1:2]).values(), strict=True):
+    for ours, theirs in zip(change.fresh[:1].columns.values(), given[1:2].columns.values(), strict=True):
         assert torch.equal(ours, theirs)
     children = change.fresh[1:]
     torch.testing.assert_close(children.log_scales.exp() * SHRUNK, given[[3, 3]].log_scales.exp())
@@ -97,16 +97,16 @@ def test_absolute_gradients_do_not_cancel() -> None:
     """Of a Gaussian in the middle of a symmetric loss the position's gradient is 0; that of its halves is not."""
     one = splat_camera(camera(), 0.1)
     round_one = dataclasses.replace(ball(logit=0.0), log_scales=torch.full((1, 3), math.log(0.2)))
-    records = on_image(round_one, one).detach().requires_grad_()
-    image = draw(records, one, torch.zeros(3)).image
+    records = RASTERISER.project(round_one, one).records.detach().requires_grad_()
+    image = RASTERISER.draw(Projected(records), one, torch.zeros(3)).image
     halves = []
     for part in (image, image[:, :16], image[:, 17:]):
         (gradient,) = torch.autograd.grad(part.sum(), records, retain_graph=True)
         halves.append(gradient)
     whole, left, right = halves
-    assert float(whole[0, X].abs()) < 1e-3 * float(left[0, X].abs())
-    assert float(left[0, X]) == pytest.approx(-float(right[0, X]), rel=1e-3)
-    assert float(image_gradients(whole, 33)[0]) > 10 * float(left[0, X].abs())
+    assert float(whole[0, Record.X].abs()) < 1e-3 * float(left[0, Record.X].abs())
+    assert float(left[0, Record.X]) == pytest.approx(-float(right[0, Record.X]), rel=1e-3)
+    assert float(image_gradients(whole, 33)[0]) > 10 * float(left[0, Record.X].abs())
 
 
 def test_gradients_are_of_an_image_of_two_units() -> None:
@@ -117,7 +117,5 @@ def test_gradients_are_of_an_image_of_two_units() -> None:
 
 def test_what_is_drawn_of_it() -> None:
     """A picture of an opaque ball is bright in its middle, which the other tests rely on."""
-    picture = draw(
-        on_image(ball(), splat_camera(camera(), 0.1)), splat_camera(View(camera()).camera, 0.1), torch.zeros(3)
-    )
-    assert float(picture.image[16, 16, 0]) > 0.7
+    picture = draw_colors(ball(), splat_camera(camera(), 0.1), 1, torch.zeros(3))
+    assert float(picture[16, 16, 0]) > 0.7

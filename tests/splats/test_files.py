@@ -548,7 +548,7 @@ def test_spz_of_other_programs_is_sorted_by_depth(tmp_path: Path, flags: int) ->
 class Splats:
     """A model of which no more is known than that it has Gaussians."""
 
-    scene = SimpleNamespace(warped=False)
+    scene = SimpleNamespace(warped=False, moving=False)
 
     def __init__(self, gaussians: Gaussians, look: Look = OURS) -> None:
         self.found, self.drawn = gaussians, look
@@ -556,7 +556,7 @@ class Splats:
     def look(self) -> Look:
         return self.drawn
 
-    def gaussians(self) -> Gaussians:
+    def gaussians(self, time: float | None = None) -> Gaussians:
         return self.found
 
 

@@ -8,8 +8,10 @@ import torch
 
 from nerfloom import Dataset, GaussianModel, Loss, Method, Scene, ViewBatch
 from nerfloom.base.pace import Pace
-from nerfloom.splats.drawing import draw, splat_camera
-from nerfloom.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, MOVES_PER_DOUBLING, steps_per_move
+from nerfloom.splats.density_control import DensityControl
+from nerfloom.splats.drawing import splat_camera
+from nerfloom.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, steps_per_move
+from nerfloom.splats.mcmc import Mcmc
 from nerfloom.splats.settings import SplattingConfig, decide_splatting
 from nerfloom.splats.start import first_points, from_points, seen_colors
 from nerfloom.testing import check_method
@@ -24,8 +26,8 @@ class Plain(GaussianModel[SplattingConfig]):
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         camera = splat_camera(batch.view.camera, self.near, self.look())
-        records = self.on_image(self.learnt_gaussians(), camera, self.config.degree)
-        rgb = draw(records, camera, batch.background, room=self.room).image
+        shown = self.on_image(self.learnt_gaussians(), camera, self.config.degree)
+        rgb = self.rasteriser.draw(shown, camera, batch.background, capacity=self.capacity).image
         return Loss({"rgb": (rgb - batch.rgb).abs().mean()}, rgb.detach())
 
 
@@ -44,13 +46,13 @@ def test_a_start_and_a_loss_are_a_method(strategy: str) -> None:
 
 
 def test_there_are_enough_changes_to_reach_the_maximum() -> None:
-    for strategy, changes in MOVES_PER_DOUBLING.items():
-        once = steps_per_move(300.0, 30_000, 60_000, strategy)
+    for changes in (DensityControl.changes_per_doubling, Mcmc.changes_per_doubling):
+        once = steps_per_move(300.0, 30_000, 60_000, changes)
         assert once == pytest.approx(300 / min(changes, MOST_MOVES), abs=1)
-        assert 300 / steps_per_move(300.0, 100, 60_000, strategy) == pytest.approx(300 / FEWEST_STEPS)
-        assert steps_per_move(1_000.0, 100, 60_000, strategy) == 1_000 // MOST_MOVES
-    assert steps_per_move(500.0, 60_000, 60_000, "adc") == MOST_STEPS
-    assert steps_per_move(0.0, 10, 60_000, "adc") == FEWEST_STEPS
+        assert 300 / steps_per_move(300.0, 100, 60_000, changes) == pytest.approx(300 / FEWEST_STEPS)
+        assert steps_per_move(1_000.0, 100, 60_000, changes) == 1_000 // MOST_MOVES
+    assert steps_per_move(500.0, 60_000, 60_000, DensityControl.changes_per_doubling) == MOST_STEPS
+    assert steps_per_move(0.0, 10, 60_000, DensityControl.changes_per_doubling) == FEWEST_STEPS
 
 
 @pytest.mark.parametrize(("given", "expected"), [({}, FEWEST_STEPS), ({"steps_per_move": 40}, 40)])

@@ -85,8 +85,8 @@ def test_gaussians_are_pulled_to_the_distances_of_a_field_until_it_fades() -> No
     term = model.loss(drawn, 0).terms["depth"]
     assert float(term.detach()) == pytest.approx(0.5 * 0.5 * 0.2, abs=3e-4)
     term.backward()
-    assert model.means.values.grad is not None
-    assert float(model.means.values.grad[0, 2]) < 0  # the camera is at z = 3, and looks down
+    assert model.columns["means"].values.grad is not None
+    assert float(model.columns["means"].values.grad[0, 2]) < 0  # the camera is at z = 3, and looks down
     model.progress = GUIDED_UNTIL
     assert "depth" not in model.loss(drawn, 0).terms
 

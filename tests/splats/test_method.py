@@ -147,7 +147,7 @@ def test_growth_asks_for_as_much_of_images_of_half_the_size() -> None:
         model.set_gaussians(ball(0.0, log_scales=torch.full((1, 3), -1.0), harmonics=torch.zeros(1, 3, 15)))
         model.loss(batch, 0).total.backward()
         model.after_every_step(0, 0.0, finite=True)
-        means.append(float(model.gradients.take(1)))
+        means.append(float(model.strategy.gradients.take(1)))
     assert means[1] == pytest.approx(means[0], rel=0.05)
 
 

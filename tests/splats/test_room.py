@@ -1,4 +1,4 @@
-"""Room for lists of tiles: as much as images have needed, no wait for it, and what has no room is counted."""
+"""Capacity of lists of tiles: as much as images have needed, no wait for it, and what is left out is counted."""
 
 from pathlib import Path
 
@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from benchmarks.operations import trainer_of
+from nerfloom.kernels.splats.project import RECORD
 from nerfloom.kernels.splats.tiles import TileLists
-from nerfloom.splats.capacity import FADED, HEADROOM, PIECE, Room
+from nerfloom.splats.capacity import FADED, HEADROOM, PIECE, Capacity
 from nerfloom.training.skipping import skip_report
 from tests.training.recorded import ahead
 
 NONE = torch.zeros(0, dtype=torch.int32)
-RECORDS = torch.zeros(100, 16)
+RECORDS = torch.zeros(100, RECORD)
 
 
 def lists(room: int, needed: int | None = None) -> TileLists:
@@ -23,34 +24,34 @@ def lists(room: int, needed: int | None = None) -> TileLists:
 
 def test_room_is_the_most_that_images_have_needed_and_some_more(monkeypatch: pytest.MonkeyPatch) -> None:
     ahead(monkeypatch)
-    room = Room()
-    assert room.of(RECORDS, 64) is None  # nothing is known
+    capacity = Capacity()
+    assert capacity.of(RECORDS, 64) is None  # nothing is known
     for entries in (50_000, 100_000, 70_000):
-        room.note(RECORDS, 64, lists(entries))
-    assert room.of(RECORDS, 64) is None
-    room.read()
-    given = room.of(RECORDS, 64)
+        capacity.note(RECORDS, 64, lists(entries))
+    assert capacity.of(RECORDS, 64) is None
+    capacity.read()
+    given = capacity.of(RECORDS, 64)
     assert given is not None
     assert given % PIECE == 0
     assert HEADROOM * 100_000 <= given < HEADROOM * 100_000 + PIECE
-    assert room.of(RECORDS, 65) is None  # a larger image
-    assert room.of(RECORDS[:0], 64) is None
-    room.note(RECORDS, 64, lists(given, given + 1000))
-    room.read()
-    assert (room.entries, room.left_out) == (220_000 + given + 1000, 1000)
-    more = room.of(RECORDS, 64)
+    assert capacity.of(RECORDS, 65) is None  # a larger image
+    assert capacity.of(RECORDS[:0], 64) is None
+    capacity.note(RECORDS, 64, lists(given, given + 1000))
+    capacity.read()
+    assert (capacity.entries, capacity.left_out) == (220_000 + given + 1000, 1000)
+    more = capacity.of(RECORDS, 64)
     assert more is not None
     assert more >= HEADROOM * (given + 1000)
-    room.note(RECORDS, 64, lists(more, 10))
-    room.read()
-    assert abs(room.of(RECORDS, 64) / (FADED * more) - 1) < 2 * PIECE / more  # type: ignore[operator]
+    capacity.note(RECORDS, 64, lists(more, 10))
+    capacity.read()
+    assert abs(capacity.of(RECORDS, 64) / (FADED * more) - 1) < 2 * PIECE / more  # type: ignore[operator]
 
 
 def test_the_cpu_asks() -> None:
-    room = Room()
-    room.note(RECORDS, 64, lists(9))
-    room.read()
-    assert room.of(RECORDS, 64) is None
+    capacity = Capacity()
+    capacity.note(RECORDS, 64, lists(9))
+    capacity.read()
+    assert capacity.of(RECORDS, 64) is None
 
 
 def test_training_with_room_learns_what_it_learns_without_and_says_what_was_left_out(
@@ -59,14 +60,15 @@ def test_training_with_room_learns_what_it_learns_without_and_says_what_was_left
     """As long as there is enough; the sums of a step may be added up in another order."""
     ahead(monkeypatch)
     asking, given = (trainer_of("gaussian-splatting", tmp_path / name) for name in ("asking", "given"))
-    monkeypatch.setattr(asking.model.room, "read", lambda: None)
+    monkeypatch.setattr(asking.model.capacity, "read", lambda: None)
     for _ in range(6):
         reports = [trainer.train_step() for trainer in (asking, given)]
         given.model.read_counts()
         assert reports[0].losses == pytest.approx(reports[1].losses, rel=1e-4)
-    room = given.model.room
-    assert room.entries > 0 == room.left_out
-    assert room.of(given.model.means.values, 8**2) is not None  # images of a quarter of the width are drawn at first
+    capacity = given.model.capacity
+    assert capacity.entries > 0 == capacity.left_out
+    records = given.model.columns["means"].values
+    assert capacity.of(records, 8**2) is not None  # images of a quarter of the width are drawn at first
     assert not any("room" in rung.says for rung in skip_report(given) if rung.skipped)
-    room.left_out = room.entries // 10
+    capacity.left_out = capacity.entries // 10
     assert any("room" in rung.says and abs(rung.skipped - 0.1) < 0.01 for rung in skip_report(given))

@@ -154,8 +154,8 @@ def test_known_depths_pull_gaussians_there() -> None:
     term = model.loss(batch, 0).terms["depth"]
     assert float(term.detach()) == pytest.approx(0.2, abs=1e-3)
     term.backward()
-    assert model.means.values.grad is not None
-    assert float(model.means.values.grad[0, 2]) < 0  # the camera is at z = 3, and looks down
+    assert model.columns["means"].values.grad is not None
+    assert float(model.columns["means"].values.grad[0, 2]) < 0  # the camera is at z = 3, and looks down
     nothing = dataclasses.replace(batch, distances=torch.zeros(33, 33))
     assert float(model.loss(nothing, 0).terms["depth"].detach()) == 0
 

@@ -38,7 +38,7 @@ from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
 COUNT = 2
 PATIENCE = 120.0
 """Seconds after which a process is taken to hang."""
-STATISTICS = "model.gradients.sums"
+STATISTICS = "model.strategy.gradients.sums"
 """What each process has seen of its own images, until Gaussians are added the next time."""
 
 

@@ -29,11 +29,11 @@ from torch.utils.checkpoint import checkpoint
 
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from nerfloom.kernels.splats.project import CUT, DISTANCE, OPACITY, REACH_X, RECORD, RGB, X, Y
+from nerfloom.kernels.splats.project import RECORD, Record
 from nerfloom.kernels.splats.tiles import TILE, TileLists
 from nerfloom.kernels.triton_backend import later
 
-ABSOLUTE_X, ABSOLUTE_Y = CUT, REACH_X
+ABSOLUTE_X, ABSOLUTE_Y = Record.CUT, Record.REACH_X
 """Columns of the records' gradient with the sums of absolute gradients of x and y."""
 MAX_ALPHA = 0.999
 """No Gaussian is more opaque: the gradient divides by 1 - alpha."""
@@ -103,10 +103,10 @@ def blend_reference(
     for tile in range(columns * rows):
         listed, weights, through = _weights(records, lists, tile, columns)
         rest = 1 - weights.sum(1)
-        tiles.append(weights @ listed[:, RGB : RGB + channels] + rest[:, None] * behind)
+        tiles.append(weights @ listed[:, Record.RED : Record.RED + channels] + rest[:, None] * behind)
         left.append(rest)
         crossed = (through[:, :-1] > 0.5) & (through[:, 1:] <= 0.5)
-        middles.append((crossed * listed[:, DISTANCE]).sum(1).detach())
+        middles.append((crossed * listed[:, Record.DISTANCE]).sum(1).detach())
 
     def joined(parts: list[Tensor]) -> Tensor:
         grid = torch.stack(parts).view(rows, columns, TILE, TILE, -1).permute(0, 2, 1, 3, 4)
@@ -124,9 +124,9 @@ def _weights(records: Tensor, lists: TileLists, tile: int, columns: int) -> tupl
     x = (tile % columns * TILE + offset_x).to(records.dtype) + 0.5
     y = (tile // columns * TILE + offset_y).to(records.dtype) + 0.5
     dx, dy = _offsets(listed[None], x, y)
-    q = (listed[:, 2] * dx + listed[:, 3] * dy) ** 2 + (listed[:, 4] * dy) ** 2
-    alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
-    alpha = alpha.masked_fill(q >= listed[:, CUT], 0)
+    q = _exponent(listed, dx, dy)
+    alpha = (listed[:, Record.OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
+    alpha = alpha.masked_fill(q >= listed[:, Record.CUT], 0)
     through = torch.cat([torch.ones_like(alpha[:, :1]), (1 - alpha).cumprod(1)], 1)
     return listed, (alpha * through[:, :-1]).masked_fill(through[:, :-1] < OPAQUE, 0), through
 
@@ -134,9 +134,15 @@ def _weights(records: Tensor, lists: TileLists, tile: int, columns: int) -> tupl
 def _offsets(listed: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Return the offsets dx, dy (..., P, M) of pixels x, y (..., P) from Gaussians (..., 1, M, RECORD)."""
     pixels = x.shape[-1]
-    center_x = _OfEachPixel.apply(listed[..., X], listed[..., ABSOLUTE_X], pixels)
-    center_y = _OfEachPixel.apply(listed[..., Y], listed[..., ABSOLUTE_Y], pixels)
+    center_x = _OfEachPixel.apply(listed[..., Record.X], listed[..., ABSOLUTE_X], pixels)
+    center_y = _OfEachPixel.apply(listed[..., Record.Y], listed[..., ABSOLUTE_Y], pixels)
     return x[..., None] - center_x, y[..., None] - center_y
+
+
+def _exponent(listed: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+    """Return u^2 + v^2 (..., P, M) at offsets from Gaussians (..., M, RECORD), whose alpha falls by exp(-u^2 - v^2)."""
+    along_x, along_y = listed[..., Record.U_X] * dx, listed[..., Record.U_Y] * dy
+    return (along_x + along_y) ** 2 + (listed[..., Record.V_Y] * dy) ** 2
 
 
 class _OfEachPixel(torch.autograd.Function):
@@ -189,17 +195,17 @@ def _blended_tiles(
     x = ((tiles % columns * TILE)[:, None, None] + within).expand(-1, TILE, -1).flatten(1)
     y = ((tiles // columns * TILE)[:, None, None] + within[:, None]).expand(-1, -1, TILE).flatten(1)
     dx, dy = _offsets(listed, x.to(records.dtype), y.to(records.dtype))
-    q = (listed[..., 2] * dx + listed[..., 3] * dy) ** 2 + (listed[..., 4] * dy) ** 2
-    alpha = (listed[..., OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
-    alpha = alpha.masked_fill((q >= listed[..., CUT]) | (place >= (end - first)[:, None])[:, None], 0)
+    q = _exponent(listed, dx, dy)
+    alpha = (listed[..., Record.OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)
+    alpha = alpha.masked_fill((q >= listed[..., Record.CUT]) | (place >= (end - first)[:, None])[:, None], 0)
     # A sum of logarithms: the gradient of a product asks the device whether a factor is 0.
     through = torch.exp(torch.nn.functional.pad(torch.log1p(-alpha).cumsum(-1), (1, 0)))
     in_front = through[..., :-1]
     weights = (alpha * in_front).masked_fill(in_front < OPAQUE, 0)
     rest = 1 - weights.sum(-1, keepdim=True)
-    values = weights @ listed[:, 0, :, RGB : RGB + len(behind)] + rest * behind
+    values = weights @ listed[:, 0, :, Record.RED : Record.RED + len(behind)] + rest * behind
     crossed = (in_front > 0.5) & (through[..., 1:] <= 0.5)
-    return torch.cat([values, rest, (crossed * listed[..., DISTANCE]).sum(-1, keepdim=True)], -1)
+    return torch.cat([values, rest, (crossed * listed[..., Record.DISTANCE]).sum(-1, keepdim=True)], -1)
 
 
 def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) -> int:

@@ -20,6 +20,24 @@ from torch import Tensor
 from nerfloom.kernels.splats import blend as blending
 from nerfloom.kernels.splats import project, tiles
 from nerfloom.kernels.splats.blend import Blended
+from nerfloom.kernels.splats.record_triton import (
+    BLUE,
+    CUT,
+    DISTANCE,
+    GREEN,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    OPACITY,
+    REACH_X,
+    RECORD,
+    RED,
+    U_X,
+    U_Y,
+    V_Y,
+    X,
+    Y,
+)
 from nerfloom.kernels.splats.tiles import TileLists
 from nerfloom.kernels.triton_launch import blocks, launch
 
@@ -27,12 +45,7 @@ BATCH = 8
 """Gaussians that are evaluated together."""
 BLOCK = 32
 """Gaussians whose entries' sums are added up together."""
-RECORD, TILE = tl.constexpr(project.RECORD), tl.constexpr(tiles.TILE)
-PIXELS = tl.constexpr(tiles.TILE**2)
-OPACITY, CUT = tl.constexpr(project.OPACITY), tl.constexpr(project.CUT)
-REACH_X, RGB = tl.constexpr(project.REACH_X), tl.constexpr(project.RGB)
-DISTANCE, NORMAL = tl.constexpr(project.DISTANCE), tl.constexpr(project.NORMAL)
-REACH_Y = tl.constexpr(project.REACH_Y)
+TILE, PIXELS = tl.constexpr(tiles.TILE), tl.constexpr(tiles.TILE**2)
 MAX_ALPHA, OPAQUE = tl.constexpr(blending.MAX_ALPHA), tl.constexpr(blending.OPAQUE)
 SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY = (tl.constexpr(k) for k in range(5))
 SUM_G, ABSOLUTE_X, ABSOLUTE_Y = tl.constexpr(5), tl.constexpr(6), tl.constexpr(7)
@@ -60,9 +73,9 @@ def _alphas(record, listed, x, y, through):
 
     The transmittances are those in front of each Gaussian; alphas are 0 where nothing is blended.
     """
-    dx, dy = x[:, None] - _column(record, listed, 0), y[:, None] - _column(record, listed, 1)
-    u = _column(record, listed, 2) * dx + _column(record, listed, 3) * dy
-    v = _column(record, listed, 4) * dy
+    dx, dy = x[:, None] - _column(record, listed, X), y[:, None] - _column(record, listed, Y)
+    u = _column(record, listed, U_X) * dx + _column(record, listed, U_Y) * dy
+    v = _column(record, listed, V_Y) * dy
     q = u * u + v * v
     raw = tl.where(q < _column(record, listed, CUT), _column(record, listed, OPACITY) * tl.exp(-q), 0.0)
     alpha = tl.where(raw > MAX_ALPHA, MAX_ALPHA, raw)
@@ -89,15 +102,15 @@ def _forward(
         _, _, _, alpha, before = _alphas(record, listed, x, y, through)
         weight = alpha * before
         after = before * (1 - alpha)
-        red += tl.sum(weight * _column(record, listed, RGB), 1)
-        green += tl.sum(weight * _column(record, listed, RGB + 1), 1)
-        blue += tl.sum(weight * _column(record, listed, RGB + 2), 1)
+        red += tl.sum(weight * _column(record, listed, RED), 1)
+        green += tl.sum(weight * _column(record, listed, GREEN), 1)
+        blue += tl.sum(weight * _column(record, listed, BLUE), 1)
         if CHANNELS > 3:
             distance += tl.sum(weight * _column(record, listed, DISTANCE), 1)
         if CHANNELS > 4:
-            normal_x += tl.sum(weight * _column(record, listed, NORMAL), 1)
-            normal_y += tl.sum(weight * _column(record, listed, NORMAL + 1), 1)
-            normal_z += tl.sum(weight * _column(record, listed, NORMAL + 2), 1)
+            normal_x += tl.sum(weight * _column(record, listed, NORMAL_X), 1)
+            normal_y += tl.sum(weight * _column(record, listed, NORMAL_Y), 1)
+            normal_z += tl.sum(weight * _column(record, listed, NORMAL_Z), 1)
         if median_image is not None:
             crossed = (before > 0.5) & (after <= 0.5)
             median += tl.sum(tl.where(crossed, _column(record, listed, DISTANCE), 0.0), 1)
@@ -130,7 +143,7 @@ def _put_shape(part, listed, record, exponent, dx, dy):
     tl.store(part + SUM_XX, tl.sum(by_x * dx, 0), mask=listed)
     tl.store(part + SUM_XY, tl.sum(by_x * dy, 0), mask=listed)
     tl.store(part + SUM_YY, tl.sum(by_y * dy, 0), mask=listed)
-    u_x, u_y, v_y = _column(record, listed, 2), _column(record, listed, 3), _column(record, listed, 4)
+    u_x, u_y, v_y = _column(record, listed, U_X), _column(record, listed, U_Y), _column(record, listed, V_Y)
     of_x = 2 * u_x * (u_x * by_x + u_y * by_y)
     of_y = 2 * (u_y * (u_x * by_x + u_y * by_y) + v_y * v_y * by_y)
     tl.store(part + ABSOLUTE_X, tl.sum(tl.abs(of_x), 0), mask=listed)
@@ -168,14 +181,14 @@ def _backward(
         part = parts + tl.load(slots + entry, mask=listed, other=0).to(tl.int64) * RECORD
         dx, dy, raw, alpha, before = _alphas(record, listed, x, y, through)
         weight = alpha * before
-        own = _column(record, listed, RGB) * red[:, None] + _column(record, listed, RGB + 1) * green[:, None]
-        own += _column(record, listed, RGB + 2) * blue[:, None]
+        own = _column(record, listed, RED) * red[:, None] + _column(record, listed, GREEN) * green[:, None]
+        own += _column(record, listed, BLUE) * blue[:, None]
         if CHANNELS > 3:
             own += _column(record, listed, DISTANCE) * far[:, None]
             tl.store(part + DISTANCE, tl.sum(weight * far[:, None], 0), mask=listed)
-        tl.store(part + RGB, tl.sum(weight * red[:, None], 0), mask=listed)
-        tl.store(part + RGB + 1, tl.sum(weight * green[:, None], 0), mask=listed)
-        tl.store(part + RGB + 2, tl.sum(weight * blue[:, None], 0), mask=listed)
+        tl.store(part + RED, tl.sum(weight * red[:, None], 0), mask=listed)
+        tl.store(part + GREEN, tl.sum(weight * green[:, None], 0), mask=listed)
+        tl.store(part + BLUE, tl.sum(weight * blue[:, None], 0), mask=listed)
         rest = behind[:, None] - tl.cumsum(weight * own, 1)
         # The gradient of the exponent: alpha times that of alpha; none where alpha is at its bound.
         exponent = tl.where(raw < MAX_ALPHA, alpha * (before * own - rest / (1 - alpha)), 0.0)
@@ -203,19 +216,19 @@ def _gather(records, firsts, parts, out, count, BLOCK: tl.constexpr):
         slot = (begin + i).to(tl.int64)
         total += tl.load(parts + slot[:, None] * RECORD + k[None, :], mask=(i < entries)[:, None], other=0.0)
     record, row = records + g * RECORD, out + g * RECORD
-    tl.store(row[:, None] + k[None, :], total, mask=here[:, None] & (k >= RGB)[None, :] & (k < NORMAL)[None, :])
-    tl.store(row[:, None] + k[None, :], tl.zeros_like(total), mask=here[:, None] & (k >= NORMAL)[None, :])
-    u_x = tl.load(record + 2, mask=here, other=0.0)
-    u_y = tl.load(record + 3, mask=here, other=0.0)
-    v_y = tl.load(record + 4, mask=here, other=0.0)
+    tl.store(row[:, None] + k[None, :], total, mask=here[:, None] & (k >= RED)[None, :] & (k < NORMAL_X)[None, :])
+    tl.store(row[:, None] + k[None, :], tl.zeros_like(total), mask=here[:, None] & (k >= NORMAL_X)[None, :])
+    u_x = tl.load(record + U_X, mask=here, other=0.0)
+    u_y = tl.load(record + U_Y, mask=here, other=0.0)
+    v_y = tl.load(record + V_Y, mask=here, other=0.0)
     opacity = tl.load(record + OPACITY, mask=here, other=0.0)
     sum_x, sum_y, sum_xy = _sum(total, SUM_X), _sum(total, SUM_Y), _sum(total, SUM_XY)
     by_u = u_x * sum_x + u_y * sum_y
-    tl.store(row, 2 * u_x * by_u, mask=here)
-    tl.store(row + 1, 2 * (u_y * by_u + v_y * v_y * sum_y), mask=here)
-    tl.store(row + 2, -2 * (u_x * _sum(total, SUM_XX) + u_y * sum_xy), mask=here)
-    tl.store(row + 3, -2 * (u_x * sum_xy + u_y * _sum(total, SUM_YY)), mask=here)
-    tl.store(row + 4, -2 * v_y * _sum(total, SUM_YY), mask=here)
+    tl.store(row + X, 2 * u_x * by_u, mask=here)
+    tl.store(row + Y, 2 * (u_y * by_u + v_y * v_y * sum_y), mask=here)
+    tl.store(row + U_X, -2 * (u_x * _sum(total, SUM_XX) + u_y * sum_xy), mask=here)
+    tl.store(row + U_Y, -2 * (u_x * sum_xy + u_y * _sum(total, SUM_YY)), mask=here)
+    tl.store(row + V_Y, -2 * v_y * _sum(total, SUM_YY), mask=here)
     of_opacity = _sum(total, SUM_G) / tl.where(opacity > 0, opacity, 1.0)
     tl.store(row + OPACITY, tl.where(opacity > 0, of_opacity, 0.0), mask=here)
     tl.store(row + CUT, _sum(total, ABSOLUTE_X), mask=here)

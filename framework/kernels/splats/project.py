@@ -17,6 +17,7 @@ A fisheye shows what lies in front of the camera's plane, less than 90 degrees f
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import torch
@@ -28,12 +29,22 @@ from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
 from nerfloom.kernels.triton_backend import later
 
-RECORD = 16
-"""Values of a Gaussian on the image."""
-X, Y, U_X, OPACITY, CUT, REACH_X, RGB, DISTANCE, NORMAL, REACH_Y = 0, 1, 2, 5, 6, 7, 8, 11, 12, 15
-"""Columns of a record: centre (x, y) in pixels; u_x, u_y, v_y, which make alpha at an offset (dx, dy) from the centre
-opacity * exp(-(u_x dx + u_y dy)^2 - (v_y dy)^2); opacity; the exponent from which alpha is below MIN_ALPHA; half the
-width of what is within it; colour; distance from the camera; normal; half the height."""
+
+class Record(IntEnum):
+    """Columns of a record, which is what an image needs of a Gaussian; kernels/splats/splat.h has the same names.
+
+    Centre X, Y in pixels. U_X, U_Y, V_Y make alpha at an offset (dx, dy) from the centre OPACITY * exp(-u^2 - v^2) with
+    u = U_X dx + U_Y dy and v = V_Y dy. CUT is u^2 + v^2 where alpha falls below MIN_ALPHA; 0 or less if the Gaussian is
+    not visible. REACH_X and REACH_Y are half the width and height of what is within, pixels. DISTANCE is from the
+    camera, scene units. The normal is the shortest axis, turned towards the camera.
+    """
+
+    X, Y, U_X, U_Y, V_Y, OPACITY, CUT, REACH_X = range(8)
+    RED, GREEN, BLUE, DISTANCE, NORMAL_X, NORMAL_Y, NORMAL_Z, REACH_Y = range(8, 16)
+
+
+RECORD = len(Record)
+"""Number of columns of a record."""
 MIN_ALPHA = 1 / 255
 """A Gaussian is not drawn where its alpha is below it."""
 BLUR = 0.3

@@ -19,6 +19,25 @@ from torch import Tensor
 from nerfloom.kernels.encodings.harmonics_triton import harmonics, harmonics_slope
 from nerfloom.kernels.splats import project
 from nerfloom.kernels.splats.project import SplatCamera
+from nerfloom.kernels.splats.record_triton import (
+    BLUE,
+    CUT,
+    DISTANCE,
+    GREEN,
+    NORMAL_X,
+    NORMAL_Y,
+    NORMAL_Z,
+    OPACITY,
+    REACH_X,
+    REACH_Y,
+    RECORD,
+    RED,
+    U_X,
+    U_Y,
+    V_Y,
+    X,
+    Y,
+)
 from nerfloom.kernels.splats.shapes_triton import (
     axes,
     column,
@@ -39,11 +58,7 @@ from nerfloom.kernels.triton_launch import blocks, launch
 
 BLOCK = 128
 """Gaussians that are taken together."""
-RECORD, MIN_ALPHA = tl.constexpr(project.RECORD), tl.constexpr(project.MIN_ALPHA)
-OPACITY, CUT = tl.constexpr(project.OPACITY), tl.constexpr(project.CUT)
-REACH_X, RGB = tl.constexpr(project.REACH_X), tl.constexpr(project.RGB)
-DISTANCE, NORMAL = tl.constexpr(project.DISTANCE), tl.constexpr(project.NORMAL)
-REACH_Y, DC = tl.constexpr(project.REACH_Y), tl.constexpr(project.DC)
+MIN_ALPHA, DC = tl.constexpr(project.MIN_ALPHA), tl.constexpr(project.DC)
 
 
 @triton.jit
@@ -64,24 +79,24 @@ def _put_normal(record, here, r00, r01, r02, r10, r11, r12, r20, r21, r22, s0, s
     n1 = tl.where(third, r12, tl.where(second, r11, r10))
     n2 = tl.where(third, r22, tl.where(second, r21, r20))
     sign = tl.where(n0 * x + n1 * y + n2 * z > 0, -1.0, 1.0)
-    tl.store(record + NORMAL, sign * n0, mask=here)
-    tl.store(record + NORMAL + 1, sign * n1, mask=here)
-    tl.store(record + NORMAL + 2, sign * n2, mask=here)
+    tl.store(record + NORMAL_X, sign * n0, mask=here)
+    tl.store(record + NORMAL_Y, sign * n1, mask=here)
+    tl.store(record + NORMAL_Z, sign * n2, mask=here)
 
 
 @triton.jit
 def _put_record(record, here, u, v, u_x, u_y, v_y, opacity, cut, reach_x, red, green, blue, distance, reach_y):
-    tl.store(record, u, mask=here)
-    tl.store(record + 1, v, mask=here)
-    tl.store(record + 2, u_x, mask=here)
-    tl.store(record + 3, u_y, mask=here)
-    tl.store(record + 4, v_y, mask=here)
+    tl.store(record + X, u, mask=here)
+    tl.store(record + Y, v, mask=here)
+    tl.store(record + U_X, u_x, mask=here)
+    tl.store(record + U_Y, u_y, mask=here)
+    tl.store(record + V_Y, v_y, mask=here)
     tl.store(record + OPACITY, opacity, mask=here)
     tl.store(record + CUT, cut, mask=here)
     tl.store(record + REACH_X, reach_x, mask=here)
-    tl.store(record + RGB, tl.where(red < 0, 0.0, red), mask=here)
-    tl.store(record + RGB + 1, tl.where(green < 0, 0.0, green), mask=here)
-    tl.store(record + RGB + 2, tl.where(blue < 0, 0.0, blue), mask=here)
+    tl.store(record + RED, tl.where(red < 0, 0.0, red), mask=here)
+    tl.store(record + GREEN, tl.where(green < 0, 0.0, green), mask=here)
+    tl.store(record + BLUE, tl.where(blue < 0, 0.0, blue), mask=here)
     tl.store(record + DISTANCE, distance, mask=here)
     tl.store(record + REACH_Y, reach_y, mask=here)
 
@@ -136,8 +151,8 @@ def _colors_back(
     BASIS: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of a channel's coefficients; return that of the direction."""
-    seen = shown & (tl.load(record + RGB + channel, mask=shown, other=0.0) > 0)  # else it was cut off below 0
-    own = tl.where(seen, tl.load(grad + RGB + channel, mask=shown, other=0.0), 0.0)
+    seen = shown & (tl.load(record + RED + channel, mask=shown, other=0.0) > 0)  # else it was cut off below 0
+    own = tl.where(seen, tl.load(grad + RED + channel, mask=shown, other=0.0), 0.0)
     tl.store(colors_grad + n * 3 + channel, own * DC, mask=here)
     of_x = tl.zeros_like(own)
     of_y, of_z = of_x, of_x

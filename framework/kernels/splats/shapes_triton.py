@@ -11,9 +11,7 @@ lane, but for the camera's; `pose` and the like are pointers.
 import triton
 import triton.language as tl
 
-from nerfloom.kernels.splats import project
-
-OPACITY, DISTANCE = tl.constexpr(project.OPACITY), tl.constexpr(project.DISTANCE)
+from nerfloom.kernels.splats.record_triton import DISTANCE, OPACITY, U_X, U_Y, V_Y, X, Y
 
 
 @triton.jit
@@ -147,9 +145,9 @@ def shape_back(grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED: tl.
     Its arguments are `grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED`.
     """
     _, b, c, det, det_0, c0, c1, c2 = covariance(a0, a1, a2, b0, b1, b2, blur)
-    of_u_x = tl.load(grad + 2, mask=shown, other=0.0)
-    of_u_y = tl.load(grad + 3, mask=shown, other=0.0)
-    of_v_y = tl.load(grad + 4, mask=shown, other=0.0)
+    of_u_x = tl.load(grad + U_X, mask=shown, other=0.0)
+    of_u_y = tl.load(grad + U_Y, mask=shown, other=0.0)
+    of_v_y = tl.load(grad + V_Y, mask=shown, other=0.0)
     of_opacity = tl.load(grad + OPACITY, mask=shown, other=0.0)
     u_x, v_y = tl.sqrt(0.5 * c / det), tl.sqrt(0.5 / c)
     u_y = -b / c * u_x
@@ -219,8 +217,8 @@ def position_back(grad, shown, p0, p1, p2, over, at_x, at_y, bounded_x, bounded_
     fy`.
     """
     of_over = of_over - bounded_x * of_jx - bounded_y * of_jy
-    of_x = fx * tl.load(grad, mask=shown, other=0.0) - tl.where(bounded_x == at_x, over * of_jx, 0.0)
-    of_y = fy * tl.load(grad + 1, mask=shown, other=0.0) - tl.where(bounded_y == at_y, over * of_jy, 0.0)
+    of_x = fx * tl.load(grad + X, mask=shown, other=0.0) - tl.where(bounded_x == at_x, over * of_jx, 0.0)
+    of_y = fy * tl.load(grad + Y, mask=shown, other=0.0) - tl.where(bounded_y == at_y, over * of_jy, 0.0)
     by_distance = tl.load(grad + DISTANCE, mask=shown, other=0.0)
     by_distance /= tl.maximum(tl.sqrt(p0 * p0 + p1 * p1 + p2 * p2), 1e-20)
     of_p2 = -over * over * (of_over + of_x * p0 + of_y * p1)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
-from nerfloom.kernels.splats.project import CUT, DISTANCE, REACH_X, REACH_Y, RECORD, X, Y
+from nerfloom.kernels.splats.project import RECORD, Record
 from nerfloom.kernels.triton_backend import later
 
 TILE = 16
@@ -75,8 +75,8 @@ def tile_lists_reference(
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
     order = _keys(records, keys).sort(stable=True).indices
-    order = order[records[order, CUT] > 0]
-    x, y, wide, high = records[order][:, [X, Y, REACH_X, REACH_Y]].unbind(-1)
+    order = order[records[order, Record.CUT] > 0]
+    x, y, wide, high = records[order][:, [Record.X, Record.Y, Record.REACH_X, Record.REACH_Y]].unbind(-1)
     edges_x, edges_y = (torch.arange(count, device=device) * TILE for count in (columns, rows))
 
     def met(center: Tensor, reach: Tensor, edges: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ def tile_lists_reference(
 
 def _keys(records: Tensor, keys: Tensor | None) -> Tensor:
     """Return the numbers (N,) that sort Gaussians: their distances, if no others are given."""
-    return records[:, DISTANCE] if keys is None else keys
+    return records[:, Record.DISTANCE] if keys is None else keys
 
 
 def _dealt(ids: Tensor, tiles: Tensor, num_tiles: int, num_gaussians: int) -> TileLists:
@@ -129,11 +129,11 @@ def _by_entries(
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = torch.sort(_keys(records, keys), stable=True).indices
     sorted_records = records.index_select(0, order)
-    x, y, wide, high = (sorted_records[:, column] for column in (X, Y, REACH_X, REACH_Y))
+    x, y, wide, high = (sorted_records[:, column] for column in (Record.X, Record.Y, Record.REACH_X, Record.REACH_Y))
     left, right = _met(x, wide, columns)
     top, bottom = _met(y, high, rows)
     across, down = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
-    counts = (across * down).masked_fill(sorted_records[:, CUT] <= 0, 0)
+    counts = (across * down).masked_fill(sorted_records[:, Record.CUT] <= 0, 0)
     needed = None if room is None else counts.sum()
     if room is None:
         room = int(counts.sum())

@@ -16,7 +16,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nerfloom.kernels.splats import project, tiles
+from nerfloom.kernels.splats import tiles
+from nerfloom.kernels.splats.project import Record
+from nerfloom.kernels.splats.record_triton import CUT, REACH_X, REACH_Y, RECORD, U_X, U_Y, V_Y, X, Y
 from nerfloom.kernels.splats.tiles import TileLists
 from nerfloom.kernels.triton_launch import blocks, launch
 
@@ -24,9 +26,7 @@ BLOCK = 32
 """Gaussians that are taken together, by one warp."""
 LAST = 2**63 - 1
 """Key behind those of all entries."""
-RECORD, TILE = tl.constexpr(project.RECORD), tl.constexpr(tiles.TILE)
-CUT = tl.constexpr(project.CUT)
-REACH_X, REACH_Y = tl.constexpr(project.REACH_X), tl.constexpr(project.REACH_Y)
+TILE = tl.constexpr(tiles.TILE)
 
 
 @triton.jit
@@ -43,11 +43,11 @@ def _span(centre, reach, count):
 @triton.jit
 def _touches(record, here, column, row):
     """Return whether an ellipse comes within CUT on a tile: the least of a quadratic form over a rectangle."""
-    x0 = column.to(tl.float32) * TILE + 0.5 - tl.load(record, mask=here, other=0.0)
-    y0 = row.to(tl.float32) * TILE + 0.5 - tl.load(record + 1, mask=here, other=0.0)
-    u_x = tl.load(record + 2, mask=here, other=1.0)
-    u_y = tl.load(record + 3, mask=here, other=0.0)
-    v_y = tl.load(record + 4, mask=here, other=1.0)
+    x0 = column.to(tl.float32) * TILE + 0.5 - tl.load(record + X, mask=here, other=0.0)
+    y0 = row.to(tl.float32) * TILE + 0.5 - tl.load(record + Y, mask=here, other=0.0)
+    u_x = tl.load(record + U_X, mask=here, other=1.0)
+    u_y = tl.load(record + U_Y, mask=here, other=0.0)
+    v_y = tl.load(record + V_Y, mask=here, other=1.0)
     x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)
     near_x = tl.where(x0 > 0, x0, tl.where(x1 < 0, x1, 0.0))
     near_y = tl.where(y0 > 0, y0, tl.where(y1 < 0, y1, 0.0))
@@ -73,8 +73,8 @@ def _list(records, distances, counts, firsts, keys, owners, count, columns, rows
         first = tl.load(firsts + g, mask=here, other=0)
         here = here & (tl.load(firsts + g + 1, mask=here, other=0) > first)  # else there is no room
         distance = tl.load(distances + g, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
-    x = tl.load(record, mask=here, other=0.0)
-    y = tl.load(record + 1, mask=here, other=0.0)
+    x = tl.load(record + X, mask=here, other=0.0)
+    y = tl.load(record + Y, mask=here, other=0.0)
     left, right = _span(x, tl.load(record + REACH_X, mask=here, other=0.0), columns)
     top, bottom = _span(y, tl.load(record + REACH_Y, mask=here, other=0.0), rows)
     wide = tl.where(here, tl.maximum(right - left, 0), 0)
@@ -108,7 +108,7 @@ def tile_lists(
     """
     records, count, device = records.contiguous(), len(records), records.device
     columns, rows = blocks(width, tiles.TILE), blocks(height, tiles.TILE)
-    distances = (records[:, project.DISTANCE] if keys is None else keys).contiguous()
+    distances = (records[:, Record.DISTANCE] if keys is None else keys).contiguous()
     counts, programs = torch.empty(count, dtype=torch.int32, device=device), (blocks(count, BLOCK),)
     shared = (count, columns, rows)
     launch(_list, programs, records, distances, counts, None, None, None, *shared, BLOCK=BLOCK, num_warps=1)

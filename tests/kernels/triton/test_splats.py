@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels.splats.blend import blend
-from nerfloom.kernels.splats.project import CUT, REACH_X, RGB, SplatCamera, project_gaussians, project_reference
+from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
 from tests.kernels.splat_truth import camera, growth_error, scene
 from tests.kernels.test_splat_lists import check, needed
 from tests.kernels.triton.compared import DEVICE, compare
 
 WIDTH, HEIGHT = 37, 30
+WIDTHS, REACHES = [Record.U_X, Record.V_Y], [Record.REACH_X, Record.REACH_Y]
 NAMES = "means log_scales rotations logits colors harmonics pose"
 
 
@@ -33,8 +34,8 @@ def projected(antialiased: bool = False, degree: int = 3):
         camera = SplatCamera(pose, (30.0, 32.0, 20.0, 15.0), WIDTH, HEIGHT, antialiased=antialiased)
         records, dropped = project_gaussians(**rows, camera=camera, degree=degree)
         # Bounds and normals pass no gradient on.
-        records = torch.cat([records[:, :CUT], records[:, CUT:RGB].detach(), records[:, RGB : RGB + 4],
-                             records[:, RGB + 4 :].detach()], 1)  # fmt: skip
+        shape, bounds, seen, normals = records.split([Record.CUT, Record.RED - Record.CUT, 4, 4], 1)
+        records = torch.cat([shape, bounds.detach(), seen, normals.detach()], 1)
         return records, torch.as_tensor(dropped, dtype=torch.int64)
 
     return run
@@ -96,10 +97,10 @@ def records_of(given: dict[str, Tensor], width: int = WIDTH, height: int = HEIGH
 @pytest.mark.parametrize(("count", "width", "height"), [(0, 20, 9), (1, 1, 1), (50, 37, 30), (40, 130, 7)])
 def test_lists(count: int, width: int, height: int) -> None:
     records = records_of(gaussians(count), width, height)
-    records[: count // 5, CUT] = 0  # not visible
+    records[: count // 5, Record.CUT] = 0  # not visible
     found = TileLists(*(part.cpu() for part in tile_lists(records.to(DEVICE), width, height)[:4]))
     listed = check(found, records, width, height)
-    assert not (needed(records, width, height) & (records[:, CUT:] > 0)[:, :1] & ~listed).any()
+    assert not (needed(records, width, height) & (records[:, Record.CUT :] > 0)[:, :1] & ~listed).any()
     boxes = check(tile_lists_reference(records, width, height), records, width, height)
     assert not (listed & ~boxes).any()
 
@@ -108,7 +109,7 @@ def test_lists_sorted_by_other_keys() -> None:
     records = records_of(gaussians(50))
     keys = torch.rand(50, generator=torch.Generator().manual_seed(1)) + 0.1
     found = tile_lists(records.to(DEVICE), WIDTH, HEIGHT, keys=keys.to(DEVICE))
-    records[:, 11] = keys  # where the distance is
+    records[:, Record.DISTANCE] = keys  # where the distance is
     check(TileLists(*(part.cpu() for part in found[:4])), records, WIDTH, HEIGHT)
 
 
@@ -132,7 +133,8 @@ def blended(width: int, height: int, channels: int, median: bool):
     def run(records: Tensor, background: Tensor) -> list[Tensor]:
         lists = tile_lists_reference(records, width, height)
         # The columns of bounds get the sums of absolute gradients.
-        records = torch.cat([records[:, :CUT], records[:, CUT:RGB].detach(), records[:, RGB:]], 1)
+        shape, bounds, rest = records.split([Record.CUT, Record.RED - Record.CUT, 8], 1)
+        records = torch.cat([shape, bounds.detach(), rest], 1)
         found = blend(records, lists, width, height, background, channels, median)
         return [part for part in found if part is not None]
 
@@ -149,12 +151,12 @@ def test_blending(count: int, width: int, height: int, channels: int) -> None:
 
 def test_extremes_of_blending() -> None:
     """A stack of walls, at which light ends within a batch and a pixel's alpha is at its bound; and thin veils."""
-    records = torch.zeros(30, 16)
-    records[:, :2], records[:, [2, 4]] = torch.tensor([8.5, 7.5]), 0.05
-    records[:, 5] = torch.tensor([0.004, 0.9, 1.0, 0.5, 0.99, 0.3] * 5)
-    records[:, CUT], records[:, [REACH_X, 15]] = (records[:, 5] * 255).log(), 40.0
-    records[:, RGB : RGB + 3] = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
-    records[:, 11] = torch.arange(30.0) + 1
+    records = torch.zeros(30, RECORD)
+    records[:, :2], records[:, WIDTHS] = torch.tensor([8.5, 7.5]), 0.05
+    records[:, Record.OPACITY] = torch.tensor([0.004, 0.9, 1.0, 0.5, 0.99, 0.3] * 5)
+    records[:, Record.CUT], records[:, REACHES] = (records[:, Record.OPACITY] * 255).log(), 40.0
+    records[:, Record.RED : Record.DISTANCE] = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
+    records[:, Record.DISTANCE] = torch.arange(30.0) + 1
     given = {"records": records, "background": torch.zeros(3)}
     compare(blended(16, 16, 4, median=True), given, "records", tolerance=1e-4)  # what is left is 1e-4 at most
 
@@ -170,13 +172,21 @@ def test_growth_is_by_the_pixels_absolute_gradients(size: tuple[int, int]) -> No
 
 def test_sums_of_absolute_gradients() -> None:
     """Two pixels that pull a Gaussian apart: the gradients of its centre cancel, and their magnitudes do not."""
-    records = torch.zeros(1, 16, device=DEVICE)
-    records[:, :2], records[:, [2, 4]], records[:, 5], records[:, CUT] = 8.0, 0.3, 0.5, math.log(127)
-    records[:, [REACH_X, 15]], records[:, RGB], records[:, 11] = 8.0, 1.0, 1.0
+    records = torch.zeros(1, RECORD, device=DEVICE)
+    records[:, :2], records[:, WIDTHS], records[:, Record.OPACITY] = 8.0, 0.3, 0.5
+    records[:, Record.CUT], records[:, REACHES] = math.log(127), 8.0
+    records[:, Record.RED], records[:, Record.DISTANCE] = 1.0, 1.0
     records.requires_grad_()
     lists = tile_lists(records, 16, 16)
     image = blend(records, lists, 16, 16, torch.zeros(3, device=DEVICE)).image
     (gradient,) = torch.autograd.grad(image.sum(), records)
     assert gradient[0, :2].abs().max() < 1e-5
-    assert gradient[0, CUT] > 0.1
-    torch.testing.assert_close(gradient[0, CUT], gradient[0, REACH_X])
+    assert gradient[0, Record.CUT] > 0.1
+    torch.testing.assert_close(gradient[0, Record.CUT], gradient[0, Record.REACH_X])
+
+
+def test_kernels_have_the_same_columns_of_a_record() -> None:
+    from nerfloom.kernels.splats import record_triton
+
+    assert all(getattr(record_triton, column.name).value == column for column in Record)
+    assert record_triton.RECORD.value == RECORD == len(Record)

@@ -130,8 +130,8 @@ BUGS = (
         "splats-cap-ignored",
         "splats",
         BLEND,
-        "alpha = (listed[:, OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)",
-        "alpha = listed[:, OPACITY] * torch.exp(-q)",
+        "alpha = (listed[:, Record.OPACITY] * torch.exp(-q)).clamp(max=MAX_ALPHA)",
+        "alpha = listed[:, Record.OPACITY] * torch.exp(-q)",
         "without compiled kernels an opaque Gaussian hides all that is behind it for ever",
     ),
     Bug(

@@ -1,0 +1,147 @@
+"""The part that draws Gaussians: it projects them to an image, lists them by tile, and blends them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nerfloom.kernels import native
+from nerfloom.kernels.splats.blend import CHANNELS, Blended, blend
+from nerfloom.kernels.splats.packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
+from nerfloom.kernels.splats.project import MIN_ALPHA, SplatCamera, project_gaussians, sort_keys
+from nerfloom.kernels.splats.tiles import TileLists, tile_lists
+from nerfloom.splats.capacity import Capacity
+from nerfloom.splats.gaussians import COLUMNS, MAX_DEGREE, Gaussians
+from nerfloom.splats.start import morton
+
+MORTON_CELLS = 2**20
+"""Cells along an axis by which Gaussians are sorted."""
+
+
+class Projected(NamedTuple):
+    """N Gaussians on an image."""
+
+    records: Tensor
+    """(N, C) what the image needs of each, in the layout of the rasteriser: `kernels.splat_project.Record`."""
+    keys: Tensor | None = None
+    """(N,) positive numbers that sort them, smallest first; None for their distances."""
+
+
+class Rasteriser:
+    """Draws Gaussians as 3D Gaussian Splatting does, by compiled kernels where there are some.
+
+    A part that draws otherwise replaces one or all of `project`, `tile` and `blend`.
+    """
+
+    def project(self, gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> Projected:
+        """Return Gaussians on an image, with a gradient.
+
+        Args:
+            gaussians: N Gaussians.
+            camera: the image.
+            degree: highest degree of the harmonics that count.
+        """
+        g = gaussians
+        columns = g.means, g.log_scales, g.rotations, g.logits, g.colors, g.harmonics
+        records, _ = project_gaussians(*columns, camera=camera, degree=degree)
+        return Projected(records, sort_keys(g.means, camera))
+
+    def prepared(self, gaussians: Gaussians) -> Callable[[SplatCamera], Projected] | None:
+        """Return a faster `project`, without gradient, of Gaussians that do not change; None if there is none.
+
+        Args:
+            gaussians: N Gaussians. Those that no picture shows may be left out.
+        """
+        return None
+
+    def tile(self, shown: Projected, camera: SplatCamera, entries: int | None = None) -> TileLists:
+        """Return the Gaussians that each tile of an image may show, from front to back.
+
+        Args:
+            shown: N Gaussians on the image.
+            camera: the image.
+            entries: number of entries for which there is memory; None for as many as there are.
+        """
+        gradients = torch.is_grad_enabled()
+        return tile_lists(shown.records, camera.width, camera.height, gradients, entries, shown.keys)
+
+    def blend(
+        self,
+        shown: Projected,
+        lists: TileLists,
+        camera: SplatCamera,
+        background: Tensor,
+        channels: int = CHANNELS["rgb"],
+        median: bool = False,
+    ) -> Blended:
+        """Return an image of Gaussians, with a gradient.
+
+        Args:
+            shown: N Gaussians on the image.
+            lists: those that each tile may show.
+            camera: the image.
+            background: (3,) colour behind everything.
+            channels: number of channels, a value of `CHANNELS`.
+            median: whether to find the median distance. It has no gradient.
+        """
+        return blend(shown.records, lists, camera.width, camera.height, background, channels, median)
+
+    def draw(
+        self,
+        shown: Projected,
+        camera: SplatCamera,
+        background: Tensor,
+        channels: int = CHANNELS["rgb"],
+        capacity: Capacity | None = None,
+        median: bool = False,
+    ) -> Blended:
+        """Return an image of Gaussians: `tile`, then `blend`.
+
+        Args:
+            shown, camera, background, channels, median: as in `blend`.
+            capacity: number of entries of lists on a device that runs ahead of Python, which is waited for otherwise.
+        """
+        pixels = camera.width * camera.height
+        lists = self.tile(shown, camera, None if capacity is None else capacity.of(shown.records, pixels))
+        if capacity is not None:
+            capacity.note(shown.records, pixels, lists)
+        return self.blend(shown, lists, camera, background, channels, median)
+
+
+class PackingRasteriser(Rasteriser):
+    """A rasteriser that packs Gaussians that do not change, on a CPU with compiled kernels."""
+
+    def prepared(self, gaussians: Gaussians) -> Callable[[SplatCamera], Projected] | None:
+        if not native.available() or gaussians.means.device.type != "cpu" or (found := packed(gaussians)) is None:
+            return None
+        return lambda camera: Projected(project_packed(found, camera), packed_sort_keys(found, camera))
+
+
+RASTERISER = PackingRasteriser()
+"""How Gaussians are drawn by default."""
+
+
+def packed(gaussians: Gaussians) -> PackedGaussians | None:
+    """Return Gaussians packed along a curve through space, without those that no picture shows; None if all are so.
+
+    Args:
+        gaussians: N of them, not changed.
+    """
+    shown = gaussians[gaussians.finite() & (gaussians.rotations.square().sum(1) > 1e-24)]
+    shown = shown[torch.sigmoid(shown.logits) > MIN_ALPHA]
+    if not len(shown):
+        return None
+    shown = shown[_along_curve(shown.means)]
+    return pack_gaussians(*(getattr(shown, name) for name in COLUMNS))
+
+
+def _along_curve(means: Tensor) -> Tensor:
+    """Return the order (N,) of positions (N, 3) along a curve through the box of all but the farthest hundredths."""
+    count = len(means)
+    ordered = means.sort(dim=0).values
+    low, high = ordered[count // 100], ordered[count - 1 - count // 100]
+    cells = (means - low) / (high - low).clamp(min=1e-20) * (MORTON_CELLS - 1)
+    return morton(cells.clamp(0, MORTON_CELLS - 1).long()).argsort()

@@ -157,9 +157,7 @@ def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
             direction_frequencies=config.direction_frequencies,
         )
     unbounded = contracted_box(config, scene) is not None
-    sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
-    grid = MultisampledHashGrid(*sizes, config.log2_table_size, config.sparse_updates)
-    field = SizedField(scene.box, grid, config.grid_width, unbounded=unbounded)
+    field = SizedField(scene.box, MultisampledHashGrid.of(config), config.grid_width, unbounded=unbounded)
     field.optimised = grid_optimiser(config, "grid")
     return field
 

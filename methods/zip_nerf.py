@@ -131,8 +131,7 @@ def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Dec
 
 def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
     """Return a field of one multisampled hash grid and two small networks, by `config` and `scene`."""
-    sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
-    grid = MultisampledHashGrid(*sizes, config.log2_table_size, config.sparse_updates, config.hash_decay_mult)
+    grid = MultisampledHashGrid.of(config, config.hash_decay_mult)
     return MultisampledField(scene.box, grid, config.hidden_width, unbounded=config.contraction)
 
 

@@ -46,7 +46,7 @@ def test_every_flag_that_is_named_exists() -> None:
         (["--pipeline.model.num-nerf-sample", "8"], "the nearest is --num-nerf-samples"),
         (
             ["--pipeline.model.collider-params", "1"],
-            "there is no equivalent flag; ns-train nerfacto --help lists all flags",
+            "there is no equivalent flag; ns-train nerfacto --help-all lists all flags",
         ),
         (["--optimizers.fields.optimizer.lr", "1e-3"], "here it is --learning-rate"),
         (["--optimizers.camera-opt.optimizer.lr", "1e-3"], "here it is --camera-learning-rate"),

@@ -21,7 +21,7 @@ NO_VALUES = (type(None), Literal["auto"], LEFT_TO_DATA, ...)
 
 
 def flag_tables(name: str, config: TrainConfig) -> str:
-    """Return Markdown with one table for each group of flags, in the order of `ns-train METHOD --help`.
+    """Return Markdown with one table for each group of flags, in the order of `ns-train METHOD --help-all`.
 
     Args:
         name: the method's name.

@@ -94,7 +94,7 @@ def is_open(value: Any, hint: Any) -> bool:
 def flags(name: str, method: Method) -> str:
     """Return the section with every flag."""
     lead = (
-        f"As `ns-train {name} --help` shows them, with the defaults of this method. Flags of the data format come "
+        f"As `ns-train {name} --help-all` shows them, with the defaults of this method. Flags of the data format come "
         "after them."
     )
     return f"## Flags\n\n{lead}\n\n{flag_tables(name, method.config)}"

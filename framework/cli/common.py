@@ -14,7 +14,7 @@ import nerfloom
 from nerfloom.base.console import console, say
 from nerfloom.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
 from nerfloom.base.from_nerfstudio import KINDS
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
 from nerfloom.training.signals import exit_status, orderly_end
 
@@ -41,7 +41,7 @@ def chosen_kind(
     Raises:
         ConfigError: if `kinds` has no such name; the message suggests the nearest.
     """
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments or arguments[0] in HELP:
         print(usage)
         return None
     name = arguments[0]
@@ -68,7 +68,7 @@ def with_run(arguments: list[str], several: Collection[str] = ()) -> list[str]:
         word = arguments[index]
         if not word.startswith("-"):
             return [*arguments[:index], "--load-config", *arguments[index:]]
-        index += 1 if "=" in word or word in ("-h", "--help") else 2
+        index += 1 if "=" in word or word in HELP else 2
         while word.replace("_", "-") in several and index < len(arguments) and _is_word(arguments[index]):
             index += 1
     return arguments

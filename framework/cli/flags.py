@@ -11,6 +11,8 @@ from typing import Any
 
 from nerfloom.base.errors import FlagError
 
+HELP = ("-h", "--help", "--help-all")
+"""Flags that ask for the help of any command. `ns-train METHOD` has so many flags that --help leaves some out."""
 FRAME = "╭╮╰╯│─"
 """What tyro draws boxes and rules with, unless the terminal has only ASCII."""
 EDGE = re.compile("^[╭│ ][─ ]")
@@ -48,8 +50,9 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
     """
     import tyro
 
-    from nerfloom.cli.flag_text import plain_flags
+    from nerfloom.cli.flag_help import RefusedSettings, plain_flags
 
+    arguments = ["--help" if argument in HELP else argument for argument in arguments]
     options = {"config": (tyro.conf.FlagConversionOff,), "registry": plain_flags(), **options}
     said = io.StringIO()
     try:
@@ -59,6 +62,8 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
         if not end.code:
             raise
         raise FlagError(in_one_line(said.getvalue(), prog)) from None
+    except RefusedSettings as error:
+        raise FlagError(str(error)) from error
     sys.stderr.write(said.getvalue())
     return settings
 

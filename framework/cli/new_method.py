@@ -11,7 +11,7 @@ from string import Template
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.common import run_command
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
 
 TEMPLATES = Path(__file__).parents[1] / "templates" / "method"
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or {"-h", "--help"} & set(arguments):
+    if not arguments or set(HELP) & set(arguments):
         print(USAGE)
         return
     name = arguments[0]

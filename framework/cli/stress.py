@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
 from nerfloom.cli.common import make_room, run_command
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
 from nerfloom.training.run_path import check_data
 
@@ -64,7 +64,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments or arguments[0] in HELP:
         print(USAGE)
         return
     methods = list(takewhile(lambda word: not word.startswith("-"), arguments))

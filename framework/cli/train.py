@@ -13,7 +13,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.from_nerfstudio import flag_answer, taken, vis_answer
 from nerfloom.cli.common import run_command
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import entry_of, registered, summary
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments or arguments[0] in HELP:
         print(_overview())
         return
     from nerfloom.cli.train_paths import check_paths  # here, so that the help above comes at once
@@ -90,7 +90,10 @@ def _overview() -> str:
     }
     lines = [USAGE, "methods:", *listed["methods"]]
     lines += ["", "data formats (recognised automatically, or named after the flags):", *listed["dataparsers"]]
-    lines += ["", "ns-train METHOD --help shows the method's flags."]
+    lines += [
+        "",
+        "ns-train METHOD --help shows the everyday flags, --help-all those of the method and the data format too.",
+    ]
     return "\n".join(lines)
 
 
@@ -146,7 +149,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
         given, word = _take(flags, "--data")[0], None
         asked = run.config.data if given is None else None if given == "None" else Path(given)
     else:  # a word may belong to the flag before it or be a format's name: only the flags' types tell
-        asking_nothing = [flag for flag in flags if flag not in ("-h", "--help")]
+        asking_nothing = [flag for flag in flags if flag not in HELP]
         initial, unknown = _parsed(run, asking_nothing, {"method": run.config}, return_unknown_args=True)
         asked, word = initial.method.data, _stray_word(unknown)
     if word is not None:
@@ -161,6 +164,8 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     _check_for_nerfstudio(flags, run.method, [run.config, parser])
     run = dataclasses.replace(run, dataparser=named, parser=parser)
     description = f"{summary(registered('methods')[run.method])}\n\nData format: {named}"
+    if _asks_for_help(flags):
+        description += "\n\nThe everyday flags; --help-all shows all, in groups."
     parsed = _parsed(run, flags, {"method": run.config, "format": parser}, description=description)
     config = limited_as_given(dataclasses.replace(parsed.method, data=data), _names(flags))
     folder = run_folder(run.method, config) if fresh else run.folder
@@ -177,26 +182,28 @@ def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any
         options: further arguments of `tyro.cli`.
 
     Raises:
-        FlagError: if a value is out of range.
+        FlagError: if a flag is unknown, or has a value that it cannot have.
     """
     import tyro
 
-    from nerfloom.cli.flag_groups import RefusedSettings, grouped_flags
+    from nerfloom.cli.flag_groups import grouped_flags
 
     fields = [(name, Annotated[type(value), tyro.conf.arg(name="")]) for name, value in settings.items()]
     kind = dataclasses.make_dataclass("Flags", fields)
-    try:
-        return read_flags(
-            kind,
-            f"ns-train {run.method}",
-            flags,
-            default=kind(**settings),
-            config=(tyro.conf.FlagConversionOff, tyro.conf.ConsolidateSubcommandArgs),
-            registry=grouped_flags(run.method, run.config, run.dataparser, run.parser),
-            **options,
-        )
-    except RefusedSettings as error:
-        raise FlagError(str(error)) from error
+    return read_flags(
+        kind,
+        f"ns-train {run.method}",
+        flags,
+        default=kind(**settings),
+        config=(tyro.conf.FlagConversionOff, tyro.conf.CascadeSubcommandArgs),
+        registry=grouped_flags(run.method, run.config, run.dataparser, run.parser, _asks_for_help(flags)),
+        **options,
+    )
+
+
+def _asks_for_help(flags: list[str]) -> bool:
+    """Return whether the flags ask for the help with the everyday flags alone."""
+    return bool({"-h", "--help"} & set(flags)) and "--help-all" not in flags
 
 
 def _are_pairs(flags: list[str]) -> bool:
@@ -204,7 +211,7 @@ def _are_pairs(flags: list[str]) -> bool:
     index = 0
     while index < len(flags):
         has_value = "=" in flags[index]
-        if not flags[index].startswith("--") or flags[index] == "--help":
+        if not flags[index].startswith("--") or flags[index] in HELP:
             return False
         if not has_value and (index + 1 == len(flags) or flags[index + 1].startswith("-")):
             return False

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nerfloom.base.config import TrainConfig, read_yaml
 from nerfloom.base.errors import CheckpointError, DataError
+from nerfloom.cli.flags import HELP
 from nerfloom.training.run_path import check_data, check_writable
 
 
@@ -24,7 +25,7 @@ def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | Non
         DataError: if the data is missing.
         CheckpointError: if the checkpoint to start from is missing.
     """
-    if {"-h", "--help"} & set(flags):
+    if set(HELP) & set(flags):
         return
     settings = {} if recipe is None else read_yaml(recipe)
     data, recorded = _value(flags, "--data"), settings.get("data")

@@ -190,15 +190,3 @@ DATASETS: dict[str, Dataset] = {
     ),
 }
 """Name of a data set -> what there is to know of it. docs/data-sources.md says where addresses and sums are from."""
-
-
-def sources_table() -> str:
-    """Return the table of all sources in Markdown, as docs/data-sources.md has it."""
-    lines = ["| data set | archive | size | source | SHA-256 | tried |", "|---|---|---|---|---|---|"]
-    for name, dataset in DATASETS.items():
-        for archive in dataset.archives:
-            size = "unknown" if archive.gigabytes is None else f"{archive.gigabytes:g} GB"
-            for source in archive.sources:
-                stated = (source.sha256 or "none stated", source.tried or "no")
-                lines.append("| " + " | ".join((name, archive.name, size, f"<{source.url}>", *stated)) + " |")
-    return "\n".join(lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 from torch import Tensor, nn
 
@@ -15,6 +15,7 @@ from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_S
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.table_memory import table
 
+HashGridT = TypeVar("HashGridT", bound="HashGrid")
 FIRST_LEVELS = 4
 """Number of levels that are open at the start if they open one after the other, as in Neuralangelo (Li et al. 2023)."""
 
@@ -84,10 +85,10 @@ class HashGrid(nn.Module):
         self.num_features = num_levels * features_per_level
 
     @classmethod
-    def of(cls, config: HashGridConfig, opening: float = 0.0) -> HashGrid:
-        """Return a grid with the sizes of `config`, decided; `opening` is as in the constructor."""
+    def of(cls: type[HashGridT], config: HashGridConfig, last: float = 0.0) -> HashGridT:
+        """Return a grid with the sizes of `config`, decided; `last` is the constructor's last argument."""
         sizes = config.num_levels, config.features_per_level, config.base_resolution, config.max_resolution
-        return HashGrid(*sizes, config.log2_table_size, config.sparse_updates, opening)
+        return cls(*sizes, config.log2_table_size, config.sparse_updates, last)
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, L * F) at `positions` (N, 3) in [0, 1]."""

@@ -16,18 +16,13 @@ CHUNK = 2**16
 """Number of points whose neighbours are looked up at once."""
 
 
-def mean_distances(points: Tensor, count: int = NEIGHBORS) -> Tensor:
-    """Return the mean distance (K,) of each point to its nearest neighbours.
-
-    Args:
-        points: (K, 3) finite positions.
-        count: number of neighbours; fewer if there are fewer points.
-    """
-    means = [distances[:, 1:].mean(1) for distances, _ in _nearest(points, count)]
+def mean_distances(points: Tensor) -> Tensor:
+    """Return the mean distance (K,) of each of the finite `points` (K, 3) to its nearest neighbours."""
+    means = [distances[:, 1:].mean(1) for distances, _ in _nearest(points)]
     return torch.from_numpy(np.concatenate([np.zeros(0), *means]))
 
 
-def inliers(points: Tensor, std_ratio: float, count: int = NEIGHBORS) -> Tensor:
+def inliers(points: Tensor, std_ratio: float) -> Tensor:
     """Return the points (K,) bool whose mean distance to their neighbours is not unusual.
 
     It is unusual if it exceeds the mean over all points by more than some standard deviations (Rusu et al. 2008).
@@ -35,26 +30,24 @@ def inliers(points: Tensor, std_ratio: float, count: int = NEIGHBORS) -> Tensor:
     Args:
         points: (K, 3) finite positions.
         std_ratio: number of standard deviations.
-        count: number of neighbours.
     """
     if len(points) < 3:
         return torch.ones(len(points), dtype=torch.bool)
-    distances = mean_distances(points, count)
+    distances = mean_distances(points)
     return distances <= distances.mean() + std_ratio * distances.std()
 
 
-def plane_normals(points: Tensor, towards: Tensor, count: int = NEIGHBORS) -> Tensor:
+def plane_normals(points: Tensor, towards: Tensor) -> Tensor:
     """Return unit normals (K, 3) float32: the direction of least spread of each point's neighbours.
 
     Args:
         points: (K, 3) finite positions.
         towards: (K, 3) directions, for example to the camera that saw the point, into whose half space a normal is
             turned.
-        count: number of neighbours.
     """
     positions = points.double()
     found, start = [torch.zeros(0, 3, dtype=torch.float64)], 0
-    for _, indices in _nearest(points, count):
+    for _, indices in _nearest(points):
         around = positions[torch.from_numpy(indices)]
         centred = around - around.mean(1, keepdim=True)
         normal = torch.linalg.eigh(centred.transpose(1, 2) @ centred).eigenvectors[:, :, 0]
@@ -64,13 +57,13 @@ def plane_normals(points: Tensor, towards: Tensor, count: int = NEIGHBORS) -> Te
     return torch.cat(found).float()
 
 
-def _nearest(points: Tensor, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield distances and indices (N, count + 1) of the nearest points, the point itself included, chunk by chunk."""
+def _nearest(points: Tensor) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield distances and indices (N, 21) of each point and its nearest neighbours, fewer of few points, by chunks."""
     from scipy.spatial import cKDTree
 
     values = points.double().numpy()
     tree = cKDTree(values)
-    most = min(count + 1, len(values))
+    most = min(NEIGHBORS + 1, len(values))
     for start in track(starts := range(0, len(values), CHUNK), "Looking for neighbours", total=len(starts)):
         distances, indices = tree.query(values[start : start + CHUNK], k=most, workers=-1)
         yield distances.reshape(-1, most), indices.reshape(-1, most)

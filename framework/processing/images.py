@@ -80,7 +80,7 @@ def output_names(sources: Iterable[Path]) -> list[str]:
 def prepare_all(
     folder: Path, sources: list[Path], images: Path, upright: bool = True, crop: int = 0
 ) -> tuple[list[PreparedImage], list[str]]:
-    """Prepare images in parallel.
+    """Prepare images in parallel, and report how many are unreadable and why the first is.
 
     Args:
         folder: folder of the sources.
@@ -91,6 +91,9 @@ def prepare_all(
 
     Returns:
         The prepared images in order, and the error messages for unreadable files, which are left out.
+
+    Raises:
+        DataError: if no image is readable.
     """
     names = output_names(sources)
     register_heif()
@@ -102,7 +105,13 @@ def prepare_all(
             return str(error)
 
     results = in_parallel(attempt, range(len(sources)), "Preparing images", len(sources))
-    return [r for r in results if isinstance(r, PreparedImage)], [r for r in results if isinstance(r, str)]
+    prepared = [result for result in results if isinstance(result, PreparedImage)]
+    messages = [result for result in results if isinstance(result, str)]
+    if messages:
+        say(f"{len(messages)} of {len(sources)} images are unreadable and skipped, the first: {messages[0]}")
+    if not prepared:
+        raise DataError(f"{folder} has no readable image: {messages[0]}")
+    return prepared, messages
 
 
 def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool = True, crop: int = 0) -> PreparedImage:
@@ -163,14 +172,13 @@ def save(image: Image.Image, path: Path, options: dict[str, Any] | None = None) 
         image.save(path, format="PNG", **(options or {}))
 
 
-def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path, crop: int = 0) -> dict[str, str]:
+def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dict[str, str]:
     """Write the masks of prepared images as 0 or 255, upright like them, named as in COLMAP: image.jpg.png.
 
     Args:
         folder: folder of masks with the images' names (with their suffix, or with .png in place of it or after it).
         prepared: the prepared images.
         masks: folder to write to.
-        crop: pixels cut off at each side of the images.
 
     Returns:
         The path in `masks` of each mask, by the name of its image.
@@ -190,13 +198,12 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path, crop: 
                 mask = image.convert("L").point(lambda value: 255 if value >= 128 else 0)
         except Exception as error:
             raise unreadable(path, error, "the mask") from error
-        size = (entry.width + 2 * crop, entry.height + 2 * crop)
+        size = (entry.width, entry.height)
         is_upright = entry.orientation >= 5 and mask.size == size and size[0] != size[1]
         if entry.orientation in OPERATIONS and not is_upright:
             mask = mask.transpose(OPERATIONS[entry.orientation])
         if mask.size != size:
             raise DataError(f"the mask {path} differs in size from its image {entry.source}")
-        mask = _cropped(mask, crop)
         target = masks / f"{entry.name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         mask.save(target)

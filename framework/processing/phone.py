@@ -13,8 +13,8 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import one_line
+from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
-from nerfloom.processing.pipeline import prepare_and_report
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.transforms import Frame, Lens, content, write
 
@@ -96,7 +96,7 @@ def write_folder(
     Raises:
         DataError: if no image is readable, or one differs in size from its lens.
     """
-    prepared, _ = prepare_and_report(folder, list(posed), output / "images", upright=False, crop=crop)
+    prepared, _ = prepare_all(folder, list(posed), output / "images", upright=False, crop=crop)
     frames = []
     for image in prepared:
         pose, uncropped = posed[Path(image.source)]

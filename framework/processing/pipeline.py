@@ -34,7 +34,7 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     """
     flags, output, work = job.flags, job.flags.output_dir, job.work
     with job.timed("preparing"):
-        prepared, unreadable = prepare_and_report(folder, sources, job.images)
+        prepared, unreadable = prepare_all(folder, sources, job.images)
         clear = contrast.for_features(folder, prepared, job.images, job.stretched)
         if len(prepared) < FEWEST:
             raise DataError(f"--data {flags.data}: {len(prepared)} images can be used; at least {FEWEST} are needed")
@@ -83,32 +83,6 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     for line in lines(summary):
         say(line)
     say(ready(output))
-
-
-def prepare_and_report(
-    folder: Path, sources: list[Path], images: Path, upright: bool = True, crop: int = 0
-) -> tuple[list[PreparedImage], list[str]]:
-    """Prepare images (`prepare_all`), and report how many are unreadable and why the first is.
-
-    Args:
-        folder: folder of the sources.
-        sources: paths of the images in it.
-        images: folder to write to.
-        upright: whether to undo the EXIF orientation.
-        crop: pixels to cut off at each side.
-
-    Returns:
-        The prepared images, and the messages for unreadable ones.
-
-    Raises:
-        DataError: if no image is readable.
-    """
-    prepared, unreadable = prepare_all(folder, sources, images, upright, crop)
-    if unreadable:
-        say(f"{len(unreadable)} of {len(sources)} images are unreadable and skipped, the first: {unreadable[0]}")
-    if not prepared:
-        raise DataError(f"{folder} has no readable image: {unreadable[0]}")
-    return prepared, unreadable
 
 
 def _frames(model: colmap.Model, prepared: list[PreparedImage], masks: dict[str, str]) -> list[transforms.Frame]:

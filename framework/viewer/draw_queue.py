@@ -82,10 +82,6 @@ class Studio:
                 return
         self._asked.set()
 
-    def wake(self) -> None:
-        """End `wait`."""
-        self._asked.set()
-
     @property
     def is_empty(self) -> bool:
         """True if no browser is there."""

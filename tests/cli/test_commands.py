@@ -31,7 +31,7 @@ def test_help_is_quick_and_lists_every_method() -> None:
 
 
 def test_method_help_shows_its_flags_without_prefix() -> None:
-    done = called("ns-train", "vanilla-nerf", "--help")
+    done = called("ns-train", "vanilla-nerf", "--help-all")
     assert done.returncode == 0
     for flag in (
         "--sampler {hierarchical,occupancy,proposal,auto}",

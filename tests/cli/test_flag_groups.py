@@ -1,4 +1,4 @@
-"""The help of `ns-train METHOD` shows each flag once, in groups, which change neither flags nor values nor errors."""
+"""The help of `ns-train METHOD` shows flags in groups, which change neither flags nor values nor errors."""
 
 import dataclasses
 import re
@@ -11,8 +11,9 @@ import tyro
 
 from nerfloom import registry
 from nerfloom.base.config import AUTO, LEFT_TO_DATA, Auto, RayConfig, TrainConfig
-from nerfloom.cli.flag_groups import DECIDED, GROUPS, grouped_flags
-from nerfloom.cli.flag_text import plain_flags
+from nerfloom.cli.evaluate import EvalFlags
+from nerfloom.cli.flag_groups import EVERYDAY, GROUPS, grouped_flags
+from nerfloom.cli.flag_help import DECIDED, plain_flags
 from nerfloom.cli.train import run_of
 from nerfloom.registry import load_dataparser, load_method
 from nerfloom.samplers.choice import SamplingConfig
@@ -51,8 +52,8 @@ def boxes(said: str) -> dict[str, list[str]]:
     return found
 
 
-def help_of(*words: str) -> dict[str, list[str]]:
-    done = called("ns-train", *words, "--help")
+def help_of(*words: str, flag: str = "--help-all") -> dict[str, list[str]]:
+    done = called("ns-train", *words, flag)
     assert done.returncode == 0, done.stderr
     return boxes(done.stdout)
 
@@ -82,6 +83,28 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]
     assert found["everyday options"][:6] == first
+
+
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_the_short_help_shows_the_everyday_flags_alone(flag: str) -> None:
+    """Whatever the method and the data format are, and whatever other flags there are."""
+    all_flags, short = help_of("nerfacto", "blender"), help_of("nerfacto", "--num-levels", "3", "blender", flag=flag)
+    assert short == {"options": [], "everyday options": all_flags["everyday options"]}
+    assert help_of("dnerf", flag=flag) == short
+    assert len(all_flags) > len(short)
+
+
+def test_the_everyday_flags_are_shown_with_their_defaults() -> None:
+    said = " ".join(called("ns-train", "nerfacto", "--help").stdout.replace("│", " ").split())
+    for flag in GROUPS[EVERYDAY]:
+        assert f" --{str(flag).replace('_', '-')} " in said
+    assert f"(default: {load_method('nerfacto').config.max_num_iterations})" in said
+
+
+def test_the_help_of_a_command_with_few_flags_shows_them_all() -> None:
+    short, all_flags = (called("ns-eval", flag) for flag in ("--help", "--help-all"))
+    assert short.stdout == all_flags.stdout
+    assert set(boxes(short.stdout)["options"]) == set(flags_of(EvalFlags(Path("run"))))
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FORMATS])
@@ -169,7 +192,7 @@ def parsed(config: TrainConfig, *flags: str, grouped: bool = True) -> Any:
 
 def test_a_plugins_settings_stand_by_themselves(capsys: Capture) -> None:
     with pytest.raises(SystemExit):
-        parsed(Plugin(), "--help")
+        parsed(Plugin(), "--help")  # of all groups: whether the help is short is said to grouped_flags
     said = capsys.readouterr().out
     found = boxes(said)
     assert found["mine options"] == ["--murk", "--tint"]
@@ -188,7 +211,7 @@ def test_a_plugins_settings_stand_by_themselves(capsys: Capture) -> None:
 
 
 def test_what_the_data_decide_is_not_called_none() -> None:
-    said = " ".join(called("ns-train", "instant-ngp", "--help").stdout.replace("│", " ").split())
+    said = " ".join(called("ns-train", "instant-ngp", "--help-all").stdout.replace("│", " ").split())
     config = load_method("instant-ngp").config
     hints = get_type_hints(type(config), include_extras=True)
     may_be = [name for name, hint in hints.items() if LEFT_TO_DATA in getattr(hint, "__metadata__", ())]

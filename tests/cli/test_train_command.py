@@ -178,7 +178,7 @@ def test_the_folder_is_dated(shared_tiny: Path) -> None:
 
 
 def test_help_of_a_method_states_its_own_defaults(shared_tiny: Path) -> None:
-    said = " ".join(called("ns-train", "instant-ngp", "--data", shared_tiny, "--help").stdout.split())
+    said = " ".join(called("ns-train", "instant-ngp", "--data", shared_tiny, "--help-all").stdout.split())
     config = load_method("instant-ngp").config
     assert f"(default: {config.max_num_iterations})" in said
     for flag in ("--num-levels", "--log2-table-size", "--downscale-factor", "--mixed-precision"):

@@ -134,7 +134,7 @@ def test_the_wheel_installs_one_name(installed: Installed) -> None:
 def test_it_trains_and_is_evaluated(installed: Installed) -> None:
     listed = installed.run("ns-train", "--help").stdout
     assert re.search("dense-grid +DenseGrid: features on dense grids", listed)
-    assert "--features-per-level" in installed.run("ns-train", "dense-grid", "--help").stdout
+    assert "--features-per-level" in installed.run("ns-train", "dense-grid", "--help-all").stdout
     done, folder = installed.train("dense-grid", SMALL, "t")
     assert done.returncode == 0, done.stderr
     before = json.loads((folder / "eval.json").read_text())["results"]

@@ -17,7 +17,7 @@ ELSEWHERE = {
     ),
     r"export NERFLOOM_": "tests/test_registry.py",
     r"ns-train .*(voxels|path/to/ring)": "tests/site/test_snippets.py",
-    r"ns-train (--help|--version|[\w-]+ --help)": "tests/cli/test_commands.py",
+    r"ns-train (--help|--version|[\w-]+ --help(-all)?)": "tests/cli/test_commands.py",
     r"ns-train --load-config": "tests/cli/test_train_command.py",
     r"ns-train --resume": "tests/training/test_trainer.py",
     r"ns-train .*--vis viewer": "tests/viewer/test_training.py",

@@ -1,5 +1,6 @@
 # make demo   train on the embedded scene for 20 seconds, and leave pictures
 # make test   the tests that every change has to pass; make test-fast those of them that take under a second
+# make mutants   plant every bug of tests/mutants, one at a time: does its test fail? ONLY='poses exports' for some
 # make docs   the documentation, into site/
 # make sanitize   the kernels' tests, on kernels that watch every read, write and sum
 # make release-check   build both distributions, look into them, install and use them
@@ -10,7 +11,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-fast test-all lint docs sanitize release-check test-versions clean
+.PHONY: demo test test-fast test-all mutants lint docs sanitize release-check test-versions clean
 
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
@@ -27,6 +28,9 @@ test-fast: .venv/installed-test
 
 test-all: .venv/installed-test .venv/installed-docs
 	$(BIN)/python -m pytest
+
+mutants: .venv/installed-test
+	$(BIN)/python -m tests.mutants $(ONLY)
 
 lint: .venv/installed-test .venv/links
 	$(BIN)/ruff check .

@@ -1,11 +1,13 @@
 """Shared by the tests: a tiny data set, tiny settings, and where real data is."""
 
 import gc
+import itertools
 import json
 import math
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -122,6 +124,17 @@ def edit_json(tiny: Path) -> EditJson:
         file.write_text(json.dumps(content))
 
     return edit
+
+
+TICK = 0.01
+"""Seconds between two looks at the `even_clock`."""
+
+
+@pytest.fixture
+def even_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock that budgets go by, a tick later each time it is looked at, however busy the machine is."""
+    looks = itertools.count()
+    monkeypatch.setattr(time, "perf_counter", lambda: next(looks) * TICK)
 
 
 @pytest.fixture

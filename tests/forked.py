@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
+from tests.patience import PATIENCE
+
 ROOT = Path(__file__).parents[1]
-PATIENCE = 120
-"""Seconds after which a program is ended, as it hangs."""
 Program = tuple[str, Sequence[object], dict[str, str]]
 """Code, its arguments, and variables besides those of this process."""
 
@@ -85,7 +85,7 @@ def _become(code: str, arguments: list[str], environment: dict[str, str], files:
         os.environ.clear()
         os.environ.update(environment)
         sys.argv = ["-c", *arguments]
-        signal.alarm(PATIENCE)
+        signal.alarm(round(PATIENCE))
         exec(compile(code, "<string>", "exec"), {"__name__": "__main__"})
         status = 0
     except SystemExit as end:

@@ -50,7 +50,8 @@ from tests.training.helpers import TINY
 
 ROOT = Path(__file__).parents[1]
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
-SLOW = ("dnerf",)
+SLOW = ("dnerf", "pixel-nerf")
+"""tests/test_moving.py and tests/test_pixel_nerf.py ask most of it in less time."""
 
 
 @pytest.mark.medium

@@ -37,7 +37,7 @@ def write_deep_png(path: Path, channels: int, size: int = 20) -> None:
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_sixteen_bits_a_channel_are_refused_not_cut(tmp_path: Path, channels: int) -> None:
     write_deep_png(tmp_path / "deep.png", channels)
-    with pytest.raises(DataError, match=r"deep\.png has more than 8 bits per channel; convert it"):
+    with pytest.raises(DataError, match=r"deep\.png .*8 bits per channel; convert"):
         read_image(tmp_path / "deep.png")
 
 
@@ -166,7 +166,7 @@ def test_missing_files_are_counted_once_and_all_missing_is_an_error(
     said = capsys.readouterr().err
     assert said.count("split 'val': 3 of 4 images are missing and skipped") == 1
     assert str(paths[0]) in said
-    with pytest.raises(DataError, match="split 'test' has no image: none of the 1 files listed in the data exists"):
+    with pytest.raises(DataError, match="split 'test' has no image"):
         existing_files(paths[:1], "test")
 
 

@@ -82,7 +82,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", [name for name in VARIANTS if name.startswith("dnerf")])
+@pytest.mark.parametrize("name", ["dnerf", "dnerf occupancy", pytest.param("dnerf hash", marks=pytest.mark.slow)])
 def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path: Path) -> None:
     """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""
     trainer = moving_trainer(name, shared_tiny, tmp_path, max_num_iterations=60)

@@ -102,7 +102,7 @@ def test_of_too_few_images_no_speed_is_found_and_nothing_carved(count: int, tmp_
     reason = {decision.option: decision.reason for decision in trainer.profile.decisions}["silhouettes"]
     if count == 20:
         assert said["silhouettes"] == "not used"
-        assert "20 images at 20 times are too few to tell how fast" in reason
+        assert "20 images at 20 times" in reason
         assert "motion" not in said
         assert not bool(sampler.carved.any())
         assert torch.equal(trainer.train_set.scene.box, BOX)

@@ -180,7 +180,7 @@ def test_the_mean_appearance_is_what_photographs_have_in_common(
     factors, off = torch.tensor([1.0, 0.2]).repeat_interleave(10), {}
     for share in (0.0, 0.25):
         (tmp_path / str(share)).mkdir()
-        trainer = dimmed(tiny, tmp_path / str(share), factors, max_num_iterations=600, mean_appearance_share=share)
+        trainer = dimmed(tiny, tmp_path / str(share), factors, max_num_iterations=300, mean_appearance_share=share)
         shown = trainer.model.render_view(trainer.train_set.view(0), torch.zeros(3))
         expected = trainer.train_set.image(0)[..., :3] / 255 * 0.6
         inside = shown.accumulation > 0.95

@@ -19,7 +19,7 @@ from tests.training.helpers import TINY
 
 DOCS = Path(__file__).parents[1] / "docs"
 FOLDER = DOCS / "notebooks"
-SIZE = 40
+SIZE = 24
 """Width and height of the embedded scene's images here, which take most of a minute to render as they are."""
 
 

@@ -102,13 +102,14 @@ def _divided(
         whole: Any = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(type(settings), settings, False))
     unprefixed = tyro.conf.arg(prefix_name=False)
     flags = {field.name: dataclasses.replace(field, type=Annotated[field.type, unprefixed]) for field in whole.fields}
-    rules, boxes = {}, []
+    rules: dict[type, StructConstructorSpec] = {}
+    boxes: list[StructFieldSpec] = []
     for title, names in groups:
-        group = type("Group", (), {})
+        group: Any = type("Group", (), {})
         rules[group] = StructConstructorSpec(dict, tuple(flags[name] for name in names))
         box: Any = Annotated[group, tyro.conf.arg(name=title, help="")]
         if everyday and title != EVERYDAY:
-            box = tyro.conf.Suppress[box]
+            box = Annotated[box, tyro.conf.Suppress]
         boxes.append(StructFieldSpec(f"{len(boxes)}", box, MISSING_NONPROP))
 
     def join(**parts: dict[str, Any]) -> Any:

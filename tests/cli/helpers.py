@@ -10,6 +10,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from unittest.mock import patch
 
+from tests.patience import PATIENCE
+
 _FLAGS = "--num-levels 4 --max-resolution 64 --log2-table-size 12 --grid-resolution 16 --num-steps 64 --vis none"
 TINY_NGP = [*_FLAGS.split(), "--samples-per-batch", "4096"]
 
@@ -22,7 +24,7 @@ def command(name: str) -> str:
 def run(name: str, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run a command and capture what it prints."""
     words = [command(name), *map(str, arguments)]
-    return subprocess.run(words, capture_output=True, text=True, cwd=folder, timeout=300)
+    return subprocess.run(words, capture_output=True, text=True, cwd=folder, timeout=PATIENCE)
 
 
 def called(name: str, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:

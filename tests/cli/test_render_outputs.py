@@ -161,7 +161,7 @@ def test_outputs_apart_and_in_folders(capture_run: Path, shows_a_ball: float, tm
     assert iio.imread(tmp_path / "beside" / "00000.jpg").shape == (HEIGHT, 2 * WIDTH, 3)
     again = called("ns-render", "spiral", *words, capture_run, "--output-path", tmp_path / "beside")
     assert again.returncode == 1
-    assert "beside holds images of another render (render.json differs); name another folder" in again.stderr
+    assert "(render.json differs)" in again.stderr
 
 
 @pytest.mark.medium
@@ -305,7 +305,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
 
     nowhere = tmp_path / "none"
     names = "--rendered-output-names"
-    assert "the true image is known to 'ns-render dataset' alone" in said("orbit", nowhere, names, "rgb", "error")
+    assert "'ns-render dataset'" in said("orbit", nowhere, names, "rgb", "error")
     assert "name at least one output, and each once" in said("orbit", nowhere, names, "rgb", "rgb")
     assert "add depth to --rendered-output-names" in said("orbit", nowhere, "--depth-format", "npy")
     assert "needs a folder" in said("orbit", nowhere, names, "depth", "--depth-format", "npy")
@@ -330,4 +330,4 @@ def test_the_bound_of_the_error_is_said(ball_run: Path, tmp_path: Path) -> None:
         "ns-render", "orbit", ball_run, "--output-path", tmp_path / "a.gif", "--num-frames", 1, "--max-error", "1/255"
     )
     assert done.returncode == 0, done.stderr
-    assert "rays ended where the rest could change a colour by at most 0.0039" in done.stderr
+    assert "at most 0.0039" in done.stderr

@@ -161,7 +161,7 @@ def test_nothing_readable_is_an_error(tiny: Path) -> None:
 
 def test_an_image_of_another_size_is_named(tiny: Path) -> None:
     iio.imwrite(tiny / "train" / "r_6.png", np.zeros((20, 24, 4), dtype=np.uint8))
-    with pytest.raises(DataError, match=r"r_6\.png is 24x20 pixels, but its camera is for 20x20"):
+    with pytest.raises(DataError, match=r"r_6\.png is 24x20 pixels, .* 20x20"):
         load_dataset(Blender().parse(tiny, "train"), "train")
 
 
@@ -191,7 +191,7 @@ def test_no_folder_and_bad_flags(tiny: Path) -> None:
 @pytest.mark.parametrize(("near", "far"), [(2.0, math.inf), (2.0, 2.0), (-1.0, 6.0), (math.nan, 6.0)])
 def test_a_scene_ends_somewhere_behind_its_start(tiny: Path, near: float, far: float) -> None:
     parsed = dataclasses.replace(Blender(), near=near, far=far).parse(tiny, "train")
-    with pytest.raises(DataError, match="--near must be at least 0 and less than --far, which must be finite"):
+    with pytest.raises(DataError, match=r"--near .*--far"):
         load_dataset(parsed, "train")
 
 

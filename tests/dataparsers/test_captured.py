@@ -75,7 +75,7 @@ def test_reduced_images_may_be_all_there_is(capture: Path) -> None:
     assert scene.downscale_factor == 1
     assert worst_miss(scene, poses()) < EXACT
     assert load_dataset(Nerfstudio(downscale_factor=8).parse(capture, "val"), "val").image(0).shape == (4, 5, 3)
-    with pytest.raises(DataError, match="there are no images for --downscale-factor 2, only images reduced by 4"):
+    with pytest.raises(DataError, match=r"--downscale-factor 2, .*by 4"):
         Nerfstudio(downscale_factor=2).parse(capture, "train")
 
 

@@ -139,9 +139,7 @@ def test_a_model_of_another_reconstruction_is_left_out_and_said_to_be(
     write_transforms(folder, make_capture(seed=5))
     scene = ALL.parse(folder, "train")
     assert (scene.sightings, scene.points) == (None, None)
-    assert "0 of 10 images have the pose that they have in transforms.json" in capsys.readouterr().err.replace(
-        "\n", " "
-    )
+    assert "0 of 10 images" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_a_damaged_model_is_left_out_and_said_to_be(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,4 +148,4 @@ def test_a_damaged_model_is_left_out_and_said_to_be(folder: Path, capsys: pytest
     assert (scene.sightings, scene.points) == (None, None)
     said = capsys.readouterr().err.replace("\n", " ")
     assert "damaged" in said
-    assert "continuing without the distances of its points" in said
+    assert "without the distances" in said

@@ -276,9 +276,7 @@ def test_a_files_own_lists(capture: Path) -> None:
     edit(capture, lambda c: c.pop("train_filenames"))
     assert len(Nerfstudio().parse(capture, "train").image_paths) == 7
     edit(capture, lambda c: c.update(test_filenames=["images/no.png"]))
-    with pytest.raises(
-        DataError, match=r"'test_filenames' lists 'images/no\.png', which is not the file_path of any frame"
-    ):
+    with pytest.raises(DataError, match=r"'test_filenames' lists 'images/no\.png'"):
         Nerfstudio().parse(capture, "train")
 
 
@@ -306,7 +304,7 @@ def test_masks_depths_and_times(capture: Path) -> None:
     assert Nerfstudio().parse(capture, "val").mask_paths is not None
     with pytest.raises(
         DataError,
-        match=r"mask .*masks/001\.png does not exist \(missing in all: 1\): .*masks has no 001\.png, but 000\.png",
+        match=r"masks/001\.png does not exist \(missing in all: 1\).*000\.png",
     ):
         Nerfstudio().parse(capture, "train")
 
@@ -328,7 +326,7 @@ def test_names_of_windows(capture: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert [path.name for path in Nerfstudio().parse(capture, "test").image_paths] == ["003.png"]
     said = capsys.readouterr().err
     assert said.count("9 of 9 are on the disk in another folder") == 1  # of training alone
-    assert "files of 'mask_path': 1 of 1 are on the disk in another case" in said
+    assert "'mask_path': 1 of 1" in said
 
 
 @pytest.mark.parametrize("digits", [2, 3, 5])

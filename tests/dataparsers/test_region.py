@@ -230,11 +230,11 @@ def test_contradictions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     edit(folder, "train", camera_angle_x=1.2)
     assert Blender().parse(folder, "train").cameras.fx.tolist() == [100.0] * 3
     said = capsys.readouterr().err
-    assert "'fl_x' is 100, but 'camera_angle_x' gives 65.7763 for a width of 90 pixels; fl_x is taken" in said
+    assert "'fl_x' is 100, but 'camera_angle_x' gives 65.7763" in said
     Blender().parse(folder, "test")
     assert "camera_angle_x" not in capsys.readouterr().err
     edit(folder, "train", w=70, h=90)
-    with pytest.raises(DataError, match=r"0000\.png is 90x70 pixels, but its camera is for 70x90"):
+    with pytest.raises(DataError, match=r"0000\.png is 90x70 pixels, .* 70x90"):
         Blender().parse(folder, "train")
     edit(folder, "train", fl_x=None, fl_y=None, camera_angle_x=None, camera_angle_y=None)
     with pytest.raises(DataError, match="neither 'fl_x' nor 'camera_angle_x'"):

@@ -45,7 +45,7 @@ def test_a_broken_connection_goes_on_where_it_broke(tmp_path: Path) -> None:
 def test_a_second_call_goes_on_where_the_first_gave_up(tmp_path: Path) -> None:
     served = Served(CONTENT, breaks_after=[1_000_000, 0, 0, 0])
     with serving({"/file.zip": served}) as address:
-        with pytest.raises(SourceError, match="broke after 1000000 of 3000000 bytes; the same command goes on"):
+        with pytest.raises(SourceError, match="1000000 of 3000000 bytes; the same command"):
             fetch(source_of(address), tmp_path / "file.zip")
         assert not (tmp_path / "file.zip").exists()
         served.asked.clear()
@@ -108,7 +108,7 @@ def test_a_wrong_checksum_removes_the_file(stated: str, tmp_path: Path) -> None:
     wrong = base64.b64encode(hashlib.md5(b"").digest()).decode()
     headers = {"x-goog-hash": f"crc32c=AAAAAA==,md5={wrong}"} if stated.startswith("md5") else {}
     source = None if headers else "0" * 64
-    refusal = pytest.raises(SourceError, match=r"has the (sha256|md5) [0-9a-f]+, not [0-9a-f]+; it was removed")
+    refusal = pytest.raises(SourceError, match=r"(sha256|md5) [0-9a-f]+, not [0-9a-f]+")
     with serving({"/file.zip": Served(CONTENT, headers=headers)}) as address, refusal:
         fetch(source_of(address, source), tmp_path / "file.zip")
     assert not list(tmp_path.glob("*.zip*.part")) + list(tmp_path.glob("*.zip"))
@@ -181,7 +181,7 @@ def test_a_disk_that_fills_up_keeps_what_came(tmp_path: Path, monkeypatch: pytes
 
         with monkeypatch.context() as patched:
             patched.setattr(Path, "open", open_small)
-            with pytest.raises(DataError, match="the disk is full; make room, and the same command goes on"):
+            with pytest.raises(DataError, match=r"disk is full; .*same command"):
                 fetch(source_of(address), tmp_path / "file.zip")
         assert 0 < (tmp_path / "file.zip.part").stat().st_size < len(CONTENT)
         fetch(source_of(address), tmp_path / "file.zip")

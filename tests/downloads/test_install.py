@@ -76,7 +76,7 @@ def test_the_next_source_is_tried(balls: bytes, tmp_path: Path, capsys: pytest.C
 def test_without_any_source_the_way_by_hand_is_said(balls: bytes, tmp_path: Path) -> None:
     with serving({}) as address:
         dataset = dataset_of(Archive("balls.zip", ("red", "blue"), (Source(f"{address}/gone"),)))
-        with pytest.raises(DataError, match=r"404 .* download balls.zip in a browser, see https://example.org/balls"):
+        with pytest.raises(DataError, match=r"404 .*balls.zip .*https://example.org/balls"):
             install("balls", dataset, tmp_path / "data")
     by_hand = tmp_path / "balls.zip"
     by_hand.write_bytes(balls)
@@ -107,7 +107,7 @@ def test_an_archive_with_something_else_leaves_nothing(tmp_path: Path) -> None:
         archive.writestr("red/notes.txt", "no scene")
     with serving({"/x.zip": Served(bad.getvalue())}) as address:
         dataset = dataset_of(Archive("x.zip", ("red",), (Source(f"{address}/x.zip"),)))
-        with pytest.raises(DataError, match="red is in no known data format; the archive has changed"):
+        with pytest.raises(DataError, match="red is in no known data format"):
             install("balls", dataset, tmp_path)
     assert not (tmp_path / "balls").exists()
     assert not (tmp_path / ".downloads" / "x.zip.unpacked").exists()
@@ -127,7 +127,7 @@ def test_scenes_that_are_missing_are_named(shared_tiny: Path, tmp_path: Path) ->
     archive = tmp_path / "x.zip"
     archive.write_bytes(zipped(shared_tiny, "red"))
     dataset = dataset_of(Archive("x.zip", ("red", "blue"), ()))
-    with pytest.raises(DataError, match="does not hold blue; name what it holds by --scenes"):
+    with pytest.raises(DataError, match=r"blue.*--scenes"):
         install("balls", dataset, tmp_path / "data", archive=archive)
     assert (tmp_path / "data" / "balls" / "red").is_dir()
     with pytest.raises(ConfigError, match="there is no such file"):

@@ -59,7 +59,7 @@ def test_frames_of_another_render_are_left_alone(tmp_path: Path, capsys: pytest.
 
 
 def test_a_frame_that_is_missing_when_files_are_written(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"000000.npz is missing or damaged; start the same command again"):
+    with pytest.raises(ConfigError, match=r"000000.npz .*same command"):
         list(Frames(tmp_path, 1))
 
 

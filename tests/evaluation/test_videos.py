@@ -85,7 +85,7 @@ def test_distances_are_numbers(tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_told_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a.gif", "a.WEBP", "folder"):
         check_suffix(tmp_path / name)
-    with pytest.raises(ConfigError, match=r"the extension must be .mp4, .gif, .webp, .png, or none for a folder"):
+    with pytest.raises(ConfigError, match=r".mp4, .gif, .webp, .png"):
         check_suffix(tmp_path / "a.avi")
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"the extra \[video\]: pip install 'imageio\[ffmpeg\]'; or name a .gif"):

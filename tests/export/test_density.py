@@ -119,7 +119,7 @@ def test_the_coarse_pass_leaves_out_empty_blocks() -> None:
 
 
 def test_there_is_a_reason_without_a_surface() -> None:
-    with pytest.raises(ConfigError, match=r"between 3 and 3 per scene unit in the box and never passes 50"):
+    with pytest.raises(ConfigError, match=r"between 3 and 3 .* 50"):
         mesh_of(Matter(lambda positions: torch.full((len(positions),), 3.0)), 50.0)
     with pytest.raises(ConfigError, match="NaN everywhere"):
         mesh_of(Matter(lambda positions: torch.full((len(positions),), torch.nan)), 5.0)

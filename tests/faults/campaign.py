@@ -22,7 +22,8 @@ from nerfloom.training.checkpoint import FOLDER, list_checkpoints
 from nerfloom.training.lock import LOCK
 from tests.conftest import write_tiny
 from tests.faults.inside import INJECTED
-from tests.faults.runs import PATIENCE, curve, ended, new_run, readable_steps, start, wait_for_checkpoint
+from tests.faults.runs import curve, ended, new_run, readable_steps, start, wait_for_checkpoint
+from tests.patience import until
 from tests.training.helpers import differences
 
 STEPS = 160
@@ -114,9 +115,7 @@ def dying_reader(stage: Stage) -> int | None:
 def second_process(stage: Stage) -> int | None:
     """In the same folder, where the first stands still meanwhile, and is killed then."""
     first = stage.start()
-    deadline = time.monotonic() + PATIENCE
-    while first.poll() is None and not _held_by(stage.folder, first.pid) and time.monotonic() < deadline:
-        time.sleep(0.005)
+    until(lambda: first.poll() is not None or _held_by(stage.folder, first.pid))
     first.send_signal(signal.SIGSTOP)
     if first.poll() is not None:
         ended(first)

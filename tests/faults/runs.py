@@ -4,16 +4,14 @@ import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from nerfloom.base.errors import CheckpointError
 from nerfloom.training.checkpoint import FOLDER, list_checkpoints, load_checkpoint
 from tests.cli.helpers import TINY_NGP
+from tests.patience import PATIENCE, until
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 120.0
-"""Seconds after which a process is taken to hang."""
 
 
 def new_run(data: Path, output: Path, steps: int, evaluated: int | None = None) -> tuple[list[object], Path]:
@@ -57,10 +55,8 @@ def ended(process: subprocess.Popen[str]) -> str:
 
 def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
     """Wait until a run has saved what it had not when this was called, or has ended."""
-    before, deadline = set(list_checkpoints(folder / FOLDER)), time.monotonic() + PATIENCE
-    while process.poll() is None and set(list_checkpoints(folder / FOLDER)) <= before:
-        assert time.monotonic() < deadline, "it saves nothing"
-        time.sleep(0.005)
+    before = set(list_checkpoints(folder / FOLDER))
+    until(lambda: process.poll() is not None or not set(list_checkpoints(folder / FOLDER)) <= before)
 
 
 def readable_steps(folder: Path) -> list[int]:

@@ -88,7 +88,7 @@ def test_a_report_that_cannot_be_written_is_said(
     monkeypatch.setattr(os, "fsync", full)
     write_report(tmp_path / "curve.json", [1, 2])
     said = capsys.readouterr().err
-    assert f"warning: cannot write {tmp_path / 'curve.json'}: No space left on device; going on without" in said
+    assert f"warning: cannot write {tmp_path / 'curve.json'}: No space left on device" in said
     assert json.loads((tmp_path / "curve.json").read_text()) == [1]
 
 
@@ -162,7 +162,7 @@ def test_a_disk_that_fills_up_while_training(shared_tiny: Path, tmp_path: Path, 
     disk(f"size={one.checkpoint.stat().st_size * 3 // 2 // 1024 + 64}k")
     settings = {"max_num_iterations": 12, "steps_per_save": 4, "max_eval_images": 0}
     run = tiny_run("instant-ngp", shared_tiny, tmp_path / "disk" / "run", **settings)
-    with pytest.raises(CheckpointError, match="No space left on device; earlier checkpoints stand"):
+    with pytest.raises(CheckpointError, match="No space left on device"):
         start_session(run)
     assert [path.name for path in (run.folder / FOLDER).iterdir()] == ["step-000000004.ckpt"]
     assert readable_steps(run.folder) == [4]

@@ -108,5 +108,5 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(
     (run.folder / FOLDER).mkdir()
     (run.folder / FOLDER / ".step-000000002.ckpt.1.tmp").write_bytes(b"half of one")
     resume(read_run(run.config_path))
-    assert "has no checkpoint: starting from the beginning" in capsys.readouterr().err
+    assert "has no checkpoint" in capsys.readouterr().err
     assert [path.name for path in (run.folder / FOLDER).iterdir()] == ["step-000000005.ckpt"]

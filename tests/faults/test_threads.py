@@ -15,10 +15,8 @@ from nerfloom.data.pixels.mapped import MappedPixels
 from nerfloom.data.pixels.stream import FIRST_STEPS, PixelStream
 from nerfloom.training.checkpoint import load_checkpoint
 from tests.images import write_noise
+from tests.patience import PATIENCE
 from tests.training.helpers import tiny_trainer
-
-PATIENCE = 60.0
-"""Seconds after which something is taken to hang."""
 
 
 def error_of(work: Callable[[], object]) -> BaseException | None:

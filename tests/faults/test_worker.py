@@ -5,13 +5,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from nerfloom.base.errors import DataError
 from nerfloom.processing.worker import Report, run_in_child
+from tests.patience import PATIENCE, until
 
 ROOT = Path(__file__).parents[2]
 """Not from tests.faults.runs: children import this file, and torch takes them seconds."""
@@ -67,14 +67,6 @@ def is_running(process: int) -> bool:
         return False
 
 
-def until(condition: Callable[[], bool]) -> bool:
-    """Whether something comes true within a minute."""
-    end = time.monotonic() + 60
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.05)
-    return condition()
-
-
 @pytest.mark.medium
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9)])
@@ -83,9 +75,9 @@ def test_it_ends_with_the_process_that_started_it(number: signal.Signals, status
     script.write_text(PARENT)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     parent = subprocess.Popen([sys.executable, str(script), str(place)], env=environment, stderr=subprocess.DEVNULL)
-    assert until(lambda: place.exists() and place.read_text() != "")
+    until(lambda: place.exists() and place.read_text() != "")
     worker = int(place.read_text())
     assert is_running(worker)
     parent.send_signal(number)
-    assert parent.wait(60) == status
-    assert until(lambda: not is_running(worker))
+    assert parent.wait(PATIENCE) == status
+    until(lambda: not is_running(worker))

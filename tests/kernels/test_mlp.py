@@ -194,5 +194,5 @@ def test_the_density_of_a_network_in_bfloat16_is_that_of_its_output() -> None:
 
 
 def test_weights_that_do_not_fit_are_named() -> None:
-    with pytest.raises(ValueError, match=r"mlp: weights of shapes \(8, 5\), \(3, 8\) do not fit inputs of 4 features"):
+    with pytest.raises(ValueError, match=r"\(8, 5\), \(3, 8\) .*4 features"):
         mlp([torch.zeros(2, 4)], [torch.zeros(8, 5), torch.zeros(3, 8)])

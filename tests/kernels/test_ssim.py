@@ -376,7 +376,7 @@ def test_some_windows_have_the_same_bits_on_any_number_of_threads(threads: Calla
 
 def test_windows_that_do_not_fit_are_refused() -> None:
     image = torch.rand(20, 30, 3)
-    with pytest.raises(ValueError, match="an image of 30x20 pixels has no windows of shape"):
+    with pytest.raises(ValueError, match="30x20 pixels"):
         ssim(image, image, torch.ones(20, 30, dtype=torch.bool))
     with pytest.raises(ValueError, match="at least one window that counts"):
         structure(image, image, torch.zeros(10, 20, dtype=torch.bool))

@@ -15,6 +15,7 @@ from nerfloom.kernels.networks.mlp import mlp
 from tests.forked import Forks
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.large import bits, measured
+from tests.patience import PATIENCE
 
 pytestmark = needs_kernels
 ENVIRONMENTS = {
@@ -46,7 +47,7 @@ def in_a_process(**environment: str) -> dict[str, object]:
     # Asked for by name too, for torch takes no more than there are cores from its environment.
     threads = environment.get("OMP_NUM_THREADS", "2")
     run = [sys.executable, "-m", "tests.kernels.large", threads]
-    done = subprocess.run(run, env=kept | environment, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(run, env=kept | environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -107,7 +108,7 @@ def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -
     try:
         expected = gather_colors(pixels, good, behind)[0]
         for _ in range(5):
-            with pytest.raises(IndexError, match="pixels: index 100 is out of range; there are 100, from 0"):
+            with pytest.raises(IndexError, match=r"pixels: index 100 .*100"):
                 gather_colors(pixels, bad, behind)
             assert torch.equal(gather_colors(pixels, good, behind)[0], expected)
     finally:
@@ -122,7 +123,7 @@ def test_memory_that_is_not_there_is_an_error_and_not_the_end_of_the_process() -
 
 def test_what_no_kernel_can_do_is_refused_by_name() -> None:
     forward = native.Function("hash_grid_forward", "pqpippipi")
-    with pytest.raises(ValueError, match="hash_grid_forward: hash grid: an entry has 1, 2, 4 or 8 features"):
+    with pytest.raises(ValueError, match=r"hash_grid_forward: .*1, 2, 4 or 8 features"):
         forward(None, 0, None, 3, None, None, 1, None, 1)
     network = native.Function("mlp_forward", "ppiqpippippi")
     with pytest.raises(ValueError, match="a layer has 1 to 384 features"):

@@ -24,10 +24,12 @@ def python(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *words], env=given, capture_output=True, text=True, check=False, cwd=ROOT)
 
 
-@pytest.mark.medium
 @needs_triton
-def test_every_kernel_computes_what_its_reference_does() -> None:
-    words = "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "tests/kernels/triton"
+@pytest.mark.parametrize(
+    "which", [pytest.param("not slow", marks=pytest.mark.medium), pytest.param("slow", marks=pytest.mark.slow)]
+)
+def test_every_kernel_computes_what_its_reference_does(which: str) -> None:
+    words = "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", which, "tests/kernels/triton"
     done = python(*words, TRITON_INTERPRET="1", NERFLOOM_KERNELS="triton")
     print(done.stdout)
     assert done.returncode == 0, done.stdout[-8000:]

@@ -8,6 +8,7 @@ from types import ModuleType
 
 import pytest
 
+from tests.conftest import write_tiny
 from tests.forked import Forks
 
 ROOT = Path(__file__).parents[2]
@@ -65,8 +66,9 @@ def test_both_learn(file: Path, shared_tiny: Path, capsys: pytest.CaptureFixture
     assert float(match[2]) == 0 if file == PLAIN else float(match[2]) > 30
 
 
-def test_as_a_script(shared_tiny: Path, forks: Forks) -> None:
+def test_as_a_script(tmp_path: Path, forks: Forks) -> None:
+    data = write_tiny(tmp_path / "ball", size=8)
     code = "import runpy, sys; del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
-    done = forks.run(code, SKIPPING, "--data", shared_tiny, "--seconds", 0.5)
+    done = forks.run(code, SKIPPING, "--data", data, "--seconds", 0.1)
     assert done.returncode == 0, done.stderr
     assert re.match(r"[\d,]+ rays/s, [1-9]\d* steps, PSNR [\d.]+ dB on 3 test images\n", done.stdout)

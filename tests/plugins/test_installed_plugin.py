@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from nerfloom.registry import VARIABLES
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.slow
 
@@ -61,7 +62,7 @@ def run(words: list[object], folder: Path) -> subprocess.CompletedProcess[str]:
     environment = {key: value for key, value in os.environ.items() if key not in LEADS_ASTRAY}
     environment["NERFLOOM_CACHE"] = str(folder / "cache")
     return subprocess.run(
-        list(map(str, words)), capture_output=True, text=True, cwd=folder, env=environment, timeout=900
+        list(map(str, words)), capture_output=True, text=True, cwd=folder, env=environment, timeout=PATIENCE
     )
 
 

@@ -46,7 +46,7 @@ def test_other_flags_or_files_cannot_go_on(flags: ColmapFlags) -> None:
     again = replace(flags, resume=True)
     with pytest.raises(DataError, match="--max-image-size is 800, and was 1600"):
         begin(replace(again, max_image_size=800), SOURCES)
-    with pytest.raises(DataError, match=r"1 files of .* were added, removed or changed since, the first: 2\.jpg"):
+    with pytest.raises(DataError, match=r"1 files of .* the first: 2\.jpg"):
         begin(again, SOURCES[:1])
     os.utime(flags.data / "1.jpg", (1, 1))
     with pytest.raises(DataError, match=r"the first: 1\.jpg"):

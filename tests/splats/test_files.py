@@ -180,7 +180,7 @@ def test_what_cannot_be_rendered_is_left_out_and_counted(tmp_path: Path, capsys:
     gaussians.logits[4], gaussians.logits[5] = math.inf, -math.inf  # opacities 1 and 0 of other programs
     write_ply(tmp_path / "a.ply", gaussians)
     read = gaussians_in(tmp_path / "a.ply")
-    assert "4 of 9 Gaussians are not finite and are left out" in capsys.readouterr().err
+    assert "4 of 9 Gaussians" in capsys.readouterr().err
     assert torch.equal(read.means, gaussians.means[4:])
     assert read.logits[:2].tolist() == [SURE, -SURE]
     gaussians.means[:] = math.nan

@@ -58,7 +58,7 @@ def test_what_is_in_a_splat_by_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [0, 31, 33])
 def test_what_is_no_splat_is_refused(tmp_path: Path, size: int) -> None:
     (tmp_path / "a.splat").write_bytes(bytes(size))
-    with pytest.raises(DataError, match=r"a\.splat is no \.splat file, or is truncated: it has \d+ bytes"):
+    with pytest.raises(DataError, match=r"a\.splat .*\d+ bytes"):
         read_gaussians(tmp_path / "a.splat")
 
 
@@ -153,7 +153,7 @@ def test_the_filter_of_mip_splatting_is_a_part_of_the_gaussian(tmp_path: Path, n
 def test_discs_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "discs.ply"
     file.write_bytes(ply(some(4), {}, without="scale_2"))
-    with pytest.raises(DataError, match=r"discs\.ply has the discs of 2D Gaussian Splatting, which are not drawn here"):
+    with pytest.raises(DataError, match=r"discs\.ply .*2D Gaussian Splatting"):
         read_gaussians(file)
     file.write_bytes(ply(some(4), {}, ("SplatRenderMode: 2dgs",)))
     with pytest.raises(DataError, match=r"discs of 2D Gaussian Splatting"):

@@ -101,9 +101,7 @@ def test_the_image_position_is_the_cameras() -> None:
 
 
 def test_a_camera_that_cannot_be_drawn_for_is_refused() -> None:
-    with pytest.raises(
-        ConfigError, match="cannot be drawn for orthographic cameras, only for pinhole, opencv and fisheye"
-    ):
+    with pytest.raises(ConfigError, match=r"orthographic cameras, .*pinhole, opencv and fisheye"):
         splat_camera(camera("orthographic"), 0.1)
 
 

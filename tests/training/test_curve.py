@@ -194,7 +194,9 @@ def test_what_json_cannot_hold_is_null() -> None:
 
 @pytest.mark.parametrize("settings", [{"max_eval_images": 0}, {}])
 def test_without_held_out_images_there_is_none(settings: dict[str, Any], shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", bool(settings), max_seconds=0.5, **settings)
+    trainer = tiny_trainer(
+        "instant-ngp", shared_tiny, tmp_path / "run", bool(settings), max_num_iterations=3, **settings
+    )
     trainer.train()
     assert written(trainer) == []
 

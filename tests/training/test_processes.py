@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,12 +31,11 @@ from tests.cli.helpers import command
 from tests.faults import runs
 from tests.forked import Forks
 from tests.images import write_noise
+from tests.patience import PATIENCE
 from tests.training import several
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
 
 COUNT = 2
-PATIENCE = 120.0
-"""Seconds after which a process is taken to hang."""
 STATISTICS = "model.strategy.gradients.sums"
 """What each process has seen of its own images, until Gaussians are added the next time."""
 
@@ -203,7 +201,7 @@ def test_the_first_process_has_the_clock(two: Two) -> None:
 
 def test_the_first_process_alone_prints_and_writes(two: Two) -> None:
     assert two.said[1] == ""
-    assert "2 processes with batches of their own; CPU threads of each: " in two.said[0]
+    assert "2 processes " in two.said[0]
     assert "12 steps done: step 12, " in two.said[0]
     assert "test: " in two.said[0]
     names = {Path(file).name for file in two.found[0]["files"]}
@@ -222,9 +220,7 @@ def test_if_one_process_is_killed_the_other_ends_and_says_how_to_continue(
     both = started("nerfloom.cli.train", *flags)
     runs.wait_for_checkpoint(both[0], folder)
     both[killed].kill()
-    start = time.monotonic()
     said = [ended(process) for process in both]
-    print(f"the other process ended {time.monotonic() - start:.1f} s later: {said[1 - killed].splitlines()[-1]}")
     assert both[1 - killed].returncode == 1
     errors = [line for line in said[1 - killed].splitlines() if "error" in line]
     assert len(errors) == 1

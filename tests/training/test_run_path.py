@@ -72,5 +72,5 @@ def test_paths_that_are_there_or_not_given_pass(
 def test_a_folder_below_a_file_is_refused(flags: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"cannot write the run's folder file.*: Not a directory; name another place"):
+    with pytest.raises(ConfigError, match=r"cannot write .*file.*: Not a directory"):
         check_paths(flags)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from nerfloom.base.machine_config import MachineConfig
+from tests.patience import PATIENCE
 from tests.training.helpers import TINY, differences, tiny_trainer
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +61,7 @@ def test_two_processes_leave_the_same_checkpoints(
         )
         for index, circumstances in enumerate(CIRCUMSTANCES)
     ]
-    said = [process.communicate(timeout=600)[1] for process in processes]
+    said = [process.communicate(timeout=PATIENCE)[1] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], said
     for kind in TINY:
         assert differences(tmp_path / "0" / kind, tmp_path / "1" / kind) == [], kind

@@ -37,7 +37,7 @@ def test_rays_without_room_are_told(shared_tiny: Path, tmp_path: Path) -> None:
     trainer.model.sampler.room.rays, trainer.model.sampler.room.left_out = 4000, 100
     (rung,) = (rung for rung in skip_report(trainer) if "room" in rung.name)
     assert rung.skipped == 0.025
-    assert "rays of batches for whose samples there was no room on the device: 2.5%" in "\n".join(lines([rung]))
+    assert "no room on the device: 2.5%" in "\n".join(lines([rung]))
 
 
 def test_what_saved_nothing_is_not_told() -> None:

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,8 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
+
+from tests.patience import PATIENCE, until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
@@ -35,7 +37,7 @@ class Tab:
         from websockets.sync.client import connect
 
         self._open = ExitStack()
-        self._socket = self._open.enter_context(connect(address, max_size=2**27, open_timeout=60))
+        self._socket = self._open.enter_context(connect(address, max_size=2**27, open_timeout=PATIENCE))
         self._numbers = itertools.count(1)
         self._identity, self._port = identity, port
         self.send("Page.enable")
@@ -45,7 +47,7 @@ class Tab:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=120))
+            answer = json.loads(self._socket.recv(timeout=PATIENCE))
             if answer.get("id") == number:
                 assert "error" not in answer, answer
                 return answer.get("result", {})
@@ -90,12 +92,12 @@ class Tab:
           const box = last.getBoundingClientRect();
           return [box.x + box.width / 2, box.y + box.height / 2];
         }})()"""
-        place = until(lambda: self.evaluate(script), 20)
+        place = until(lambda: self.evaluate(script))
         self.click(*place)
 
     def close(self) -> None:
         self._open.close()
-        urllib.request.urlopen(f"http://127.0.0.1:{self._port}/json/close/{self._identity}", timeout=20).close()
+        urllib.request.urlopen(f"http://127.0.0.1:{self._port}/json/close/{self._identity}", timeout=PATIENCE).close()
 
 
 class Chromium:
@@ -109,18 +111,18 @@ class Chromium:
         command = [program, *FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"]
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         file = profile / "DevToolsActivePort"
-        self.port = int(until(lambda: file.is_file() and file.read_text().split("\n")[0], 60))
+        self.port = int(until(lambda: file.is_file() and file.read_text().split("\n")[0]))
 
     def open(self, address: str) -> Tab:
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}/json/new?{address}", method="PUT")
-        with urllib.request.urlopen(request, timeout=60) as answer:
+        with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
             target = json.load(answer)
         return Tab(target["webSocketDebuggerUrl"], target["id"], self.port)
 
     def close(self) -> None:
         self._process.send_signal(signal.SIGTERM)
         try:
-            self._process.wait(20)
+            self._process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             self._process.kill()
 
@@ -133,13 +135,3 @@ def chromium(folder: Path, width: int = 900, height: int = 700) -> Iterator[Chro
         yield browser
     finally:
         browser.close()
-
-
-def until(found: Callable[[], Any], seconds: float) -> Any:
-    """Wait for something true, and return it."""
-    end = time.monotonic() + seconds
-    while True:
-        if result := found():
-            return result
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.05)

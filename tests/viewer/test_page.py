@@ -20,8 +20,9 @@ from nerfloom.training.trained import load_trained
 from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import TINY_NGP, command, train
 from tests.conftest import write_tiny
+from tests.patience import PATIENCE, until
 from tests.training.helpers import tiny_trainer
-from tests.viewer.chromium import Chromium, Tab, chromium, until
+from tests.viewer.chromium import Chromium, Tab, chromium
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 pytestmark = pytest.mark.slow
@@ -55,7 +56,7 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
         yield process, address
     finally:
         process.terminate()
-        process.communicate(timeout=60)
+        process.communicate(timeout=PATIENCE)
 
 
 def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
@@ -188,12 +189,12 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
         time.sleep(1)
         tab.press("Save")
         file = run / "camera_path.json"
-        until(file.is_file, 20)
+        until(file.is_file)
         path = read_camera_path(file)
         assert len(path.keyframes) == 2
         assert float((path.poses[0] - path.poses[-1]).abs().max()) > 0.1
         tab.press("Save and render")
-        until(lambda: next(run.glob("camera_path.*[!n]"), None), 120)
+        until(lambda: next(run.glob("camera_path.*[!n]"), None))
         tab.screenshot(tmp_path / "path.png")
 
         other = browser.open(address)
@@ -270,15 +271,15 @@ def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path)
             found = re.search(r"step ([\d,]+) · \d+ s", tab.evaluate("document.body.innerText"))
             return int(found[1].replace(",", "")) if found else 0
 
-        until(lambda: tab.screenshot()[PICTURE].std() > 5, 60)
-        before = until(step, 30)
-        until(lambda: step() > before, 30)
+        until(lambda: tab.screenshot()[PICTURE].std() > 5)
+        before = until(step)
+        until(lambda: step() > before)
         tab.press("Pause training")
         time.sleep(2)
         paused = step()
         time.sleep(2)
         assert step() == paused
         tab.press("Go on training")
-        until(lambda: step() > paused, 30)
+        until(lambda: step() > paused)
         tab.close()
         assert process.poll() is None

@@ -26,6 +26,7 @@ from tests.training.helpers import tiny_run
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 
 from nerfloom.viewer.server import close_server, open_server
+from tests.patience import until
 from tests.viewer.client import LOOK, Client
 
 
@@ -177,10 +178,7 @@ def test_garbage_on_the_socket(served: Served, connected: Callable[..., Client])
     client = connected()
     client.look()
     assert decibels(client.finished(), truth(served, 80)) > 35
-    end = time.monotonic() + 20
-    while len(served.page._panels) > 2 and time.monotonic() < end:
-        time.sleep(0.1)
-    assert len(served.page._panels) <= 2  # those that have left are forgotten
+    until(lambda: len(served.page._panels) <= 2)  # those that have left are forgotten
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1", "http://localhost.evil.com"])

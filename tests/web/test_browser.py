@@ -13,6 +13,7 @@ from nerfloom.evaluation.metrics import psnr
 from nerfloom.export.web import gaussians_of, make_page
 from nerfloom.splats.drawing import draw_colors, splat_camera
 from nerfloom.splats.look import OURS, Look
+from tests.patience import PATIENCE
 from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -38,7 +39,7 @@ def browser() -> str:
 def opened(browser: str, folder: Path, address: str, *flags: str) -> str:
     """What Chromium prints that opens an address."""
     command = [browser, *FLAGS, f"--user-data-dir={folder / 'profile'}", *flags, address]
-    return subprocess.run(command, capture_output=True, text=True, timeout=180, check=True).stdout
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import torch
 
 from nerfloom.splats.look import Look
 from nerfloom.splats.spz import encoded
+from tests.patience import PATIENCE
 from tests.web.helpers import some_gaussians
 
 PAGE = files("nerfloom.export") / "page"
@@ -23,7 +24,7 @@ def run(code: str, given: Any) -> Any:
         pytest.skip("there is no Node.js; the page's program is not run")
     program = "".join((PAGE / name).read_text(encoding="utf-8") for name in ("spz.js", "splats.js"))
     start = f"const given = {json.dumps(given)}, answer = (value) => console.log(JSON.stringify(value));\n"
-    done = subprocess.run([node, "-"], input=program + start + code, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([node, "-"], input=program + start + code, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

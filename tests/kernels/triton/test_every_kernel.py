@@ -1,5 +1,7 @@
 """Every operation that Triton has, at random, extreme and no inputs: what `ns-bench gpu` prints."""
 
+import pytest
+
 from nerfloom.benchmarks.kernel_cases import KINDS
 from nerfloom.benchmarks.kernel_errors import as_table, measured
 from tests.kernels.triton.compared import DEVICE
@@ -7,6 +9,7 @@ from tests.kernels.triton.compared import DEVICE
 LARGEST = 1e-5
 
 
+@pytest.mark.slow  # every kernel has tests of its own beside this
 def test_errors_of_every_kernel_are_of_rounding() -> None:
     """Those of differences that cancel are larger than others."""
     rows = measured(DEVICE)

@@ -1,1 +1,0 @@
-"""Bugs by what they spoil, one module a part of the framework."""

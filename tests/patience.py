@@ -1,0 +1,18 @@
+"""How long what should come is waited for: against hanging alone, as no test is about speed."""
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+PATIENCE = 600.0
+"""Seconds after which a test takes what it waits for as hanging."""
+Found = TypeVar("Found")
+
+
+def until(found: Callable[[], Found]) -> Found:
+    """Wait for something true, and return it."""
+    end = time.monotonic() + PATIENCE
+    while not (result := found()):
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.005)
+    return result

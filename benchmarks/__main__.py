@@ -122,19 +122,21 @@ def _tables(flags: TablesFlags) -> None:
         read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale, flags.lpips_weights)
         for path in flags.tables
     ]
+    files = [flags.output_dir / f"{table.name}.json" for table in tables]
     if flags.show == "markdown":
-        print("\n\n".join(markdown(table, flags.output_dir, wanted) for table in tables))
+        print("\n\n".join(markdown(table, file, wanted) for table, file in zip(tables, files, strict=True)))
         return
-    named = {row.name: row for table in tables for row in table.rows}  # tables may share rows
-    rows = [row for row in named.values() if wanted.search(row.name)]
-    if not rows:
+    asked = [[row for row in table.rows if wanted.search(row.name)] for table in tables]
+    if not (count := sum(map(len, asked))):
         raise FlagError(f"--only {shown(flags.only)}: no row has such a name; --show rows lists them")
     if flags.show == "rows":
-        print(listing(rows, flags.output_dir))
+        print("\n\n".join(listing(rows, file) for rows, file in zip(asked, files, strict=True) if rows))
         return
-    make_room(flags.output_dir / f"{rows[0].name}.json")
-    failures = run_rows(rows, flags.data_root, flags.output_dir)
-    say(f"{len(rows) - len(failures)} of {len(rows)} rows are in {flags.output_dir}")
+    failures: dict[str, str] = {}
+    for rows, file in zip(asked, files, strict=True):
+        make_room(file)
+        failures |= run_rows(rows, flags.data_root, file)
+    say(f"{count - len(failures)} of {count} rows are in {flags.output_dir}")
     if failures:
         raise ConfigError(f"{len(failures)} rows failed, first {next(iter(failures))}: {next(iter(failures.values()))}")
 
@@ -178,9 +180,12 @@ def _operations(flags: OperationsFlags) -> None:
 
 def _contention(flags: ContentionFlags) -> None:
     from benchmarks.contention import WORK, measure
+    from nerfloom.benchmarks.results import add_row
+    from nerfloom.kernels import native
 
     make_room(flags.output)
-    write_results(flags.output, measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK))
+    found = measure(flags.data, flags.seconds, flags.rows, (flags.work,) if flags.work else WORK)
+    add_row(flags.output, native.variant(), found)
 
 
 def _cache(flags: CacheFlags) -> None:
@@ -209,10 +214,12 @@ def _meshes(flags: MeshFlags) -> None:
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"python -m benchmarks meshes needs packages that are not installed: {advice}")
     from benchmarks.meshes import measure
+    from nerfloom.benchmarks.results import add_row
 
     make_room(flags.output)
     run = None if flags.load_config is None else trained_run(flags.load_config).parent
-    write_results(flags.output, measure(run, flags.seconds, flags.exports, flags.resolutions))
+    experiment = "procedural" if run is None else run.parent.parent.name
+    add_row(flags.output, experiment, measure(run, flags.seconds, flags.exports, flags.resolutions))
 
 
 def _viewer(flags: ViewerBenchFlags) -> None:

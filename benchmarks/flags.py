@@ -169,8 +169,8 @@ class MeshFlags:
     """Exports that are measured."""
     resolutions: tuple[int, ...] = (256, 512)
     """Cells along the longest edge of the box."""
-    output: Path = RESULTS / "meshes-procedural.json"
-    """JSON file to write."""
+    output: Path = RESULTS / "meshes.json"
+    """JSON file, which gets a row for the run's data."""
 
 
 @dataclass(frozen=True)
@@ -189,9 +189,9 @@ class ViewerBenchFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class TablesFlags:
-    """Train and judge the rows of tables of results, each in its own process, and keep each as a JSON file.
+    """Train and judge the rows of tables of results, each in its own process, and keep them in a JSON file a table.
 
-    Rows whose file is there are left out, and a row that was stopped goes on: the same command continues."""
+    Rows that are in the file are left out, and a row that was stopped goes on: the same command continues."""
 
     tables: tuple[Path, ...]
     """Files of the tables, such as configs/tables/captures.yml."""
@@ -209,7 +209,7 @@ class TablesFlags:
     run_dir: Path = Path("outputs/tables")
     """Folder of the runs, with the last checkpoint and some pictures of each."""
     output_dir: Path = RESULTS
-    """Folder of the results, a file for each row."""
+    """Folder of the results: TABLE.json for TABLE.yml."""
 
 
 @dataclass(frozen=True, kw_only=True)

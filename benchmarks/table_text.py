@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 
@@ -12,16 +12,28 @@ from nerfloom.evaluation.lpips import NETWORK
 
 LOADING, EVALUATION = 20.0, 60.0
 """Seconds before a row's training, and after it where nothing is known of its data, in estimates of a row's time."""
-Column = tuple[str, Callable[[Result], float | None], str]
+Column = tuple[str, Callable[[Result], float | None], Callable[[float], str]]
 """Heading of a column, what it shows of a result, and how."""
 
 
 def columns(table: Table, found: Sequence[Result]) -> list[Column]:
-    """Return the columns of a table of which anything is known.
+    """Return the columns of a table that some result has a value for.
 
     Args:
         table: the table.
         found: all results.
+    """
+    sizes = sorted({size for result in found for size in result["results"].get("by_size", {})}, key=len)
+    every = all_columns(sizes, table.images)
+    return [column for column in every if any(column[1](result) is not None for result in found)]
+
+
+def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]:
+    """Return all columns.
+
+    Args:
+        sizes: sizes of images whose PSNR is shown, such as 1/2.
+        images: heading of a column -> name of the held-out image whose PSNR it shows.
     """
 
     def of_run(name: str) -> Callable[[Result], float | None]:
@@ -36,22 +48,20 @@ def columns(table: Table, found: Sequence[Result]) -> list[Column]:
     def memory(result: Result) -> float | None:
         return None if (used := of_run("peak_memory_bytes")(result)) is None else used / 2**30
 
-    sizes = sorted({size for result in found for size in result["results"].get("by_size", {})}, key=len)
-    every: list[Column] = [
-        ("test PSNR", lambda result: result["results"]["psnr"], "{:.2f} dB"),
-        ("SSIM", lambda result: result["results"]["ssim"], "{:.3f}"),
-        ("MS-SSIM", lambda result: result["results"].get("ms_ssim"), "{:.3f}"),
-        (f"LPIPS ({NETWORK})", lambda result: result["results"]["lpips"], "{:.3f}"),
-        *((f"size {size}", of_size(size), "{:.2f} dB") for size in sizes),
-        *((heading, of_image(name), "{:.2f} dB") for heading, name in table.images.items()),
-        ("floaters", lambda result: result["results"].get("floaters"), "{:.1f} %"),
-        ("steps", of_run("steps"), "{:,.0f}"),
-        ("training rays/s", of_run("rays_per_second"), "{:,.0f}"),
-        ("samples a ray", of_run("samples_per_ray"), "{:.1f}"),
-        ("peak memory", memory, "{:.1f} GiB"),
-        ("render", lambda result: 1 / result["results"]["fps"], "{:.2g} s/image"),
+    return [
+        ("test PSNR", lambda result: result["results"]["psnr"], "{:.2f} dB".format),
+        ("SSIM", lambda result: result["results"]["ssim"], "{:.3f}".format),
+        ("MS-SSIM", lambda result: result["results"].get("ms_ssim"), "{:.3f}".format),
+        (f"LPIPS ({NETWORK})", lambda result: result["results"].get("lpips"), "{:.3f}".format),
+        *((f"size {size}", of_size(size), "{:.2f} dB".format) for size in sizes),
+        *((heading, of_image(name), "{:.2f} dB".format) for heading, name in images.items()),
+        ("floaters", lambda result: result["results"].get("floaters"), "{:.2f} %".format),
+        ("steps", of_run("steps"), "{:,.0f}".format),
+        ("training rays/s", of_run("rays_per_second"), lambda rate: f"{float(f'{rate:.3g}'):,.0f}"),
+        ("samples a ray", of_run("samples_per_ray"), "{:.1f}".format),
+        ("peak memory", memory, "{:.1f} GiB".format),
+        ("render", lambda result: 1 / result["results"]["fps"], "{:.2g} s/image".format),
     ]
-    return [column for column in every if any(column[1](result) is not None for result in found)]
 
 
 def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
@@ -61,7 +71,7 @@ def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
 
     Args:
         table: the table.
-        results: folder of the results.
+        results: the file of its results.
         wanted: what is found in the names of the rows that are shown.
     """
     lines: dict[tuple[str, str, float], list[tuple[Row, Result]]] = {}
@@ -69,22 +79,22 @@ def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
         runs = lines.setdefault((row.data, row.method, row.seconds), [])
         runs += [] if (found := kept(row, results)) is None else [(row, found)]
     shows = columns(table, [found for runs in lines.values() for _, found in runs])
-    headings = ["run", *(heading for heading, *_ in shows), "file"]
+    headings = ["run", *(heading for heading, *_ in shows), "result"]
     text = ["| " + " | ".join(headings) + " |", "|---" * len(headings) + "|"]
     for (data, method, seconds), runs in lines.items():
-        cells = [_cell(show, [found for _, found in runs]) for show in shows]
-        files = ", ".join(f"`{row.name}.json`" for row, _ in runs)
-        text.append("| " + " | ".join([f"{data}, {method}, {seconds:g} s", *cells, files]) + " |")
+        cells = [cell(show, [found for _, found in runs]) for show in shows]
+        first = f"`{runs[0][0].name}`" if runs else ""
+        text.append("| " + " | ".join([f"{data}, {method}, {seconds:g} s", *cells, first]) + " |")
     return "\n".join(text)
 
 
-def _cell(column: Column, found: Sequence[Result]) -> str:
+def cell(column: Column, found: Sequence[Result]) -> str:
     """Return the mean of a column over the seeds, with the spread of PSNRs; nothing if a run lacks it."""
     _, value_of, shape = column
     values = [value for value in map(value_of, found) if value is not None]
     if not values or len(values) < len(found):
         return ""
-    text = shape.format(fmean(values))
+    text = shape(fmean(values))
     return text.replace(" dB", f" ± {stdev(values):.2f} dB") if len(values) > 1 else text
 
 
@@ -93,7 +103,7 @@ def listing(rows: Sequence[Row], results: Path) -> str:
 
     Args:
         rows: the rows.
-        results: folder of the results.
+        results: the file of their table's results.
     """
     found = [(row, kept(row, results)) for row in rows]
     done = [(row, result) for row, result in found if result is not None]

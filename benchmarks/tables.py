@@ -1,8 +1,8 @@
-"""Tables of results: each row a run in a process of its own, judged on every held-out image and kept as a JSON file.
+"""Tables of results: each row a run in a process of its own, judged on every held-out image and kept in a JSON file.
 
 A table is a YAML file. Its `rows` are blocks: every data set of a block with every method, budget and seed of it is a
-row. Rows whose file is there are not run again, so that a table of many hours grows over days. A row that was stopped
-goes on where it was.
+row. The results of a table are one JSON file, `rows`, by name. Rows that are in it are not run again, so that a table
+of many hours grows over days. A row that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from typing import Any
 from nerfloom.base.config import from_plain, read_yaml
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, shown
+from nerfloom.benchmarks.results import add_row, read_rows
 from nerfloom.comparison import runner
 from nerfloom.comparison.measures import measure, read_json
 from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, Job, split_words
 from nerfloom.training.report import SUMMARY
-from nerfloom.training.run import write_json
 
 TRIED = 3
 """Number of held-out images on which a trial, with other budgets than the table's, is judged."""
 Result = dict[str, Any]
-"""The content of a row's file: what ns-eval writes, and how it was made, as `run`."""
+"""What is kept of a row: what ns-eval writes, and how it was made, as `run`."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Name of the row, and of its file."""
+        """Name of the row, also in the results."""
         seed = "" if self.job.seed == FIRST_SEED else f"-seed{self.job.seed}"
         return f"{self.data}-{self.method}-{self.seconds:g}s{seed}"
 
@@ -74,10 +74,12 @@ class Table:
     """The rows of a file.
 
     Args:
+        name: name of the table: its file's, without `.yml`.
         rows: the rows, seed by seed.
         images: heading of a column -> name of the held-out image whose PSNR it shows.
     """
 
+    name: str
     rows: tuple[Row, ...]
     images: Mapping[str, str]
 
@@ -106,12 +108,12 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
             row = replace(row, conditions=replace(row.conditions, lpips_weights=weights))
             if not re.fullmatch(r"[\w.-]+", row.name):
                 raise ConfigError(
-                    f"{path}: {shown(row.name)} names no file; take letters, digits and hyphens for names"
+                    f"{path}: {shown(row.name)} is no name of a row; take letters, digits and hyphens for names"
                 )
             if row.name in rows:
                 raise ConfigError(f"{path}: two rows are called {row.name}; give one's data or method another name")
             rows[row.name] = row
-    return Table(tuple(rows.values()), images)
+    return Table(path.stem, tuple(rows.values()), images)
 
 
 def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Iterator[Row]:
@@ -158,32 +160,33 @@ def _conditions(place: str, root: Path, seconds: float, views: int | None) -> Co
     )
 
 
-def kept(row: Row, results: Path) -> Result | None:
+def kept(row: Row, file: Path) -> Result | None:
     """Return the result of a row, or None if it is not there.
 
     Args:
         row: the row.
-        results: folder of the results.
+        file: the table's results.
 
     Raises:
-        ConfigError: if the file is of another command.
+        ConfigError: if the result is of another command.
     """
-    found = read_json(path := results / f"{row.name}.json")
-    if not isinstance(found, dict) or "results" not in found:
+    if (found := read_rows(file).get(row.name)) is None:
         return None
     made_by = found.get("run", {}).get("label", row.job.contender.label)
     if made_by != row.job.contender.label:
-        raise ConfigError(f"{path} is of '{made_by}', not of '{row.job.contender.label}'; remove it, or rename the row")
+        raise ConfigError(
+            f"{file}: {row.name} is of '{made_by}', not of '{row.job.contender.label}'; remove it, or rename the row"
+        )
     return found
 
 
-def run_rows(rows: Sequence[Row], root: Path, results: Path) -> dict[str, str]:
-    """Train and judge the rows that are missing, one after the other, and write a file for each.
+def run_rows(rows: Sequence[Row], root: Path, file: Path) -> dict[str, str]:
+    """Train and judge the rows that are missing, one after the other, and keep each when it is done.
 
     Args:
         rows: the rows.
-        root: folder of the folders of all data, which is left out of the files.
-        results: folder of the results.
+        root: folder of the folders of all data, which is left out of the results.
+        file: the table's results.
 
     Returns:
         Name of each row that failed -> why.
@@ -194,13 +197,12 @@ def run_rows(rows: Sequence[Row], root: Path, results: Path) -> dict[str, str]:
     failures = {}
     with runner.stoppable() as stopped:
         for number, row in enumerate(rows, 1):
-            if stopped.is_set() or kept(row, results) is not None:
+            if stopped.is_set() or kept(row, file) is not None:
                 continue
             say(f"[{number}/{len(rows)}] {row.name}: {row.conditions.budget()}, {time.strftime('%H:%M')}")
             failure = None if runner.is_done(row.job) else runner.run_job(row.job, row.conditions, None, stopped)
             if failure is None:
-                results.mkdir(parents=True, exist_ok=True)
-                write_json(results / f"{row.name}.json", found := result_of(row, root))
+                add_row(file, row.name, found := result_of(row, root))
                 say(f"  PSNR {found['results']['psnr']:.2f} dB, {found['run']['steps']:,} steps")
             elif not stopped.is_set():
                 failures[row.name] = f"{failure.reason} (full output: {failure.log})"
@@ -209,7 +211,7 @@ def run_rows(rows: Sequence[Row], root: Path, results: Path) -> dict[str, str]:
 
 
 def result_of(row: Row, root: Path) -> Result:
-    """Return the content of a finished row's file, without paths of the machine.
+    """Return what is kept of a finished row, without paths of the machine.
 
     Args:
         row: the row.

@@ -53,6 +53,17 @@ def test_against_triangulation_of_noisy_rays() -> None:
     torch.testing.assert_close(found, spread, rtol=0.03, atol=0)
 
 
+def test_the_distance_of_a_point_beyond_measure_is_unknown() -> None:
+    """Its information is below float64: the inverse does not exist. The other point's distance is as before."""
+    tracks, centers = two_rays(0.3, 3.0, 1e-3)
+    points = torch.cat((tracks.points.double(), torch.full((1, 3), 1e200, dtype=torch.float64)))
+    images, seen = torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1])
+    both = Tracks(points, images, seen, torch.full((4,), 1e-3), torch.zeros(2, dtype=torch.int64))
+    found = distance_deviations(both, centers)
+    torch.testing.assert_close(found[:2], distance_deviations(tracks, centers))
+    assert not (found[2:] <= LARGEST_DEVIATION).any()
+
+
 def test_one_image_knows_no_distance() -> None:
     tracks, centers = two_rays(0.3, 3.0, 1e-3)
     alone = tracks.of_images(torch.tensor([1]))

@@ -86,15 +86,16 @@ def _methods(flags: MethodFlags) -> None:
 
 def _profile(flags: ProfileFlags) -> None:
     from nerfloom.benchmarks.profile_step import measure
+    from nerfloom.benchmarks.results import add_row
     from nerfloom.cli.train import run_of
     from nerfloom.comparison.plan import split_words
 
     if not (words := split_words(flags.method, "--method")):
         raise FlagError("--method is empty; give the name of a method, such as instant-ngp")
-    path = flags.output_dir / f"profile-{words[0]}.json"
+    path = flags.output_dir / "profile-step.json"
     make_room(path)
     run = run_of(words[0], [*words[1:], "--data", str(flags.data)])
-    write_results(path, {"method": flags.method, **measure(run, flags.steps, flags.max_seconds)})
+    add_row(path, flags.method, measure(run, flags.steps, flags.max_seconds))
 
 
 def _frames(flags: FramesFlags) -> None:

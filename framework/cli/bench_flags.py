@@ -71,4 +71,4 @@ class ProfileFlags:
     max_seconds: float = 45.0
     """Time budget, seconds, for which the method chooses its settings; training does not stop after it."""
     output_dir: Path = RESULTS
-    """Folder of profile-METHOD.json."""
+    """Folder of profile-step.json, which gets a row for the method."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import zlib
@@ -87,7 +88,9 @@ def views_for(max_seconds: float | None) -> int | None:
     Returns:
         A number of views; None for all.
     """
-    return None if max_seconds is None else max(LEAST_VIEWS, round(max_seconds))
+    if max_seconds is None or not math.isfinite(max_seconds):  # which the conditions refuse
+        return None
+    return max(LEAST_VIEWS, round(max_seconds))
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,8 @@ class Conditions:
             )
         for name in ("max_seconds", "max_num_iterations", "target_psnr"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise FlagError(f"--{name.replace('_', '-')} is {value}; it must be more than 0")
+            if value is not None and not 0 < value < math.inf:
+                raise FlagError(f"--{name.replace('_', '-')} is {value}; it must be more than 0 and finite")
         if self.curve_images < 0 or (self.max_eval_images is not None and self.max_eval_images < 1):
             raise FlagError("--curve-images must be at least 0, --max-eval-images at least 1")
 

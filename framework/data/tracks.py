@@ -171,8 +171,9 @@ def distance_deviations(tracks: Tracks, centers: Tensor) -> Tensor:
     across = (eye - outer) / spread[:, None, None] + outer / squared[:, None, None]
     information = across.new_zeros(len(tracks.points), 3, 3).index_add_(0, tracks.seen, across)
     unseen = torch.bincount(tracks.seen, minlength=len(tracks.points)) == 0
-    covariance = torch.linalg.inv(torch.where(unseen[:, None, None], eye, information))
-    return ((covariance[tracks.seen] * outer).sum((-1, -2))).clamp(min=0).sqrt()
+    covariance, singular = torch.linalg.inv_ex(torch.where(unseen[:, None, None], eye, information))
+    deviations = ((covariance[tracks.seen] * outer).sum((-1, -2))).clamp(min=0).sqrt()
+    return deviations.masked_fill(singular[tracks.seen] > 0, torch.inf)  # points so far away that nothing holds them
 
 
 def _renumbered(images: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:

@@ -57,8 +57,8 @@ def test_a_profile_adds_up(shared_tiny: Path, tmp_path: Path) -> None:
     flags = ("--data", shared_tiny, "--method", method, "--steps", 2, "--output-dir", tmp_path)
     done = called("ns-bench", "profile-step", *flags)
     assert done.returncode == 0, done.stderr
-    content = json.loads((tmp_path / "profile-nerfacto.json").read_text())
-    assert (content["method"], content["rays per step"]) == (method, 128)
+    content = json.loads((tmp_path / "profile-step.json").read_text())["rows"][method]
+    assert content["rays per step"] == 128
     assert sum(content["ms"].values()) == pytest.approx(content["ms per step"], abs=0.1)
     assert content["ms"]["Python and torch"] > 0
 
@@ -68,7 +68,8 @@ def test_contention_is_measured_alone_and_beside(shared_tiny: Path, tmp_path: Pa
     flags = ["--data", shared_tiny, "--rows", "one loop", "--seconds", 0.3, "--work", "training"]
     done = benchmarked("contention", *flags, "--output", tmp_path / "c.json")
     assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "c.json").read_text())["training"]
+    (content,) = json.loads((tmp_path / "c.json").read_text())["rows"].values()
+    rows = content["training"]
     assert [row["beside"] for row in rows] == ["nothing", "one loop", "one loop, OMP_WAIT_POLICY=PASSIVE"]
     assert rows[0]["share"] == [1.0]
     for row in rows:

@@ -16,6 +16,7 @@ from benchmarks.__main__ import main
 from benchmarks.table_text import LOADING, estimate
 from benchmarks.tables import Row, read_table
 from nerfloom.base.errors import ConfigError
+from nerfloom.benchmarks.results import add_row
 from nerfloom.cli.train import run_of
 from nerfloom.comparison import runner
 from nerfloom.comparison.plan import Conditions, Job
@@ -100,7 +101,7 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
         ("rows: [{data: {a: b}, methods: {c: kplanes}}]", "has no rows"),
         ("rows: [{data: {a: b}, methods: [kplanes], seconds: [1]}]", "must have names with a text each"),
         ("rows: [{data: {a: b}, methods: {c: kplanez}, seconds: [1]}]", "Did you mean 'kplanes'"),
-        ("rows: [{data: {../a: b}, methods: {c: kplanes}, seconds: [1]}]", "names no file"),
+        ("rows: [{data: {../a: b}, methods: {c: kplanes}, seconds: [1]}]", "is no name of a row"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1, 1]}]", "two rows are called a-c-1s"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}, second: [1]}]", "unknown key"),
     ],
@@ -131,6 +132,11 @@ def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.M
     assert rows
 
 
+def rows_of(folder: Path) -> dict[str, Any]:
+    """What is kept of `write`'s table."""
+    return json.loads((folder / "table.json").read_text())["rows"]
+
+
 def test_rows_that_are_there_are_not_run_again(
     ran: list[tuple[str, float, int]],
     tmp_path: Path,
@@ -144,7 +150,7 @@ def test_rows_that_are_there_are_not_run_again(
         bench(monkeypatch, tmp_path, "--only", "ball")
     assert "ball-planes-45s: its planes have crashed" in capsys.readouterr().err
     assert len(ran) == 8
-    content = json.loads((tmp_path / "results" / "ball-planes-10s-seed43.json").read_text())
+    content = rows_of(tmp_path / "results")["ball-planes-10s-seed43"]
     assert content["run"]["command"].startswith(
         "ns-train kplanes --num-scales 2 --downscale-factor 2 --machine.seed 43"
     )
@@ -163,12 +169,12 @@ def test_rows_that_are_there_are_not_run_again(
     assert "is of 'kplanes --num-scales 2 on" in capsys.readouterr().err
 
 
-def test_a_finished_run_without_its_file_is_only_written(
+def test_a_finished_run_without_its_row_is_only_written(
     ran: list[tuple[str, float, int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path)
     bench(monkeypatch, tmp_path, "--only", "^embedded-ngp-10s$")
-    file = tmp_path / "results" / "embedded-ngp-10s.json"
+    file = tmp_path / "results" / "table.json"
     before = file.read_text()
     file.unlink()
     bench(monkeypatch, tmp_path, "--only", "^embedded-ngp-10s$")
@@ -184,16 +190,16 @@ def test_means_and_spreads_over_seeds(
 ) -> None:
     path = write(tmp_path)
     bench(monkeypatch, tmp_path, "--only", "ngp")
-    for file in (tmp_path / "results").glob("*.json"):
-        content = json.loads(file.read_text())
+    rows = rows_of(tmp_path / "results")
+    for content in rows.values():
         content["per_image"] = [{"name": "r_0.png", "psnr": content["results"]["psnr"] - 1}]
         content["results"]["by_size"] = {"1/2": {"psnr": 30.0}, "1": {"psnr": 29.0}}
-        file.write_text(json.dumps(content))
+    (tmp_path / "results" / "table.json").write_text(json.dumps({"rows": rows}))
     bench(monkeypatch, tmp_path, "--show", "markdown", "--only", "^ball")
     head, _, *lines = capsys.readouterr().out.splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (head, *lines)]
     titles = ["run", "test PSNR", "SSIM", "size 1", "size 1/2", "first", "steps"]
-    assert cells[0] == [*titles, "training rays/s", "peak memory", "render", "file"]
+    assert cells[0] == [*titles, "training rays/s", "peak memory", "render", "result"]
     assert [row[0] for row in cells[1:]] == [
         f"ball, {method}, {seconds} s" for seconds in (10, 45) for method in ("ngp", "planes")
     ]
@@ -202,10 +208,16 @@ def test_means_and_spreads_over_seeds(
     spread = f"{stdev(psnrs):.2f} dB"
     assert cells[3][1] == f"{fmean(psnrs):.2f} ± {spread}"
     assert cells[3][2:6] == ["0.900", "29.00 ± 0.00 dB", "30.00 ± 0.00 dB", f"{fmean(psnrs) - 1:.2f} ± {spread}"]
-    assert cells[3][6:] == [
-        "1,000", f"{1e6 / 45.5:,.0f}", "1.0 GiB", "0.25 s/image", "`ball-ngp-45s.json`, `ball-ngp-45s-seed43.json`"
-    ]  # fmt: skip
+    assert cells[3][6:] == ["1,000", "22,000", "1.0 GiB", "0.25 s/image", "`ball-ngp-45s`"]
     assert cells[2][1:] == [""] * 10
+
+
+def test_what_is_no_file_of_results_is_kept(tmp_path: Path) -> None:
+    file = tmp_path / "table.json"
+    file.write_text('{"rows": [')
+    with pytest.raises(ConfigError, match="is no file of results"):
+        add_row(file, "ball-ngp-10s", {"results": {"psnr": 30.0}})
+    assert file.read_text() == '{"rows": ['
 
 
 def test_a_row_is_expected_to_take_as_long_as_those_like_it(tmp_path: Path) -> None:
@@ -247,11 +259,11 @@ def test_a_table_that_is_stopped_goes_on(tmp_path: Path) -> None:
     time.sleep(3)
     first.send_signal(signal.SIGTERM)
     assert "run the same command to continue" in first.communicate()[1]
-    assert not (tmp_path / "tiny-ngp-8s.json").exists()
+    assert not (tmp_path / "table.json").exists()
     (log,) = tmp_path.rglob("seed-42.log")
     subprocess.run([*words, *folders], check=True)
     assert "resuming" in log.read_text()
-    content = json.loads((tmp_path / "tiny-ngp-8s.json").read_text())
+    content = rows_of(tmp_path)["tiny-ngp-8s"]
     assert content["run"]["seconds"] == pytest.approx(8, abs=1)
     assert content["run"]["samples_per_ray"] > 1
     assert content["results"]["psnr"] > 12

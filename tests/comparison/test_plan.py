@@ -1,6 +1,7 @@
 """What is compared, under which conditions, by which commands."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,10 +48,18 @@ def test_words_are_those_of_a_shell() -> None:
         split_words("'open", "--data-flags")
 
 
+@pytest.mark.parametrize("seconds", [math.nan, math.inf])
+def test_a_budget_without_end_is_refused(seconds: float) -> None:
+    """As a recipe can have it: YAML knows .nan and .inf."""
+    with pytest.raises(ConfigError, match=r"--max-seconds is (nan|inf); it must be more than 0 and finite"):
+        plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=seconds))
+
+
 def test_conditions_must_end_somewhere() -> None:
     with pytest.raises(ConfigError, match="set how long each method trains"):
         replace(CONDITIONS, max_seconds=None)
-    for nothing in ({"max_seconds": 0.0}, {"max_num_iterations": 0}, {"target_psnr": float("nan")}):
+    nothings = ({"max_seconds": 0.0}, {"max_num_iterations": 0}, {"target_psnr": math.nan}, {"max_seconds": math.inf})
+    for nothing in nothings:
         with pytest.raises(ConfigError, match="must be more than 0"):
             replace(CONDITIONS, **nothing)
     assert CONDITIONS.budget() == "120 s of training"

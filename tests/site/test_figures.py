@@ -1,19 +1,20 @@
 """Figures in the documents are those of the evaluations that they name, and tables of names those of the code."""
 
 import json
-import math
 import re
 from pathlib import Path
-from statistics import fmean, stdev
+from types import ModuleType
+from typing import Any
 
+import pytest
+
+from benchmarks.tables import read_table
 from nerfloom.base import from_nerfstudio
 from nerfloom.base.other_projects import ELSEWHERE
 from nerfloom.registry import registered
 from tests.site.pages import ROOT
 
 DOCS = ROOT / "docs"
-COUNTED = "ignored pixels were copied from the true image and counted as perfect in ssim and ms_ssim"
-"""What older files of masked captures say, whose SSIM is not shown."""
 PSNR = re.compile(r"(\d+\.\d+)(?: ± \d+\.\d+)? dB")
 
 
@@ -22,74 +23,67 @@ def rows(page: Path) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
 
 
-def results(name: str) -> dict[str, float]:
-    content = json.loads((DOCS / "results" / name).read_text())
-    return content["results"] | ({"ssim": math.nan} if content.get("masks") == COUNTED else {})
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """docs/building/tables.py."""
+    monkeypatch.syspath_prepend(str(DOCS / "building"))
+    import tables as module
+
+    return module
 
 
-def runs(cell: str) -> list[dict[str, float]]:
-    """The results in the files that a cell names; a star stands for any letters, as in `lego-x-45s-seed*.json`."""
-    patterns = re.findall(r"`([\w.*-]+\.json)`", cell)
-    names = [sorted(file.name for file in (DOCS / "results").glob(pattern)) for pattern in patterns]
-    assert names
-    assert all(names), f"no file is called {cell}"
-    return [results(name) for group in names for name in group]
+def test_tables_are_those_of_their_results(tables: ModuleType) -> None:
+    known = tables.all_rows()
+    assert len(known) > 100
+    for page in tables.PAGES:
+        text = (DOCS / page).read_text(encoding="utf-8")
+        assert tables.filled(text, known) == text, f"{page}: python -m docs.building.tables"
 
 
-def ssim_of(found: list[dict[str, float]]) -> str:
-    mean = fmean(run["ssim"] for run in found)
-    return "" if math.isnan(mean) else f"{mean:.3f}"
+def evaluation(psnr: float, **run: float) -> dict[str, Any]:
+    return {"results": {"psnr": psnr, "ssim": 0.9, "fps": 4.0}, "run": run, "per_image": []}
 
 
-def psnr_of(found: list[dict[str, float]]) -> str:
-    """The mean, and of several seeds the standard deviation of a run."""
-    values = [run["psnr"] for run in found]
-    return f"{fmean(values):.2f}" + (f" ± {stdev(values):.2f}" if len(values) > 1 else "") + " dB"
+def test_cells_are_filled_in_by_name(tables: ModuleType) -> None:
+    known = {"a-x-5s": evaluation(31.0, steps=1200), "a-x-5s-seed43": evaluation(32.0, steps=1400)}
+    known |= {"a-x-5s-slow": evaluation(9.0, steps=1), "b-x-5s": evaluation(30.0), "b-y-5s": evaluation(28.0)}
+    page = """
+| run | test PSNR | steps | note | result |
+|---|---|---|---|---|
+| two | ? | ? | 7 | `a-x-5s` |
+| one | ? | ? | 8 | `b-x-5s` |
+| other | ? | ? | 9 | |
+
+<!-- results: ROW-COLUMN-5s: test PSNR, SSIM: best -->
+
+| data | `x` | y |
+|---|---|---|
+| `a`: first | | |
+| `b` | | |
+
+| data | x |
+|---|---|
+| `a` | ? |
+"""
+    cells = [line for line in tables.filled(page, known).splitlines() if line.startswith("| ")]
+    assert cells[1:4] == [
+        "| two | 31.50 ± 0.71 dB | 1,300 | 7 | `a-x-5s` |",
+        "| one | 30.00 dB |  | 8 | `b-x-5s` |",
+        "| other | ? | ? | 9 | |",
+    ]
+    assert cells[5] == "| `a`: first | **31.50 ± 0.71 dB, 0.900** |  |"
+    assert cells[6] == "| `b` | **30.00 dB, 0.900** | 28.00 dB, 0.900 |"
+    assert cells[8] == "| `a` | ? |"
+    with pytest.raises(KeyError, match="c-x-5s"):
+        tables.filled(page.replace("`b`", "`c`"), known)
 
 
-def test_figures_are_those_of_their_files() -> None:
-    pages = [DOCS / "figures.md", DOCS / "published.md"]
-    measured = [row for page in pages for row in rows(page) if row[-1].endswith(".json`")]
-    assert len(measured) >= 29
-    for row in measured:
-        found = runs(row[-1])
-        assert row[1:3] == [psnr_of(found), ssim_of(found)], row
-
-
-CAPTURED_BY = ("nerfacto-without-points", "nerfacto", "nerfacto-free-space", "zip-nerf", "mip-nerf-360")
-"""Names in the files of the columns of both tables of captures, after the first column."""
-WITH_POINTS = ("can", "cup", "desk")
-"""Captures of which points are known, so that `nerfacto` learns from them."""
-
-
-def test_the_tables_of_captures_are_those_of_their_files() -> None:
-    """The first has PSNR and SSIM, the second steps, seconds an image and, where points are known, floaters."""
-    tables = [row for row in rows(DOCS / "figures.md") if len(row) == 6 and re.match(r"`\w+`", row[0])]
-    checked = 0
-    for number, (first, *cells) in enumerate(tables):
-        capture = first.split("`")[1]
-        for name, cell in zip(CAPTURED_BY, cells, strict=True):
-            file = DOCS / "results" / f"{capture}-{name}-600s.json"
-            if (capture, name) == ("fox", "nerfacto-without-points") and not file.exists():
-                file = DOCS / "results" / "fox-nerfacto-600s.json"
-            expected = file.exists() and (name != "nerfacto" or capture in WITH_POINTS)
-            assert bool(cell) == expected, (first, name)
-            if not cell:
-                continue
-            content = json.loads(file.read_text())
-            found = results(file.name)
-            floaters = found.get("floaters")
-            quality = ", ".join(filter(None, (psnr_of([found]), ssim_of([found]))))
-            share = "" if floaters is None else f", {floaters:.2f} %"
-            work = f"{content['run']['steps']:,}, {1 / found['fps']:.1f} s{share}"
-            assert cell.replace("*", "") == (quality if number < len(tables) // 2 else work), (first, name)
-            checked += 1
-    assert checked >= 40
-
-
-def test_several_seeds_are_a_mean_with_its_spread() -> None:
-    assert psnr_of([{"psnr": 31.0}, {"psnr": 32.0}, {"psnr": 33.0}]) == "32.00 ± 1.00 dB"
-    assert psnr_of([{"psnr": 31.0}]) == "31.00 dB"
+def test_results_are_shown_or_rows_of_a_table(tables: ModuleType) -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
+    files = (ROOT / "configs" / "tables").glob("*.yml")
+    asked = {row.name for file in files for row in read_table(file, Path("data"), Path("runs")).rows}
+    shown = {re.sub(r"-seed\d+$", "", name) for name in tables.all_rows()}
+    assert [name for name in sorted(shown - asked) if f"`{name}`" not in text] == []
 
 
 def test_what_stands_beside_published_results_is_in_the_figures() -> None:
@@ -98,24 +92,6 @@ def test_what_stands_beside_published_results_is_in_the_figures() -> None:
     known = (DOCS / "figures.md").read_text()
     assert len(ours) >= 5
     assert [number for number in ours if number not in PSNR.findall(known)] == []
-
-
-def test_the_table_of_budgets_is_that_of_its_files() -> None:
-    head, *body = [row for row in rows(DOCS / "guides" / "choosing.md") if len(row) == 9]
-    seconds = [int(cell.removesuffix(" s")) for cell in head[1:]]
-    compared = {row["label"]: row for row in json.loads((DOCS / "results" / "methods-lego.json").read_text())["runs"]}
-    checked = 0
-    for row in body[1:]:
-        label = row[0].strip("`")
-        for budget, cell in zip(seconds, row[1:], strict=True):
-            if not cell:
-                continue
-            name = f"lego-{label.split()[0]}-{budget}s"
-            seeds = sorted((DOCS / "results").glob(f"{name}-seed*.json")) or [DOCS / "results" / f"{name}.json"]
-            found = [results(file.name) for file in seeds if file.exists()] or [compared[label]]
-            assert cell == psnr_of(found).removesuffix(" dB"), (label, budget)
-            checked += 1
-    assert checked >= 15
 
 
 def test_captures_to_choose_by_are_those_of_the_figures() -> None:

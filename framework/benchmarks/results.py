@@ -1,0 +1,42 @@
+"""Files of results: a JSON file a table, whose `rows` stand by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from nerfloom.base.errors import ConfigError
+from nerfloom.comparison.measures import read_json
+from nerfloom.training.run import write_json
+
+
+def read_rows(file: Path) -> dict[str, Any]:
+    """Return the rows of a file of results by name; none if there is no such file.
+
+    Args:
+        file: the JSON file.
+
+    Raises:
+        ConfigError: if it is not a file of results.
+    """
+    if not file.exists() or not file.stat().st_size:
+        return {}
+    found = read_json(file)
+    if not isinstance(found, dict) or not isinstance(rows := found.get("rows"), dict):
+        raise ConfigError(f"{file} is no file of results, which has rows by name; name another place")
+    return rows
+
+
+def add_row(file: Path, name: str, result: Any) -> None:
+    """Add a row to a file of results, in place of one of that name.
+
+    Args:
+        file: the JSON file; it and its folder are created if missing.
+        name: name of the row.
+        result: plain data.
+
+    Raises:
+        ConfigError: if the file is there and holds something else.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_json(file, {"rows": dict(sorted({**read_rows(file), name: result}.items()))})

@@ -1,7 +1,7 @@
 """Effect of each part of instant-ngp: training with one part switched off, or on, in turn.
 
 Each variant is trained with each seed. The variants alternate, so that a drift of the machine's speed affects all of
-them. Reported are the seconds of training to the target PSNR on validation views and the final PSNR on all test views:
+them. The results are the training seconds to the target PSNR on validation views, and the final PSNR on all test views:
 means over seeds, with the standard deviation of a single run.
 """
 
@@ -47,7 +47,7 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
         data: folder of the data set.
         seconds: seconds of training of each run.
         seeds: number of runs of each variant.
-        target: PSNR, dB, to which the time is reported.
+        target: PSNR, dB, for which the time is reported.
 
     Returns:
         The machine, the arguments and a row for each variant, as plain data.

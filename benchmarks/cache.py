@@ -1,8 +1,8 @@
 """Memory and speed of training with a large image set under --cache-limit, and with a small one in memory.
 
-Renders of the embedded scene are enlarged to images of the given size. instant-ngp is trained on them with their pixels
-in a file, and on the same images at a quarter of the width with all pixels in memory, each in its own process. The page
-cache is warm, as the file has just been written.
+Renders of the embedded scene are enlarged to the given image size. instant-ngp is trained on them with their pixels in
+a file, and on the same images at a quarter of the width with all pixels in memory, each in its own process. The page
+cache is warm, because the file has just been written.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from nerfloom.training.trainer import Trainer
 RENDERED = 200
 """Width and height of the renders before they are enlarged, pixels."""
 WARM_UP = 0.25
-"""Fraction of the time after which speed is measured, as the occupancy grid has then found empty space."""
+"""Fraction of the time before the speed is measured; the occupancy grid has then found empty space."""
 SETS = (("small, in memory", 4, False), ("large, from a file", 1, True), ("again", 1, True))
 """Name of each set, divisor of width and height, and whether pixels are read from a file."""
 
@@ -45,7 +45,7 @@ def measure(images: int, size: tuple[int, int], seconds: float, limit: float, fo
         size: width and height of the large images, pixels.
         seconds: seconds of training on each set.
         limit: maximum memory of decoded pixels, MB.
-        folder: folder of images and cache; the system's temporary folder if None.
+        folder: folder of images and cache; None for the system's temporary folder.
 
     Returns:
         The machine, the arguments and the result of `trained_on` for each set, as plain data.
@@ -169,7 +169,7 @@ def timed_into(function: Callable[..., Any], spent: list[float]) -> Callable[...
 
     Args:
         function: function to call.
-        spent: a list of one element, the sum.
+        spent: a list with one element, the sum.
     """
 
     def timed(*arguments: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Distances between a mesh and an exact surface, which is given by its signed distance."""
+"""Distances between a mesh and an exact surface, given by its signed distance."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from nerfloom.export.mesh import Mesh
 SignedDistance = Callable[[Tensor], Tensor]
 """Function from positions (N, 3) to signed distances (N,), negative inside a solid."""
 SHELL = 0.01
-"""Half the thickness of the shell in which points are drawn to be moved to the surface."""
+"""Half the thickness of the shell in which points are drawn, before they are moved to the surface."""
 CHUNK = 2**17
-"""Number of positions that are evaluated at once."""
+"""Number of positions evaluated at once."""
 MESH_SAMPLES = 1_000_000
-"""Number of points on a mesh among which the nearest faces are looked for."""
+"""Number of points on a mesh used to find the nearest faces."""
 CANDIDATES = 8
 """Number of nearest points whose faces are compared exactly."""
 
 
 def surface_sample(distance: SignedDistance, box: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return points (count, 3) float64 evenly on a surface, and its outward normals.
+    """Return points (count, 3) float64 evenly distributed on a surface, and its outward normals.
 
-    Points are drawn in a thin shell around the surface, and moved along the gradient of the distance. So they are even
-    but for terms of the shell's thickness times the curvature.
+    Points are drawn in a thin shell around the surface, and moved along the gradient of the distance. The distribution
+    is even up to terms of the shell's thickness times the curvature.
 
     Args:
         distance: the surface.
@@ -54,9 +54,9 @@ def _gradient(distance: SignedDistance, points: Tensor) -> Tensor:
 
 
 def visible_from(distance: SignedDistance, points: Tensor, normals: Tensor, cameras: Tensor) -> Tensor:
-    """Return whether each point of a surface is seen from any of several positions, (N,) bool, by sphere tracing.
+    """Return whether each point of a surface is visible from any of several positions, (N,) bool, by sphere tracing.
 
-    Fields of view do not count: each camera looks at the whole scene.
+    Fields of view are ignored: each camera sees the whole scene.
 
     Args:
         distance: the surface.
@@ -101,7 +101,7 @@ def mesh_sample(mesh: Mesh, count: int) -> tuple[Tensor, Tensor]:
 
 
 def distances_to_mesh(points: Tensor, mesh: Mesh) -> Tensor:
-    """Return the distance (N,) from points (N, 3) to a mesh: to the nearest of the faces that are likely the nearest.
+    """Return the distance (N,) from points (N, 3) to a mesh, approximately: to the nearest of a few likely faces.
 
     `trimesh.proximity` compares all faces that may be the nearest, which takes minutes for a million of them.
 
@@ -122,13 +122,13 @@ def distances_to_mesh(points: Tensor, mesh: Mesh) -> Tensor:
 
 
 def seen_samples(points: Tensor, normals: Tensor, cameras: Tensor, pixels: int = 128) -> Tensor:
-    """Return whether each of many points on a mesh is seen from any of several positions, (N,) bool.
+    """Return whether each of many points on a mesh is visible from any of several positions, (N,) bool.
 
-    Points are drawn into an image of all directions with a depth buffer; those at most 2 % behind the nearest of their
-    pixel are seen. So a point that is hidden by another part at less than that distance counts as seen.
+    Points are drawn into an image of all directions with a depth buffer. Points at most 2 % behind the nearest in their
+    pixel count as visible. So a point hidden by another part at less than that distance also counts.
 
     Args:
-        points: (N, 3) points, dense enough to leave no hole in an image.
+        points: (N, 3) points, dense enough to leave no holes in an image.
         normals: (N, 3) normals of their faces.
         cameras: (M, 3) positions.
         pixels: height of the images; their width is twice that.

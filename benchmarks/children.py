@@ -1,4 +1,4 @@
-"""Measurements in separate processes, which earlier measurements cannot affect."""
+"""Measurements in separate processes, unaffected by earlier measurements."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def own_command(name: str, *arguments: object) -> list[str]:
 
 
 def output_of(command: Sequence[str]) -> str:
-    """Run a command to its end and return what it prints on standard output.
+    """Run a command to its end and return its standard output.
 
     Args:
         command: a program and its arguments, as from `python_command`.

@@ -1,11 +1,11 @@
-"""Scenes whose volume-rendering integral is known, for measuring the errors of samplers.
+"""Scenes with a known volume-rendering integral, for measuring the errors of samplers.
 
 With tau(t) the integral of density from a ray's near end to the distance t, a pixel is (Max 1995; NeRF, equation 1)
 
     C = integral of exp(-tau) sigma c dt + exp(-tau(far)) background.
 
-For constant density and linear colour this is elementary (`Solids`). For Gaussians, tau is a sum of error functions,
-and the integrand is analytic, so that Gauss-Legendre quadrature is exact up to rounding (`Blobs`). All matter is in
+For constant density and linear colour this is elementary (`Solids`). For Gaussians, tau is a sum of error functions and
+the integrand is analytic, so Gauss-Legendre quadrature is exact up to rounding (`Blobs`). All matter is in
 `BOX`.
 """
 
@@ -45,7 +45,7 @@ class Light(NamedTuple):
 
 
 class ClosedForm(Field):
-    """A field whose rendered colours are known, in any float type; its features are its colours."""
+    """A field with known rendered colours, in any float type; its features are its colours."""
 
     @abstractmethod
     def truth(self, rays: Rays, background: Tensor) -> Light:
@@ -154,7 +154,7 @@ class Solids(ClosedForm):
         starts, lengths = ends[:, :-1], ends.diff(dim=-1)
         sigma, _ = self._along(origins, directions, starts + lengths / 2)
         tau = sigma * lengths
-        # An interval of linear colour emits the colour at the mean position at which light is stopped.
+        # An interval of linear colour emits the colour at the mean position where light is stopped.
         _, color = self._along(origins, directions, starts + lengths * mean_place(tau))
         weights = torch.exp(-(tau.cumsum(-1) - tau)) * -torch.expm1(-tau)
         depth = tau.sum(-1)
@@ -213,7 +213,7 @@ class Gaussian:
 
 
 class Blobs(ClosedForm):
-    """Overlapping Gaussians, whose densities add up; each emits its own colour.
+    """Overlapping Gaussians whose densities add up; each emits its own colour.
 
     Args:
         gaussians: the Gaussians.

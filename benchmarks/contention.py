@@ -1,8 +1,8 @@
 """Speed of training and rendering beside other programs.
 
-instant-ngp runs alone, beside busy loops of several kinds, and beside itself. Reported are its speed as a fraction of
-that alone, and its fair share of the cores. A fraction above the fair share means that the loops got less than theirs.
-No other programs should run meanwhile.
+instant-ngp runs alone, beside busy loops of several kinds, and beside itself. The results are its speed as a fraction
+of the speed alone, and its fair share of the cores. A fraction above the fair share means that the loops got less than
+theirs. No other programs should run during the measurement.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from nerfloom.training.trainer import Trainer
 LOOP = "import time\nend = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
 """Program of a busy loop."""
 WORK = ("training", "rendering")
-"""Kinds of work that are measured."""
+"""Kinds of work to measure."""
 SETTINGS_FOR = 45.0
 """Time budget, seconds, for which the method chooses its settings."""
 STEPS_BEFORE_RENDERING = 300
@@ -51,7 +51,7 @@ class Row:
     nice: int = 0
     """Niceness of the loops."""
     own_group: bool = False
-    """Whether the loops have a session of their own, which the scheduler treats as one process."""
+    """Whether the loops have their own session, which the scheduler treats as one process."""
     trainings: int = 1
     """Number of simultaneous trainings."""
     environment: tuple[tuple[str, str], ...] = ()
@@ -65,7 +65,7 @@ class Row:
         """
         if self.own_group:
             return 0.5
-        weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's weight of nice 19
+        weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's weight for nice 19
         return cores / (cores * self.trainings + self.loops * weight)
 
 
@@ -117,7 +117,7 @@ def measure(data: Path, seconds: float, parts: Sequence[str] = (), works: Sequen
 
 
 def chosen(parts: Sequence[str]) -> list[Row]:
-    """Return the conditions with given names; `ALONE` is always among them, as speeds are fractions of its speed.
+    """Return the conditions with given names; `ALONE` is always included, because speeds are fractions of its speed.
 
     Args:
         parts: names or parts of names; all conditions if empty.
@@ -127,7 +127,7 @@ def chosen(parts: Sequence[str]) -> list[Row]:
     """
     for part in parts:
         if not any(part in row.name for row in ROWS):
-            raise FlagError(f"--rows: no condition is called '{part}'; known: {'; '.join(row.name for row in ROWS)}")
+            raise FlagError(f"--rows: there is no condition '{part}'; known: {'; '.join(row.name for row in ROWS)}")
     return [row for row in ROWS if row is ALONE or not parts or any(part in row.name for part in parts)]
 
 
@@ -157,7 +157,7 @@ def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[
         children = [started(command, env=environment, **pipes) for _ in range(row.trainings)]
         for process in children:
             wait_for(process, "ready")
-        loop = [sys.executable, "-c", LOOP.format(seconds=20 * seconds)]  # it ends by itself if this process is killed
+        loop = [sys.executable, "-c", LOOP.format(seconds=20 * seconds)]  # ends by itself if this process is killed
         for _ in range(row.loops):
             started(["nice", "-n", str(row.nice), *loop], start_new_session=row.own_group)
         time.sleep(0.5)
@@ -169,17 +169,17 @@ def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[
 
 
 def wait_for(process: subprocess.Popen[str], start: str) -> str:
-    """Read a process's output up to the next line with a given start.
+    """Read a process's output up to the next line with a given beginning.
 
     Args:
         process: process with a pipe for its output.
-        start: start of the line.
+        start: beginning of the line.
 
     Returns:
         The line.
 
     Raises:
-        NerfloomError: if the process ends before.
+        NerfloomError: if the process ends before that.
     """
     for line in process.stdout or ():
         if line.startswith(start):

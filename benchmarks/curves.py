@@ -1,8 +1,8 @@
-"""PSNR against seconds of training, of several methods: a run from the start for every budget and every seed.
+"""PSNR against training seconds of several methods: a run from scratch for every budget and seed.
 
-Schedules and sizes follow the budget, so the curve of one long run would show less at each of its times than a method
-can do in that time. Runs are those of a comparison (`nerfloom.comparison`), in a folder for each budget: what is
-there is kept, so that a stopped benchmark goes on, and methods, budgets and seeds can be added.
+Schedules and sizes depend on the budget, so the curve of one long run would underestimate what a method reaches in a
+shorter time. Runs are those of a comparison (`nerfloom.comparison`), in a folder for each budget. Existing runs
+are kept, so a stopped benchmark can continue, and methods, budgets and seeds can be added.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class Budget:
     """Results of all methods with one budget."""
 
     seconds: float
-    """Seconds of training that each run was given."""
+    """Training seconds of each run."""
     rows: tuple[Row, ...]
     """Results of each method, in the order of the methods."""
 
 
 def all_methods() -> tuple[str, ...]:
-    """Return all installed methods, with the flags with which they are meant to be used on a CPU."""
+    """Return all installed methods, with their recommended flags for a CPU."""
     with_flags = {text.split()[0]: text for text in STANDARD}
     return tuple(with_flags.get(name, name) for name in registered("methods"))
 
@@ -42,21 +42,21 @@ def all_methods() -> tuple[str, ...]:
 def plans(
     methods: Sequence[str], data: Path | None, budgets: Sequence[float], seeds: int, views: int, folder: Path
 ) -> list[Plan]:
-    """Return the runs as a comparison for each budget, the shortest first.
+    """Return the runs as a comparison for each budget, shortest first.
 
     Args:
-        methods: methods, each with its own flags; `all_methods` if there are none.
+        methods: methods, each with its own flags; `all_methods` if empty.
         data: folder of the data set; the embedded scene if None.
         budgets: seconds of training.
         seeds: number of runs of each method with each budget.
-        views: maximum number of held-out views that are evaluated.
+        views: maximum number of held-out views to evaluate.
         folder: folder of the runs.
 
     Raises:
         ConfigError: if a method is unknown, there is no budget, or a number is out of range.
     """
     if not budgets:
-        raise FlagError("--budgets is empty; list seconds of training, as in --budgets 10 45 150")
+        raise FlagError("--budgets is empty; list seconds of training, such as --budgets 10 45 150")
     contenders = tuple(map(Contender.of, methods or all_methods()))
     root = None if data is None else str(data.resolve())
     return [
@@ -80,17 +80,17 @@ def _conditions(data: str | None, seconds: float, views: int) -> Conditions:
 
 
 def run(plan: Plan) -> Budget:
-    """Train and evaluate what is missing of a budget.
+    """Train and evaluate the missing runs of a budget.
 
     Args:
         plan: the runs of the budget.
 
     Returns:
-        What was measured, with the reasons of failures.
+        The measurements, with the reasons of failures.
 
     Raises:
-        ConfigError: if the folder holds runs under other conditions, or cannot be written.
-        Stopped: on a signal; the runs that are done are kept.
+        ConfigError: if the folder has runs under other conditions or cannot be written.
+        Stopped: on a signal; finished runs are kept.
     """
     plan.claim_folder()
     failures: dict[str, list[str]] = {}
@@ -106,7 +106,7 @@ def published(plan: Plan, found: Sequence[Budget]) -> dict[str, Any]:
 
     Args:
         plan: the runs of any budget.
-        found: what was measured with each budget.
+        found: measurements with each budget.
     """
     runs = [run for budget in found for row in budget.rows for run in row.runs]
     machines: list[dict[str, Any]] = []
@@ -151,7 +151,7 @@ def table(plan: Plan, found: Sequence[Budget]) -> Table:
 
     Args:
         plan: the runs of any budget.
-        found: what was measured with each budget.
+        found: measurements with each budget.
     """
     result = Table("PSNR, dB, after", *(f"{budget.seconds:g} s" for budget in found))
     for index, contender in enumerate(plan.contenders):
@@ -171,7 +171,7 @@ def draw(plan: Plan, found: Sequence[Budget]) -> str:
 
     Args:
         plan: the runs of any budget.
-        found: what was measured with each budget.
+        found: measurements with each budget.
 
     Returns:
         The plot as an SVG element.

@@ -1,4 +1,4 @@
-"""Curves of error against evaluations of a field: evaluations needed for an error, and plots."""
+"""Curves of error against evaluations of a field: evaluations needed for a given error, and plots."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nerfloom.base.console import say
 from nerfloom.comparison import plots
 
 LEAST_ERROR = 1e-12
-"""Replacement of an error of 0, which has no logarithm."""
+"""Replaces an error of 0, which has no logarithm."""
 
 
 class Curve(NamedTuple):
@@ -50,7 +50,7 @@ def evaluations_needed(evaluations: Sequence[float], errors: Sequence[float], ta
 def draw(curves: dict[str, dict[str, Curve]], folder: Path) -> list[Path]:
     """Draw a plot for each scene, with a curve for each sampler: error over evaluations of the field, both logarithmic.
 
-    For samplers with coarse fields or proposals, a dashed line is over all evaluations.
+    For samplers with coarse fields or proposals, a dashed line shows all evaluations.
 
     Args:
         curves: curves by scene and sampler.

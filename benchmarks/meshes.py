@@ -1,9 +1,9 @@
-"""Meshes of a trained run: how far they are from the truth, and the time and memory that they take.
+"""Meshes of a trained run: their distance from the truth, and the time and memory to make them.
 
-Each export runs as the command in a process of its own. On the embedded scene, whose surface is exact, reported are the
-mean distances from the mesh to the surface and from the surface to the mesh, and both for what training cameras see
-alone: nothing is known of the underside of things, or of their inside. On a capture with sparse points, reported are
-the distances from these points to the mesh and to the point cloud.
+Each export runs as a command in its own process. The embedded scene has an exact surface. For it, the results are the
+mean distances from the mesh to the surface and from the surface to the mesh, and both for parts visible to training
+cameras, because nothing is known about undersides and interiors. For a capture with sparse points, the results are the
+distances from these points to the mesh and to the point cloud.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SURFACE_POINTS = 20_000
 MESH_POINTS = 300_000
 """Number of points on a mesh."""
 EYES = 20
-"""Number of training cameras from which it is decided what is seen."""
+"""Number of training cameras used to determine visibility."""
 
 
 @runtime_checkable
@@ -54,12 +54,12 @@ class KnowsItsSurface(Protocol):
 
 
 def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions: Sequence[int]) -> dict[str, Any]:
-    """Export meshes of a run and compare them with what is known, and print a line for each.
+    """Export meshes of a run, compare them with the known truth, and print a line for each.
 
     Args:
         run: folder of the run; None to train instant-ngp on the embedded scene.
-        seconds: seconds of that training.
-        kinds: exports of `ns-export` that make a mesh.
+        seconds: training seconds for that run.
+        kinds: exports of `ns-export` that produce a mesh.
         resolutions: cells along the longest edge of the box.
 
     Returns:
@@ -86,7 +86,7 @@ def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions:
 
 
 class Truth:
-    """The surface of a run's scene, as far as it is known, in the frame of its input.
+    """The known surface of a run's scene, in the frame of its input.
 
     Args:
         run: folder of the run.
@@ -101,7 +101,7 @@ class Truth:
         self.size = float((poses[:, :, 3] - poses[:, :, 3].mean(0)).norm(dim=-1).mean())
         self.distance = loaded.parser.signed_distance if isinstance(loaded.parser, KnowsItsSurface) else None
         self.sparse: Tensor | None = None
-        # Points whose distances are not known well enough to learn from are no truth either.
+        # Points with distances too inaccurate to learn from are not used as truth either.
         points = parsed.points if parsed.sightings is None else parsed.sightings.points.unique(dim=0)
         if points is not None:
             inside = ((points >= parsed.box[0]) & (points <= parsed.box[1])).all(-1)
@@ -112,7 +112,7 @@ class Truth:
             self.visible = visible_from(self.distance, self.points, normals, self.eyes)
 
     def of_mesh(self, mesh: Mesh) -> dict[str, Any]:
-        """Return how far `mesh` is from what is known."""
+        """Return the distances between `mesh` and the known surface."""
         if self.distance is not None:
             samples, faces = mesh_sample(mesh, MESH_POINTS)
             a, b, c = (mesh.vertices[mesh.faces[faces, corner]] for corner in range(3))
@@ -134,7 +134,7 @@ class Truth:
         return {}
 
     def of_points(self, run: Path, folder: Path) -> dict[str, Any]:
-        """Return how far sparse points are from the point cloud of `run`, made in `folder`; nothing without them."""
+        """Return the distances of sparse points from the point cloud of `run`, made in `folder`; empty without them."""
         if self.sparse is None:
             return {}
         from scipy.spatial import cKDTree

@@ -1,7 +1,7 @@
-"""Operations of torch, and waits for the device, in a training step that runs on torch alone, as on a GPU.
+"""Numbers of torch operations, and of waits for the device, in a training step in torch alone, as on a GPU.
 
-They are counted on the CPU, by torch's dispatcher. Whatever is computed is taken to be on the device, except tensors
-that are created without naming one, and what is computed from these alone.
+They are counted on the CPU, by torch's dispatcher. All computed tensors are assumed to be on the device, except tensors
+created without naming a device, and results of these alone.
 
 An operation is what the dispatcher passes on to a kernel; views and empty tensors start none. A wait is where Python
 needs a value or a size from the device, or where the device needs a value of Python's: there is no work left for the
@@ -38,7 +38,7 @@ METHODS = (
     "instant-ngp", "nerfacto", "kplanes", "tensorf", "gaussian-splatting", "vanilla-nerf", "dnerf", "mip-nerf",
     "mip-nerf-360", "zip-nerf", "nerf-plus-plus",
 )  # fmt: skip
-"""Methods that are counted if none is named."""
+"""Methods counted by default."""
 SCENES: dict[str, Callable[[int], Dataset]] = {
     "nerfacto": ball_under_a_sky,
     "dnerf": moving_ball,
@@ -46,9 +46,9 @@ SCENES: dict[str, Callable[[int], Dataset]] = {
     "zip-nerf": ball_under_a_sky,
     "nerf-plus-plus": ball_under_a_sky,
 }
-"""Scenes of methods whose scenes are not still ones in a box."""
+"""Scenes for methods that need more than a static one in a box."""
 SIZE, IMAGE_SIZE = 64, 800
-"""Width and height of the images, and those for which methods decide their settings, pixels."""
+"""Width and height of the images; and the image size for which methods decide their settings, pixels."""
 SMALLER: dict[str, Any] = {
     "num_rays_per_batch": 16,
     "samples_per_batch": 2**11,
@@ -64,28 +64,28 @@ SMALLER: dict[str, Any] = {
     "few_images": False,
     "mixed_precision": False,
 }
-"""Settings that do not change the number of operations, but the time that they take on the CPU; and those that other
-machines and data would decide otherwise."""
+"""Settings that do not change the number of operations, but their time on the CPU; and settings that other machines and
+data would decide differently."""
 ON_A_GPU: dict[str, dict[str, Any]] = {"mip-nerf-360": {"encoding": "integrated"}}
-"""What a method decides on a GPU, and not on the CPU on which it is counted."""
+"""Decisions that a method takes on a GPU, but not on the counting CPU."""
 STARTS_NOTHING = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "_unsafe_view"}
-"""Operations other than views for which a device has nothing to do."""
+"""Operations other than views without work for a device."""
 FACTORIES = {
     torch.arange, torch.as_tensor, torch.empty, torch.eye, torch.full, torch.from_numpy, torch.linspace, torch.ones,
     torch.rand, torch.randint, torch.randn, torch.randperm, torch.tensor, torch.zeros,
 }  # fmt: skip
 """Functions whose result is on the host unless a device is named."""
 FROM_VALUES = {torch.tensor, torch.as_tensor, Tensor.new_tensor}
-"""Functions that bring values of Python's to a device."""
+"""Functions that copy values from Python to a device."""
 TO_HOST = {Tensor.cpu, Tensor.numpy, Tensor.tolist}
-"""Functions that bring values of a device to Python."""
+"""Functions that copy values from a device to Python."""
 CPU_ONLY = "framework/kernels/argument_checks.py"
 """File of checks that other devices leave out."""
 PACKAGES = Path(__file__).parents[1]
 OURS = tuple(str(PACKAGES / name) for name in ("framework", "methods"))
-"""Folders of the code that places are named in."""
+"""Folders of the code in which places are named."""
 TOLD = 5
-"""Number of places with most waits that are reported."""
+"""Number of places with the most waits to report."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Counted:
     steps: int
     """Number of steps."""
     operations: int
-    """Number of operations in all of them."""
+    """Total number of operations."""
     waits: Counter[str]
     """Number of waits by place: file and function."""
 
@@ -119,8 +119,8 @@ def measure(methods: Sequence[str], before: int, steps: int) -> dict[str, Any]:
 
     Args:
         methods: names of the methods.
-        before: training steps before those that are counted, in which the occupancy grid finds empty space.
-        steps: training steps that are counted.
+        before: uncounted training steps at the beginning, in which the occupancy grid finds empty space.
+        steps: number of counted steps.
 
     Returns:
         The machine, the arguments and a row for each method, as plain data.
@@ -141,7 +141,7 @@ def trainer_of(method: str, folder: Path, scene: Callable[[int], Dataset] | None
     Args:
         method: name of the method.
         folder: folder of the run's files.
-        scene: returns images of this width; if not given, those that suit the method.
+        scene: function that returns images of a given width; None for images that suit the method.
     """
     declared = load_method(method)
     dataset = (scene or SCENES.get(method, ball_in_a_box))(SIZE)
@@ -155,18 +155,18 @@ def trainer_of(method: str, folder: Path, scene: Callable[[int], Dataset] | None
 
 
 def counted(trainer: Trainer, before: int, steps: int) -> Counted:
-    """Take training steps, and count operations and waits of the last of them.
+    """Run training steps, and count operations and waits of the last ones.
 
     Args:
         trainer: the trainer of a run, on the CPU.
-        before: steps that are not counted.
-        steps: steps that are counted.
+        before: number of uncounted steps.
+        steps: number of counted steps.
     """
-    trainer.steps_per_read = STEPS_PER_LOG  # as on other devices than the CPU
-    with patch.object(devices, "runs_ahead", lambda device: True):  # likewise
+    trainer.steps_per_read = STEPS_PER_LOG  # as on devices other than the CPU
+    with patch.object(devices, "runs_ahead", lambda device: True):  # as on devices other than the CPU
         for _ in range(before):
             trainer.train_step()
-        trainer.model.read_counts()  # as after every so many steps
+        trainer.model.read_counts()  # as at regular intervals
         with Counting() as counting:
             for _ in range(steps):
                 report = trainer.train_step()
@@ -176,7 +176,7 @@ def counted(trainer: Trainer, before: int, steps: int) -> Counted:
 
 
 class Counting(TorchDispatchMode):
-    """A mode that counts operations and waits, in the forward and the backward pass."""
+    """Counts operations and waits in the forward and the backward pass."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -209,10 +209,10 @@ class Counting(TorchDispatchMode):
 
 
 class _Transfers(TorchFunctionMode):
-    """A mode that notices transfers between host and device, which on the CPU do not reach the dispatcher.
+    """Notices transfers between host and device, which do not reach the dispatcher on the CPU.
 
     Args:
-        waits: the number of waits by place, to which they are added.
+        waits: number of waits by place; transfers are added.
     """
 
     def __init__(self, waits: Counter[str]) -> None:
@@ -231,21 +231,21 @@ class _Transfers(TorchFunctionMode):
         if (leaves or arrives or (func in FROM_VALUES and not host)) and (place := _place()) is not None:
             self.waits[place] += 1
         if (leaves or arrives) and isinstance(out, Tensor):
-            out = out.view_as(out) if out is args[0] else out  # another object, since the one given stays where it is
+            out = out.view_as(out) if out is args[0] else out  # a new object, because the argument stays on its device
             _mark(out, leaves)
         return out
 
 
 def _names_a_device(args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
-    """Return whether the arguments of `Tensor.to` name a device, or a tensor on it."""
+    """Return whether the arguments of `Tensor.to` name a device, or a tensor on a device."""
     named = [*args, kwargs.get("device"), kwargs.get("other")]
     return any(isinstance(each, torch.device) or (isinstance(each, Tensor) and not _on_host(each)) for each in named)
 
 
 def _waits(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
-    """Return whether an operation's result has a size, or is a value, that Python must know."""
+    """Return whether an operation's result has a size, or is a value, that Python needs."""
     name = func.overloadpacket.__name__
-    if name in ("index", "index_put", "index_put_", "_index_put_impl_"):  # by a mask: its true elements are counted
+    if name in ("index", "index_put", "index_put_", "_index_put_impl_"):  # indexing by a mask counts its True elements
         return any(each.dtype in (torch.bool, torch.uint8) for each in _tensors(args[1]))
     if name == "repeat_interleave" and kwargs.get("output_size") is not None:
         return False
@@ -253,7 +253,7 @@ def _waits(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> bool:
 
 
 def _tensors(values: Any) -> list[Tensor]:
-    """Return the tensors among values and in lists of them."""
+    """Return the tensors among values and in lists of values."""
     found = []
     for value in values:
         if isinstance(value, Tensor):
@@ -273,7 +273,7 @@ def _on_host(tensor: Tensor) -> bool:
 
 
 def _place() -> str | None:
-    """Return file and function of the innermost frame of our code; None if other devices leave out what it does."""
+    """Return file and function of the innermost frame of our code; None for code that other devices skip."""
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
         file = frame.f_code.co_filename

@@ -1,10 +1,10 @@
 """Effect of refining camera poses, on the embedded scene with disturbed training poses.
 
 Each training camera is rotated about a random axis, and moved in a random direction by a fraction of its distance from
-the centre of the scene. There are four runs: exact poses, disturbed poses without refinement, and disturbed poses
-refined by SO3xR3 and by SE3. Reported are the errors of the poses before and after, once the best similarity transform
-to the true ones is removed, and the PSNR of test views, whose cameras are transformed to the frame of the disturbed
-poses by a similarity.
+the scene's centre. There are four runs: exact poses, disturbed poses without refinement, and disturbed poses refined by
+SO3xR3 and by SE3. The results are the errors of the poses before and after, without the best similarity transform to
+the true poses, and the PSNR of test views. The test cameras are transformed to the frame of the disturbed poses by a
+similarity.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def measure(method: str, seconds: float, degrees: float, percent: float) -> dict
     Raises:
         ConfigError: if the method cannot refine poses.
     """
-    refinable(method)  # before the scene is rendered, which takes a while
+    refinable(method)  # checked before the slow rendering of the scene
     embedded = load_dataparser(SCENE)()
     exact, test = (load_dataset(embedded.parse(None, split), split) for split in ("train", "test"))
     cameras = disturb(exact.cameras, degrees, percent / 100)
@@ -90,7 +90,7 @@ def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
 
 
 def refinable(method: str) -> Any:
-    """Return the settings of a method that refines poses, with proposals if it casts rays: a march would not see them.
+    """Return the settings of a method that refines poses; with proposals if it casts rays: marches have no gradient.
 
     Args:
         method: name of the method.
@@ -100,7 +100,7 @@ def refinable(method: str) -> Any:
     """
     config = load_method(method).config
     if not hasattr(config, "camera_optimizer"):
-        raise ConfigError(f"--method {method}: it does not refine poses, for it has no --camera-optimizer")
+        raise ConfigError(f"--method {method}: it cannot refine poses: it has no --camera-optimizer")
     return replace(config, sampler="proposal") if isinstance(config, SamplingConfig) else config
 
 
@@ -111,7 +111,7 @@ def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -
         method: name of the method.
         data: training images with cameras.
         seconds: seconds of training.
-        camera_optimizer: refinement of the poses, as for the flag of that name.
+        camera_optimizer: refinement of the poses, as in the flag of that name.
 
     Raises:
         ConfigError: if the method cannot refine poses.
@@ -130,7 +130,7 @@ def errors(trainer: Trainer, data: Dataset, exact: Dataset, test: Dataset) -> di
 
     Args:
         trainer: the trainer, after training.
-        data: training images with the poses that the run was given.
+        data: training images with the run's given poses.
         exact: training images with the true poses.
         test: test images with the true poses.
     """
@@ -155,7 +155,7 @@ def carry(cameras: Cameras, truth: Tensor, given: Tensor) -> Cameras:
     Args:
         cameras: cameras in the frame of `truth`.
         truth: (N, 3, 4) true poses.
-        given: (N, 3, 4) the other poses of the same cameras.
+        given: (N, 3, 4) other poses of the same cameras.
     """
     scale, rotation, translation = align_cameras(truth, given)
     poses = cameras.camera_to_worlds.double()

@@ -1,4 +1,4 @@
-"""Comparison of poses from ns-process-data with those of a COLMAP model of the same images, matched by name."""
+"""Comparison of poses from ns-process-data with a COLMAP model of the same images, matched by name."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerfloom.processing.transforms import opengl_pose
 
 
 def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
-    """Compare two sets of poses, once the best similarity transform between them is removed.
+    """Compare two sets of poses, without the best similarity transform between them.
 
     Args:
         processed: folder with transforms.json, from ns-process-data.
@@ -27,7 +27,7 @@ def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
         the model's images with a pose in the processed folder; and the summary of the processing.
 
     Raises:
-        DataError: if no image is in both.
+        DataError: if there are no common images.
     """
     transforms = json.loads((processed / "transforms.json").read_text())
     processed_poses = {
@@ -38,7 +38,7 @@ def compare(processed: Path, model_folder: Path) -> dict[str, Any]:
     model_poses = {name: opengl_pose(world_to_camera) for name, (_, _, world_to_camera) in model.images.items()}
     names = sorted(processed_poses.keys() & model_poses.keys())
     if not names:
-        raise DataError(f"{processed} and {model_folder} have no image in common; both name images by their files")
+        raise DataError(f"{processed} and {model_folder} have no common images; both must name images by their files")
     errors = pose_errors(
         torch.from_numpy(np.stack([processed_poses[name] for name in names])),
         torch.from_numpy(np.stack([model_poses[name] for name in names])),

@@ -1,8 +1,7 @@
 """Seconds to a PSNR, and final PSNR, of instant-ngp with one process and with several on the same cores.
 
-Several processes take a step with batches of their own, and with the mean of their gradients. So the batch of all
-together is larger, unless it is divided among them. The kinds alternate, so that a drift of the machine's speed affects
-all of them.
+Several processes train with their own batches and the mean of their gradients. So the total batch is larger, unless it
+is divided among them. The kinds alternate, so that a drift of the machine's speed affects all of them.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ def measure(
         count: number of processes.
         seconds: seconds of training of each run.
         seeds: number of runs of each kind.
-        samples: samples of a training step of one process.
-        targets: PSNRs of validation views, dB, to which the time is reported.
+        samples: samples per training step of one process.
+        targets: PSNRs of validation views, dB, for which the time is reported.
 
     Returns:
         The machine, the arguments and a row for each run, as plain data.
@@ -54,14 +53,14 @@ def measure(
 def trained(
     data: Path, processes: int, seconds: float, seed: int, samples: int, targets: Sequence[float]
 ) -> dict[str, Any]:
-    """Train once, by torchrun if with several processes, and return the learning curve and what follows from it.
+    """Train once, with torchrun for several processes, and return the learning curve and results from it.
 
     Args:
         data: folder of the data set.
         processes: number of processes.
         seconds: seconds of training.
         seed: random seed.
-        samples: samples of a training step of each process.
+        samples: samples per training step of each process.
         targets: PSNRs, dB.
     """
     flags = ("instant-ngp", "--data", data, "--max-seconds", seconds)

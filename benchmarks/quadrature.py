@@ -1,8 +1,8 @@
-"""Error of colours against evaluations of the field, for every sampler, on scenes known in closed form.
+"""Error of colours against evaluations of the field, for every sampler, on scenes with closed forms.
 
 Rays are random, from around the scene, over white. `sweep` measures the error for increasing numbers of samples, and
-`costs` computes the evaluations needed for an error. `skipping` measures, on many more rays, how skipping empty cells
-and ending rays early change colours; for the latter there is an error bound, and `Skip.kept` is whether it holds.
+`costs` computes the evaluations needed for a given error. `skipping` measures, on many more rays, how skipping empty
+cells and ending rays early change colours. Ending rays has an error bound, and `Skip.kept` states whether it holds.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from nerfloom.training.machine import machine
 TARGETS = (1e-2, 1e-3, 1e-4)
 """Mean errors for which the number of evaluations is reported."""
 THRESHOLDS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Transmittances at which rays end, each of which is the bound of the error."""
+"""Transmittances at which rays end; each is also the bound of the error."""
 STEPS = 512
-"""Steps along the box's diagonal when skipping is measured; the framework's default."""
+"""Steps along the box's diagonal in measurements of skipping; the framework's default."""
 RAYS_AT_ONCE, SKIPPING_RAYS_AT_ONCE = 512, 4096
-"""Rays per batch in the sweep, and when skipping is measured."""
+"""Rays per batch in the sweep, and in measurements of skipping."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,11 @@ class Sizes:
     """Size of the measurement."""
 
     counts: tuple[int, ...] = (8, 16, 32, 64, 128, 256, 512)
-    """Counts of the sweep, which each sampler multiplies (`sampling.renderers`)."""
+    """Counts of the sweep; each sampler multiplies them (`sampling.renderers`)."""
     rays: int = 4096
     """Number of rays at each point of the sweep."""
     skipping_rays: int = 100_000
-    """Number of rays on which skipping is measured."""
+    """Number of rays for measurements of skipping."""
     fit_steps: int = 400
     """Training steps of the proposals."""
     grid_resolution: int = 128
@@ -117,7 +117,7 @@ def main(output: Path, plots: Path | None = None, quick: bool = False, seed: int
     Args:
         output: JSON file to write.
         plots: folder for a plot of each scene's curves; no plots if None.
-        quick: whether fewer rays, counts and steps are used.
+        quick: whether to use fewer rays, counts and steps.
         seed: random seed of rays, jitter and proposals.
 
     Returns:
@@ -133,7 +133,7 @@ def main(output: Path, plots: Path | None = None, quick: bool = False, seed: int
         grids = functools.cache(partial(filled_grid, scene, sizes.grid_resolution, seed))
         rows += sweep(name, scene, proposals, grids, sizes, seed)
         skips += skipping(name, scene, grids(STEPS), sizes.skipping_rays, seed)
-        say(f"{name}: {time.perf_counter() - start:.0f} s, of which fitting proposals took {fits[name]:.0f} s")
+        say(f"{name}: {time.perf_counter() - start:.0f} s, including {fits[name]:.0f} s for fitting proposals")
     needed = costs(rows)
     console.print(cost_table(needed))
     console.print(skip_table(skips))
@@ -172,7 +172,7 @@ def sweep(
     Args:
         name: name of the scene.
         scene: the scene.
-        proposals, grids: as for `sampling.renderers`.
+        proposals, grids: as in `sampling.renderers`.
         sizes: size of the measurement.
         seed: random seed of rays and jitter.
     """
@@ -190,7 +190,7 @@ def measured(scene: str, sampler: str, count: int, render: Renderer, rays: Rays,
     """Measure the errors of rendered colours.
 
     Args:
-        scene, sampler, count: as for `Row`.
+        scene, sampler, count: as in `Row`.
         render: the renderer.
         rays: R rays.
         truth: (R, 3) float64 true colours.
@@ -215,7 +215,7 @@ def _parts(rays: Rays, size: int) -> list[Rays]:
 
 
 def curves(rows: Iterable[Row]) -> dict[str, dict[str, Curve]]:
-    """Group `rows` of a sweep to curves by scene and sampler."""
+    """Group the `rows` of a sweep into curves by scene and sampler."""
     by_scene: dict[str, dict[str, Curve]] = {}
     for row in rows:
         curve = by_scene.setdefault(row.scene, {}).setdefault(row.sampler, Curve([], [], [], []))
@@ -227,7 +227,7 @@ def curves(rows: Iterable[Row]) -> dict[str, dict[str, Curve]]:
 
 
 def costs(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    """Return the evaluations per ray for each of `TARGETS` from `rows` of a sweep; None if a target is not reached."""
+    """Return the evaluations per ray for each of `TARGETS`, from `rows` of a sweep; None if a target is not reached."""
     return [
         {
             "scene": scene,
@@ -247,7 +247,7 @@ def costs(rows: Iterable[Row]) -> list[dict[str, Any]]:
 
 @torch.no_grad()
 def skipping(name: str, scene: ClosedForm, grid: OccupancySampler, num_rays: int, seed: int) -> list[Skip]:
-    """Measure the effect of an occupancy grid on colours, and that of ending rays at each of `THRESHOLDS` with it.
+    """Measure the effect of an occupancy grid on colours, and of ending rays at each of `THRESHOLDS` with it.
 
     Args:
         name: name of the scene.
@@ -267,12 +267,12 @@ def skipping(name: str, scene: ClosedForm, grid: OccupancySampler, num_rays: int
 def changed(
     scene: str, skipped: str, bound: float | None, render: Renderer, without: Renderer, num_rays: int, seed: int
 ) -> Skip:
-    """Measure the differences of two renderers in the colours of random rays, and their evaluations.
+    """Measure the differences between two renderers in the colours of random rays, and their evaluations.
 
-    A NaN among the differences makes the maximum NaN, which is within no bound.
+    A NaN among the differences makes the maximum NaN, which is not within any bound.
 
     Args:
-        scene, skipped, bound: as for `Skip`.
+        scene, skipped, bound: as in `Skip`.
         render: renderer with skipping.
         without: renderer without skipping.
         num_rays: number of rays.
@@ -296,7 +296,7 @@ def changed(
 
 
 def cost_table(needed: list[dict[str, Any]]) -> Table:
-    """Return a table of `needed`, the result of `costs`: evaluations of the field, and with coarse ones in brackets."""
+    """Return a table of `needed`, from `costs`: evaluations of the field, and with coarse ones in brackets."""
     table = Table(title="evaluations a ray for a mean error of colour (with coarse ones)", title_justify="left")
     for heading in ("scene", "sampler", *(f"{target:.0e}" for target in TARGETS)):
         table.add_column(heading, justify="left" if heading in ("scene", "sampler") else "right")
@@ -315,7 +315,7 @@ def _cost(cell: dict[str, Any]) -> str:
 
 def skip_table(skips: list[Skip]) -> Table:
     """Return a table of `skips`: differences of colours, and saved evaluations."""
-    table = Table(title="what skipping changes of a colour, and the evaluations it saves", title_justify="left")
+    table = Table(title="effect of skipping on colours, and saved evaluations", title_justify="left")
     for heading in ("scene", "skipped", "bound", "largest", "mean", "kept", "saved"):
         table.add_column(heading, justify="left" if heading in ("scene", "skipped") else "right")
     for skip in skips:

@@ -1,7 +1,7 @@
-"""Rendering of scenes with every sampler of the framework, with evaluations of the field counted.
+"""Rendering of scenes with every sampler of the framework, counting evaluations of the field.
 
-All evaluations are counted, including those whose result is not used. Those of a coarse field or of proposals are
-counted separately, as proposals are much smaller than the field.
+All evaluations are counted, including those with unused results. Evaluations of a coarse field or of proposals are
+counted separately, because proposals are much smaller than the field.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DISTANCE, NEAR, FAR = 4.0, 2.0, 6.0
 EARLY_STOP = 1e-4
 """Transmittance at which the sampler "early stop" ends a ray; the framework's default in rendering."""
 GRID_STEPS = 1024
-"""Training steps in which an occupancy grid is filled, four times its warm-up."""
+"""Training steps for filling an occupancy grid, four times its warm-up."""
 FIT_RAYS = 1024
 """Rays per step of training proposals."""
 
@@ -58,7 +58,7 @@ def random_rays(count: int, seed: int) -> Rays:
 
 
 class Picture(NamedTuple):
-    """Colours of R rays and the evaluations that they took."""
+    """Colours of R rays and the evaluations they took."""
 
     color: Tensor
     """(R, 3) colours."""
@@ -73,7 +73,7 @@ Renderer = Callable[[Rays], Picture]
 
 
 class Counted(Field):
-    """A `field` that counts the positions at which its density is evaluated."""
+    """A `field` that counts the evaluations of its density."""
 
     def __init__(self, field: Field) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ def render(field: Field, sampler: Sampler, rays: Rays, jitter: bool) -> Rendered
 
 
 def sampled(scene: Field, sampler: Sampler, jitter: bool, rays: Rays) -> Picture:
-    """Render a scene with a sampler that evaluates nothing but the field.
+    """Render a scene with a sampler that evaluates only the field.
 
     Args:
         scene: the scene.
@@ -113,11 +113,11 @@ def sampled(scene: Field, sampler: Sampler, jitter: bool, rays: Rays) -> Picture
 
 
 def hierarchical(scene: Field, counts: tuple[int, int], rays: Rays) -> Picture:
-    """Render a scene with hierarchical sampling, with the field also as the coarse one.
+    """Render a scene with hierarchical sampling, using the field also as the coarse field.
 
     Args:
         scene: the scene.
-        counts: samples per ray of the coarse field, and further ones of the fine field.
+        counts: samples per ray of the coarse field, and further samples of the fine field.
         rays: R rays.
     """
     coarse, fine = Counted(scene), Counted(scene)
@@ -131,7 +131,7 @@ def proposed(scene: Field, sampler: ProposalSampler, counts: tuple[int, ...], ra
     Args:
         scene: the scene.
         sampler: proposals trained on the scene.
-        counts: intervals per ray of each proposal and of the field, whatever the proposals were trained with.
+        counts: intervals per ray of each proposal and of the field, independent of the proposals' training.
         rays: R rays.
     """
     sampler.counts = counts
@@ -184,7 +184,7 @@ def full_grid(num_steps: int) -> OccupancySampler:
 
 
 def filled_grid(scene: Field, resolution: int, seed: int, num_steps: int) -> OccupancySampler:
-    """Return a grid that is filled by its own updates.
+    """Return a grid filled by its own updates.
 
     Args:
         scene: the scene.

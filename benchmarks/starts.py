@@ -22,7 +22,7 @@ STARTS: dict[str, list[str]] = {
 }
 """Flags of ns-train for each start."""
 REFUSAL = "error: --start"
-"""Beginning of the message with which gaussian-splatting refuses a start that the data does not allow."""
+"""Beginning of gaussian-splatting's error message for a start that the data does not support."""
 
 
 def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, Any]:
@@ -32,11 +32,11 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
         data: folder of the data set.
         seconds: seconds of training of each run.
         seeds: number of runs from each start.
-        target: PSNR, dB, to which the time is reported.
+        target: PSNR, dB, for which the time is reported.
 
     Returns:
-        The machine, the arguments and a row for each start, as plain data. A start that the data does not allow has the
-        message of the refusal instead of results.
+        The machine, the arguments and a row for each start, as plain data. For a start that the data does not support,
+        the row has the error message instead of results.
     """
     runs: dict[str, list[tuple[float | None, float]]] = {name: [] for name in STARTS}
     refused: dict[str, str] = {}
@@ -48,7 +48,7 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
                 runs[name].append(train(data, seconds, seed, target, switches, "gaussian-splatting"))
                 say(f"seed {seed}  {name}: {runs[name][-1]}")
             except NerfloomError as error:
-                if REFUSAL not in str(error):  # anything else is a failure, not a property of the data
+                if REFUSAL not in str(error):  # other errors are failures, not properties of the data
                     raise
                 refused[name] = str(error)
                 say(f"{name}: {error}")

@@ -1,4 +1,4 @@
-"""Tables of results as text: Markdown with means over seeds, and a list of rows with the time that they will take."""
+"""Tables of results as text: Markdown with means over seeds, and a list of rows with estimated times."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
 def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
     """Return a table as Markdown: a line for each data set, method and budget, with the mean over seeds.
 
-    PSNRs of several seeds have the standard deviation of a single run behind them. Lines without a run are left empty.
+    With several seeds, PSNRs are followed by the standard deviation of a single run. Lines without a run are left
+    empty.
 
     Args:
         table: the table.
@@ -99,7 +100,7 @@ def cell(column: Column, found: Sequence[Result]) -> str:
 
 
 def listing(rows: Sequence[Row], results: Path) -> str:
-    """Return a line for each row: its name, and its PSNR or the time that it will take; then the time of all.
+    """Return a line for each row with its name and its PSNR or estimated time, and the total time.
 
     Args:
         rows: the rows.
@@ -120,11 +121,11 @@ def listing(rows: Sequence[Row], results: Path) -> str:
 
 
 def estimate(row: Row, done: Sequence[tuple[Row, Result]]) -> float:
-    """Return the seconds that a row will take: loading, training, and evaluation as of rows that are done.
+    """Return the estimated seconds of a row: loading, training and evaluation, as in finished rows.
 
     Args:
         row: the row.
-        done: rows that are done; the same method on the same data counts, else any on the same data.
+        done: finished rows. Those with the same method and data are used, otherwise any with the same data.
     """
     near = [(other, found) for other, found in done if other.data == row.data]
     same = [(other, found) for other, found in near if other.method == row.method] or near

@@ -25,14 +25,14 @@ from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, Job, spl
 from nerfloom.training.report import SUMMARY
 
 TRIED = 3
-"""Number of held-out images on which a trial, with other budgets than the table's, is judged."""
+"""Number of held-out images to evaluate in a trial, which has other budgets than the table."""
 Result = dict[str, Any]
 """What is kept of a row: what ns-eval writes, and how it was made, as `run`."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Numbers of a block's rows."""
+    """Settings of a block's rows."""
 
     seconds: tuple[float, ...] = ()
     """Seconds of training."""
@@ -45,7 +45,7 @@ class Row:
     """A run of a table.
 
     Args:
-        data: short name of its data, as in the table.
+        data: short name of its data in the table.
         method: short name of its method.
     """
 
@@ -76,7 +76,7 @@ class Table:
     Args:
         name: name of the table: its file's, without `.yml`.
         rows: the rows, seed by seed.
-        images: heading of a column -> name of the held-out image whose PSNR it shows.
+        images: heading of a column -> name of the held-out image whose PSNR to show.
     """
 
     name: str
@@ -88,11 +88,11 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
     """Read a table.
 
     Args:
-        path: its YAML file.
-        root: folder of the folders of all data.
-        runs: folder in which runs are kept.
+        path: the YAML file.
+        root: folder that contains the folders of all data.
+        runs: folder for runs.
         scale: factor of all budgets; if not 1, the rows are trials.
-        lpips_weights: file of LPIPS's weights, for the rows that are run; None to look for the lpips package.
+        lpips_weights: LPIPS's weights file, for the rows that are run; None to use the lpips package.
 
     Raises:
         ConfigError: if the file is not a table, or names an unknown method.
@@ -100,7 +100,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
     content = read_yaml(path)
     images, blocks = _texts(content.get("images", {}), f"{path}: images"), content.get("rows")
     if not isinstance(blocks, list) or content.keys() - {"images", "rows"}:
-        raise ConfigError(f"{path}: a table has a list of 'rows', and perhaps 'images', and nothing else")
+        raise ConfigError(f"{path}: a table has a list of 'rows' and optionally 'images', nothing else")
     rows: dict[str, Row] = {}
     weights = None if lpips_weights is None else str(lpips_weights.resolve())
     for number, block in enumerate(blocks):
@@ -111,7 +111,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
                     f"{path}: {shown(row.name)} is no name of a row; take letters, digits and hyphens for names"
                 )
             if row.name in rows:
-                raise ConfigError(f"{path}: two rows are called {row.name}; give one's data or method another name")
+                raise ConfigError(f"{path}: two rows are called {row.name}; rename the data or method of one")
             rows[row.name] = row
     return Table(path.stem, tuple(rows.values()), images)
 
@@ -119,7 +119,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
 def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Iterator[Row]:
     """Yield the rows of a block."""
     if not isinstance(block, dict):
-        raise ConfigError(f"{where} is {shown(block)}; it must have data, methods, seconds, and perhaps seeds")
+        raise ConfigError(f"{where} is {shown(block)}; it must have data, methods, seconds, and optionally seeds")
     data, methods = (_texts(block.get(name), f"{where}: {name}") for name in ("data", "methods"))
     others = {name: value for name, value in block.items() if name not in ("data", "methods")}
     numbers = from_plain(Block(), others, where)
@@ -130,14 +130,14 @@ def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Itera
             for seconds in numbers.seconds:
                 for method_name, method in methods.items():
                     conditions = _conditions(place, root, seconds * scale, None if scale == 1 else TRIED)
-                    # Its label makes the folder of a run another one if flags of the method or of the data differ.
+                    # The label gives runs with other flags of the method or data another folder.
                     contender = replace(Contender.of(method), label=f"{method} on {place or 'the embedded scene'}")
                     job = Job(contender, seed, runs / f"{seconds * scale:g}s")
                     yield Row(data_name, method_name, job, conditions)
 
 
 def _texts(value: Any, where: str) -> dict[str, str]:
-    """Return a mapping of names to texts as it is, or raise ConfigError."""
+    """Return a mapping of names to texts unchanged, or raise ConfigError."""
     if isinstance(value, dict) and all(isinstance(item, str) for item in (*value, *value.values())):
         return value
     raise ConfigError(f"{where} is {shown(value)}; it must have names with a text each")
@@ -189,7 +189,7 @@ def run_rows(rows: Sequence[Row], root: Path, file: Path) -> dict[str, str]:
         file: the table's results.
 
     Returns:
-        Name of each row that failed -> why.
+        Name of each failed row -> reason.
 
     Raises:
         Stopped: on a signal, after the running row has saved.

@@ -1,6 +1,6 @@
 """Times of the viewer: first picture, pictures of a moving camera, finished picture.
 
-There is no browser and no socket: what is measured is from a request to the JPEG file.
+There is no browser and no socket: times are measured from a request to the JPEG file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.request import Pose, Request
 
 WARM_UP = 12
-"""Pictures of a moving camera before those that are measured."""
+"""Number of pictures of a moving camera before the measurement."""
 
 
 @dataclass(frozen=True)
@@ -36,23 +36,23 @@ class Times:
     height: int
     """Height of the finished picture, pixels."""
     first: float
-    """From the first request to the first picture, with the JPEG file."""
+    """Seconds from the first request to the first picture, as a JPEG file."""
     coarse: float
-    """Median of the pictures of a moving camera."""
+    """Median seconds for pictures of a moving camera."""
     slowest: float
-    """Longest of them."""
+    """Maximum seconds for pictures of a moving camera."""
     stride: int
-    """Stride of the last of them, pixels."""
+    """Stride of the last of these pictures, pixels."""
     per_second: float
-    """Pictures per second of a moving camera."""
+    """Pictures of a moving camera per second."""
     finished: float
-    """From the last request to the finished picture, with the time in which the camera rests."""
+    """Seconds from the last request to the finished picture, including the time in which the camera rests."""
     rays_per_pixel: int
     """Rays per pixel of the finished picture."""
 
 
 def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
-    """Measure the pictures of a trained run for one browser whose camera turns, rests, and is waited for.
+    """Measure the pictures of a trained run for one browser whose camera turns, then rests until it is finished.
 
     Args:
         run: the run's folder.
@@ -109,7 +109,7 @@ def _jpeg(image: np.ndarray, quality: int) -> bytes:
 
 
 def _request(scene: Any, index: int, width: int, height: int) -> Request:
-    """Return what a camera sees that circles the scene at the distance of the first training camera."""
+    """Return a request for a camera that circles the scene at the distance of the first training camera."""
     center = scene.box.mean(0).double()
     position = scene.camera_to_worlds[0, :, 3].double() - center
     radius, angle = float(position.norm()), 0.02 * index

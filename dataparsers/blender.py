@@ -1,8 +1,8 @@
-"""Renders: transforms_{train,val,test}.json as Blender's scripts write them, of NeRF-Synthetic and of any other scene.
+"""Renders: transforms_{train,val,test}.json as written by Blender scripts, for NeRF-Synthetic and any other scene.
 
-NeRF-Synthetic (Mildenhall et al. 2020) states an angle of view, and has cameras 4.03 units from the origin, to which
-they look; box, near and far are those of its paper. Of any other scene, what the images show is placed in the same box,
-whatever its units and its place (`nerfloom.dataparsers.region`).
+NeRF-Synthetic (Mildenhall et al. 2020) states an angle of view, and its cameras look at the origin from 4.03 units
+away; box, near and far are those of its paper. Any other scene is placed in the same box, whatever its units and
+position (`nerfloom.dataparsers.region`).
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from nerfloom.dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_
 from nerfloom.dataparsers.renders import Renders, read_renders
 
 TRANSFORMS = "transforms_train.json"
-"""File by which the format is recognised."""
+"""File that identifies the format."""
 MOST_SCALES = 8
-"""Maximum number of sizes of an image; at the eighth, a pixel is the mean of 16,384."""
+"""Maximum number of sizes of an image; at the eighth, a pixel is the mean of 16,384 pixels."""
 DISTANCE, NEAR, FAR = 4.0311, 2.0, 6.0
 """Distance of NeRF-Synthetic's cameras from the origin, and its near and far, in the input's units."""
 TOLERANCE = 0.01
-"""Difference up to which cameras are where those of NeRF-Synthetic are, in their distance."""
+"""Maximum deviation from NeRF-Synthetic's camera positions, relative to their distance."""
 ORIGIN = Placement(torch.eye(4, dtype=torch.float64)[:3], 1.0)
-"""Placement of a scene that stays where it is."""
+"""Placement of a scene that is not moved."""
 
 
 @dataclass(frozen=True)
@@ -40,22 +40,22 @@ class Blender(DataParser):
     """Flags of the blender format."""
 
     downscale_factor: int = 1
-    """Integer factor by which images are reduced."""
+    """Integer factor for reducing images."""
     scale_factor: float = 1.0
-    """Factor of camera positions, and thus of the scene."""
+    """Factor for camera positions, and so for the scene."""
     half_size: float | None = None
-    """Half the side of the cube around the origin that holds the scene, in the input's units. If not given: 1.5 for
-    NeRF-Synthetic; of other data, a cube around what silhouettes leave or cameras look at."""
+    """Half the side of the cube around the origin that holds the scene, in the input's units. Default: 1.5 for
+    NeRF-Synthetic; for other data, a cube from silhouettes or from what the cameras look at."""
     near: float | None = None
-    """Distance from a camera at which the scene starts, in the input's units. If not given: 2 for NeRF-Synthetic, else
-    by cameras and cube."""
+    """Distance from a camera at which the scene starts, in the input's units. Default: 2 for NeRF-Synthetic, otherwise
+    from cameras and cube."""
     far: float | None = None
-    """Distance from a camera at which the scene ends, in the input's units. If not given: 6 for NeRF-Synthetic, else by
-    cameras and cube."""
+    """Distance from a camera at which the scene ends, in the input's units. Default: 6 for NeRF-Synthetic, otherwise
+    from cameras and cube."""
     placement: Path | None = None
-    """dataparser_transforms.json of a run whose placement is taken instead of one by silhouettes and cameras."""
+    """dataparser_transforms.json of a run whose placement to use instead of one from silhouettes and cameras."""
     multiscale: int = 1
-    """Number of sizes at which each image is used, 1, 1/2, 1/4, ..., with a loss weighted by the area of pixels; 4 is
+    """Number of sizes at which each image is used: 1, 1/2, 1/4, ... The loss is weighted by the area of pixels. 4 is
     Mip-NeRF's multiscale protocol."""
 
     @classmethod
@@ -101,14 +101,14 @@ class Blender(DataParser):
                 raise DataError(f"--{name.replace('_', '-')} is {value}; it must be above zero")
 
     def _region(self, training: Renders) -> tuple[Region, bool]:
-        """Return the region that the training images show, and whether the scene stays where it is."""
+        """Return the region shown in the training images, and whether the scene keeps its position."""
         half = HALF_SIZE if self.half_size is None else self.half_size
         if _is_nerf_synthetic(training):
             return Region(torch.zeros(3), half, NEAR, FAR, False, "NeRF-Synthetic's"), True
         images = training.images
         if self.half_size is not None:
             return cube_at_origin(placed_cameras(images, ORIGIN), half), True
-        middle = images.poses[:, :3, 3].mean(0)  # relative to which float32 is precise
+        middle = images.poses[:, :3, 3].mean(0)  # float32 is precise relative to it
         cameras = placed_cameras(images, Placement(torch.cat([torch.eye(3).double(), -middle[:, None]], -1), 1.0))
         cube = None if training.cube is None else (training.cube[0] - middle, training.cube[1])
         region = find_region(cameras, images.paths, images.times is not None, cube)
@@ -125,15 +125,15 @@ def has_times(file: Path) -> bool:
 
 
 def _training(path: Path, others: Renders) -> Renders:
-    """Return the training images, which place all splits, or others if there are none."""
+    """Return the training images, which determine the placement of all splits, or `others` if there are none."""
     try:
         return read_renders(path, "train", is_wanted=False)
-    except DataError:  # reported when they are wanted
+    except DataError:  # reported when they are requested
         return others
 
 
 def _is_nerf_synthetic(renders: Renders) -> bool:
-    """Return whether cameras are those of NeRF-Synthetic, whose box holds what they show where they look."""
+    """Return whether the cameras are those of NeRF-Synthetic, looking at the origin."""
     images = renders.images
     origins, ahead = images.poses[:, :3, 3], -images.poses[:, :3, 2]
     depths = -(origins * ahead).sum(-1)  # of the origin

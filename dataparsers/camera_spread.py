@@ -1,4 +1,4 @@
-"""Cameras that stand in one position: nothing then tells how far anything is."""
+"""Check for cameras at a single position, from which no distance can be estimated."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import torch
 from torch import Tensor
 
 SMALL = 0.01
-"""Distance of cameras from their middle, as a share of the distance of points, below which there is no parallax."""
+"""There is no parallax if cameras are closer to their centre than this fraction of the distance of points."""
 ROUNDING = 1e-10
-"""The same as a share of the largest coordinate, below which it is rounding: half a millimetre of 5,000 kilometres."""
+"""Camera distances below this fraction of the largest coordinate are rounding: 0.5 mm at 5,000 km."""
 
 
 def camera_spread(poses: Tensor, points: Tensor | None) -> float | None:
-    """Return how far cameras are apart, as a share of the distance of what they see.
+    """Return the distance between cameras, as a fraction of the distance of what they see.
 
     Args:
         poses: (M, 3 or 4, 4) camera-to-world.
         points: (K, 3) points on surfaces in the same frame; None if there are none.
 
     Returns:
-        Root mean square distance of the cameras from their middle by the median distance of points from it: 0 if all
-        cameras stand in one position, None if there are several positions and no points, or a single camera.
+        Root-mean-square distance of the cameras from their centre, over the median distance of points from it. 0 if all
+        cameras stand at one position; None for a single camera, or for several positions without points.
     """
     if len(poses) < 2:
         return None
@@ -35,9 +35,9 @@ def camera_spread(poses: Tensor, points: Tensor | None) -> float | None:
 
 
 def warning(spread: float) -> str:
-    """Return a line of text that warns of cameras with too little `spread`."""
+    """Return a warning about cameras with too little `spread`."""
     where = "in one position" if spread == 0 else f"within {spread:.2%} of the distance of what they see"
     return (
-        f"warning: all cameras stand {where}, as if one had turned on the spot: nothing tells how far anything is, and "
+        f"warning: all cameras stand {where}, as if one had turned on the spot: distances are unknown, and "
         "views from elsewhere will be wrong; take photographs from different positions"
     )

@@ -20,16 +20,16 @@ from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.sparse_points import sparse_points
 
 LARGEST_SIDE = 1600
-"""Longer side of an image, pixels, above which images are reduced by default."""
+"""Images with a longer side above this, pixels, are reduced by default."""
 EXTREME = 1e9
-"""Limit of focal lengths, principal points (pixels) and boxes (scene units) beyond which float32 may overflow; focal
-lengths must also be larger than its inverse."""
+"""Maximum of focal lengths, principal points (pixels) and boxes (scene units), beyond which float32 may overflow; focal
+lengths must also exceed its inverse."""
 ASPECT_TOLERANCE = 0.03
 """Relative difference between the aspect ratios of an image and its camera that rounded sizes can explain."""
 
 
 Division = Callable[[list[str]], Tensor]
-"""Function from the names of all existing images to the indices (S,) of those of a split."""
+"""Function from the names of all existing images to the indices (S,) of a split's images."""
 
 
 def captured_scene(
@@ -41,14 +41,14 @@ def captured_scene(
 ) -> ParsedScene:
     """Return the images of one split, placed together with those of the others.
 
-    Missing image files are reported once and left out before anything else is decided.
+    Missing image files are reported once and left out before any decision.
 
     Args:
         flags: the format's flags.
         images: images of all splits.
         split: the split to return.
-        division: selects the split's images; by default, every `eval_interval`-th is held out.
-        applied: what the poses were moved by before, if the caller undoes it by `from_original`.
+        division: selects the split's images; by default, every `eval_interval`-th image is held out.
+        applied: the transform already applied to the poses, if the caller undoes it by `from_original`.
 
     Raises:
         DataError: if a flag or a camera is invalid, a camera does not fit its image, or a mask is missing.
@@ -95,7 +95,7 @@ def image_sizes(paths: Sequence[Path]) -> Tensor:
         paths: M image files.
 
     Raises:
-        DataError: if none is readable.
+        DataError: if no file is readable.
     """
     default = image_size(paths)
     sizes = []
@@ -108,11 +108,11 @@ def image_sizes(paths: Sequence[Path]) -> Tensor:
 
 
 def sizes_of(stated: Sequence[Sequence[int | None]], unstated: Callable[[], Tensor]) -> Tensor:
-    """Return width and height (M, 2) int64 that intrinsics refer to: those stated, or the image's if one is missing.
+    """Return width and height (M, 2) int64 for intrinsics: as stated, or the image's if any is missing.
 
     Args:
-        stated: M widths and heights; None for what is missing.
-        unstated: returns width and height (M, 2) int64 of the images; called if one is missing.
+        stated: M widths and heights; None for missing values.
+        unstated: returns width and height (M, 2) int64 of the images; called if any is missing.
     """
     if not any(None in size for size in stated):
         return torch.tensor(stated)
@@ -140,7 +140,7 @@ def _check_flags(flags: Captured) -> None:
 
 
 def _choose_files(images: PosedImages, factor: int | None) -> tuple[PosedImages, int]:
-    """Return the images with the files to read, and the factor by which to reduce these when they are loaded."""
+    """Return the images with the files to read, and the factor by which to reduce them when loading."""
     folder, paths = images.folder, images.paths
     root = _shared_folder(folder, paths)
     steps = sorted({*REDUCED, factor or 1})
@@ -189,7 +189,7 @@ def _reduced(path: Path, root: Path | None, step: int) -> Path:
 
 
 def _beside(folder: Path, paths: tuple[Path | None, ...] | None, step: int) -> tuple[Path | None, ...] | None:
-    """Return the masks or depths for images reduced by `step`: reduced ones if they exist, else the originals."""
+    """Return the masks or depths for images reduced by `step`: reduced ones if they exist, otherwise the originals."""
     if paths is None:
         return None
     root = _shared_folder(folder, [path for path in paths if path is not None])
@@ -211,7 +211,7 @@ def checked_box(box: Tensor, source: str) -> Tensor:
 
     Args:
         box: minimum and maximum corner.
-        source: what the box is computed from, as a plural subject of the message.
+        source: what the box is computed from, as a plural subject for the message.
 
     Raises:
         DataError: if the box is empty or too large.
@@ -263,7 +263,7 @@ def _check_intrinsics(images: PosedImages, sizes: Tensor) -> None:
                 f"{path}: its camera has fx, fy, cx, cy = {values} for {stated[0]}x{stated[1]} pixels; "
                 "focal lengths and sizes must be above zero"
             )
-        # Rounding a side to whole pixels changes the aspect ratio of a small image more.
+        # Rounding to whole pixels changes the aspect ratio of small images more.
         slack = ASPECT_TOLERANCE + 1 / min(actual)
         if abs(math.log(actual[0] * stated[1] / (actual[1] * stated[0]))) > slack:
             raise DataError(

@@ -23,10 +23,10 @@ class Colmap(Captured):
     """Flags of the colmap format."""
 
     colmap_path: str | None = None
-    """Folder of the reconstruction in the data folder; by default, the one with the most images in sparse or
+    """Folder of the reconstruction in the data folder. Default: the one with the most images in sparse or
     colmap/sparse."""
     images_path: str = "images"
-    """Folder of the images in the data folder; reduced ones are in folders beside it, such as images_2."""
+    """Folder of the images in the data folder; reduced images are in folders beside it, such as images_2."""
     masks_path: str = "masks"
     """Folder of masks in the data folder: white for pixels to train on."""
 
@@ -34,7 +34,7 @@ class Colmap(Captured):
     def recognizes(cls, path: Path) -> bool:
         # Collections of the phototourism format have their reconstruction in dense/sparse, which is not searched here.
         models = find_models(path)
-        # A model alone, such as sparse/0 itself, is no data folder: its images lie elsewhere.
+        # A model alone, such as sparse/0 itself, is not a data folder: its images are elsewhere.
         return bool(models) and (models != [path / "."] or has_images(path)) and not has_transforms(path)
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
@@ -52,7 +52,7 @@ def read_images(path: Path, model: Path, images: str, masks: str, split: Split) 
         model: folder of the reconstruction.
         images: folder of the images in `path`.
         masks: folder of the masks in `path`.
-        split: the split that is read; training says what is named differently on the disk.
+        split: the split to read; for training, differences between names and the disk are reported.
 
     Raises:
         DataError: as `read_model`, or for an unsupported camera model.
@@ -80,7 +80,7 @@ def tracks_of(sparse: SparseModel, intrinsics: Tensor) -> Tracks | None:
 
     Args:
         sparse: the reconstruction of M images.
-        intrinsics: (M, 4) fx, fy, cx, cy of the images that it was made from.
+        intrinsics: (M, 4) fx, fy, cx, cy of the images used for the reconstruction.
     """
     if not len(sparse.points):
         return None

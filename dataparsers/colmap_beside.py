@@ -1,4 +1,4 @@
-"""The COLMAP model that lies beside a transforms.json which was made from it: which images see which points."""
+"""The COLMAP model from which a transforms.json beside it was made: it tells which images see which points."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from nerfloom.dataparsers.colmap_lens import lenses_of
 from nerfloom.dataparsers.colmap_model import choose_model, find_models, read_model
 
 LARGEST_ANGLE = 0.2
-"""Largest angle between an image's rotations in the model and in the file, degrees: about two pixels of a phone's
-image at 800 pixels."""
+"""Maximum angle between an image's rotations in the model and in the file, degrees: about two pixels of a phone's image
+at 800 pixels."""
 LARGEST_SHIFT = 0.002
-"""Largest distance between its positions, as a share of the largest distance of a camera from the cameras' mean."""
+"""Maximum distance between its positions, relative to the largest distance of a camera from the cameras' mean."""
 FEWEST_ALIKE = 0.5
-"""Share of the images in both that must have the same pose, else the model is not what the file was made from."""
+"""Minimum fraction of common images with the same pose; with fewer, the file was not made from the model."""
 
 
 def tracks_beside(
@@ -31,18 +31,18 @@ def tracks_beside(
 ) -> Tracks | None:
     """Return the tracks of the model beside a transforms.json, in the file's frame and for its images.
 
-    A model that cannot be read, or that has other poses than the file, is left out, and said to be. So are images whose
-    own pose is another one.
+    A model that cannot be read, or whose poses differ from the file's, is not used, and this is reported. Images whose
+    own pose differs are left out.
 
     Args:
         folder: the data folder.
-        names: of each of the file's M images, the paths under which the model may have it.
+        names: for each of the file's M images, its possible paths in the model.
         poses: (M, 3 or 4, 4) camera-to-world of the file.
         applied: (4, 4) rotation and translation from the model's frame to the file's.
         scale: factor of positions, applied last.
 
     Returns:
-        The tracks; None if there is no model, or none that fits.
+        The tracks; None if there is no matching model.
     """
     if not find_models(folder):
         return None
@@ -65,8 +65,8 @@ def tracks_beside(
     alike = _same_poses(poses[ours].double(), _moved(model.poses[theirs], applied.double(), scale))
     if int(alike.sum()) < max(FEWEST_ALIKE * len(pairs), 1):
         say(
-            f"{path}: {int(alike.sum())} of {len(poses)} images have the pose that they have in transforms.json, so it "
-            "is of another reconstruction; continuing without the distances of its points"
+            f"{path}: only {int(alike.sum())} of {len(poses)} images have their pose from transforms.json, so it "
+            "is another reconstruction; continuing without the distances of its points"
         )
         return None
     number = torch.full((len(model.names),), -1, dtype=torch.int64)
@@ -79,11 +79,11 @@ def tracks_beside(
 
 
 def names_in_model(file_path: str, source_path: object) -> list[str]:
-    """Return the paths under which a model may have a frame's image, as they are compared, the likeliest first.
+    """Return the possible paths of a frame's image in a model, in comparable form, most likely first.
 
     Args:
-        file_path: the frame's image, as in 'images/a/1.jpg', where a model has 'a/1.jpg'.
-        source_path: the file that the image was made from; anything but text is left out.
+        file_path: the frame's image, such as 'images/a/1.jpg', where a model has 'a/1.jpg'.
+        source_path: the file from which the image was made; ignored if it is not text.
     """
     parts = spelled(file_path).split("/")
     endings = ["/".join(parts[start:]) for start in range(len(parts))]
@@ -98,7 +98,7 @@ def _moved(poses: Tensor, applied: Tensor, scale: float) -> Tensor:
 
 
 def _same_poses(ours: Tensor, theirs: Tensor) -> Tensor:
-    """Return which of M poses are the same, up to `LARGEST_ANGLE` and `LARGEST_SHIFT`, (M,) bool."""
+    """Return which of M poses agree within `LARGEST_ANGLE` and `LARGEST_SHIFT`, (M,) bool."""
     centers = ours[:, :3, 3]
     spread = (centers - centers.mean(0)).norm(dim=-1).max() if len(ours) else 0.0
     apart = (ours[:, :3, :3] - theirs[:, :3, :3]).flatten(1).norm(dim=-1) / 8**0.5  # the sine of half the angle

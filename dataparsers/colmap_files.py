@@ -1,7 +1,7 @@
 """Validation of COLMAP's binary files: whether they hold as many records as they state.
 
 pycolmap trusts the count at the beginning of a file. From a truncated file it creates cameras from uninitialised
-memory, or reads without end; therefore each file is traversed once, record by record, before it is read.
+memory, or reads without end. So each file is traversed once, record by record, before it is read.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from pathlib import Path
 from nerfloom import DataError
 
 LONGEST_NAME = 4096
-"""Maximum length of an image's name, bytes; no system opens a longer path."""
+"""Maximum length of an image's name, bytes; no system opens longer paths."""
 PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
 """Number of a camera model -> number of its parameters."""
 POSE = 7 * 8
 """Size of a rotation (4) and a translation (3), bytes."""
 NAME = 4 + POSE + 4
-"""Place of the name in an image's record, after its number, pose and camera, bytes."""
+"""Position of the name in an image's record, after its number, pose and camera, bytes."""
 
 Walk = Callable[[mmap.mmap, int], int]
-"""Function from the start of a record to its end; raises `struct.error` if the file ends before or the record is
-invalid."""
+"""Function from the start of a record to its end. It raises `struct.error` if the file ends before that or the record
+is invalid."""
 
 
 def check_binary(folder: Path) -> None:
-    """Traverse the binary files of a model, as far as they exist.
+    """Traverse the existing binary files of a model.
 
     Args:
         folder: folder of the reconstruction.
@@ -42,7 +42,7 @@ def check_binary(folder: Path) -> None:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the names of the images that the model in `folder` has, as far as they can be read. Never raises."""
+    """Return the names of the images in the model in `folder`, as far as they can be read. Never raises."""
     names: list[str] = []
     try:
         if not (folder / "images.bin").is_file():
@@ -60,7 +60,7 @@ def image_names(folder: Path) -> list[str]:
 
 
 def text_names(file: Path) -> dict[int, str]:
-    """Return the name of each image of a text model by its number, with the spaces that pycolmap cuts it off at.
+    """Return image number -> name in a text model, including spaces, at which pycolmap cuts names off.
 
     Args:
         file: images.txt, with two lines for each image: number, pose, camera and name; and the keypoints.
@@ -98,7 +98,7 @@ def _check_file(file: Path, walk: Walk, records: str) -> None:
     advice = "copy it again, or export the model again with `colmap model_converter`"
     try:
         if file.stat().st_size < 8:
-            raise DataError(f"{file} is truncated: it lacks the number of {records}; {advice}")
+            raise DataError(f"{file} is truncated: the number of {records} is missing; {advice}")
         with file.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
             (count,) = struct.unpack_from("<Q", data, 0)
             offset, index = 8, 0
@@ -164,4 +164,4 @@ RECORDS: dict[str, tuple[Walk, str]] = {
     "images": (_image, "images"),
     "points3D": (_point, "points"),
 }
-"""File -> function that steps over one of its records, and the records' name."""
+"""File -> function that steps over one of its records, and the name of the records."""

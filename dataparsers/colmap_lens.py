@@ -44,7 +44,7 @@ def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str)
         try:
             converted.append(from_colmap(camera.model, camera.params, camera.width, camera.height))
         except DataError as error:
-            command = "" if camera.model in PARAMETERS else f", as in: {_command(where)}"
+            command = "" if camera.model in PARAMETERS else f", for example with: {_command(where)}"
             raise DataError(f"{where}: image {name!r}: {error}{command}") from error
     models = [camera.model for camera in converted]
     # A pinhole camera is an opencv camera without distortion.

@@ -1,4 +1,4 @@
-"""COLMAP reconstructions: selection of one, and its cameras, poses and sparse points.
+"""COLMAP reconstructions: choice of one, and its cameras, poses and sparse points.
 
 Schönberger and Frahm 2016.
 """
@@ -24,13 +24,13 @@ from nerfloom.dataparsers.reading import file_name
 from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 
 LOCATIONS = ("sparse", "colmap/sparse", ".")
-"""Folders searched for reconstructions, below which they may lie too; the data folder itself comes last."""
+"""Folders searched for reconstructions, at any depth up to `DEEPEST`; the data folder itself comes last."""
 DEEPEST = 4
-"""Maximum number of levels below these folders, as in sparse/0/models/1."""
+"""Maximum number of levels below these folders, such as sparse/0/models/1."""
 FILES = ("cameras", "images", "points3D")
 """Files of a reconstruction, without suffix."""
 LEAST_ERROR = 0.5
-"""Least error that is believed, pixels; also that of a point whose error was not computed."""
+"""Minimum reprojection error assumed for a point, pixels; also used if no error was computed."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class SparseModel:
     errors: Tensor
     """(K,) float64 mean reprojection error of each point, pixels, at least `LEAST_ERROR`."""
     lengths: Tensor
-    """(K,) int64 length of each point's track, sightings in images without a pose included."""
+    """(K,) int64 length of each point's track, including sightings in images without a pose."""
     sightings: Tensor
-    """(O, 2) int64 image, and point that it sees."""
+    """(O, 2) int64 image and the point seen in it."""
 
 
 def find_models(path: Path, locations: Sequence[str] = LOCATIONS) -> list[Path]:
-    """Return the reconstructions in some folders and below them, those of the first folder first. Never raises.
+    """Return the reconstructions in some folders and below, in the order of the folders. Never raises.
 
     Args:
         path: the data folder.
@@ -82,7 +82,7 @@ def find_models(path: Path, locations: Sequence[str] = LOCATIONS) -> list[Path]:
 
 
 def _folders(folder: Path, levels: int) -> list[Path]:
-    """Return a folder and those below it, down to a number of levels, sorted by name."""
+    """Return a folder and its subfolders down to a number of levels, sorted by name."""
     try:
         inside = sorted(entry for entry in folder.iterdir() if entry.is_dir()) if levels else []
     except OSError:
@@ -98,16 +98,16 @@ def _is_model(folder: Path) -> bool:
 
 
 def choose_model(path: Path, location: str | None, images: str = "images", quiet: bool = False) -> Path:
-    """Return the reconstruction of most of the images that are there; of several, say which others there are.
+    """Return the reconstruction with the most existing images; if there are several, report the others.
 
     Args:
         path: the data folder.
         location: subfolder to search; None for the default ones.
         images: folder of the images in `path`.
-        quiet: whether nothing is said.
+        quiet: whether to report nothing.
 
     Raises:
-        DataError: if there is none.
+        DataError: if there is no reconstruction.
     """
     locations = LOCATIONS if location is None else (location,)
     models = find_models(path, locations)
@@ -125,8 +125,8 @@ def choose_model(path: Path, location: str | None, images: str = "images", quiet
         shown = [model.relative_to(path).as_posix() for model in models]
         others = ", ".join(f"{shown[index]} has {there[index]}" for index in range(len(models)) if index != best)
         say(
-            f"{len(models)} COLMAP reconstructions in {path}: {shown[best]} has {there[best]} of the images that are "
-            f"there, and is used; {others} (--colmap-path chooses another)"
+            f"{len(models)} COLMAP reconstructions in {path}: using {shown[best]} with {there[best]} of the existing "
+            f"images; {others} (--colmap-path chooses another)"
         )
     return models[best]
 
@@ -150,7 +150,7 @@ def read_model(folder: Path) -> SparseModel:
     except ImportError as error:
         raise DataError(f"reading {folder} needs pycolmap, which is not installed: pip install pycolmap") from error
     try:
-        # Of text, pycolmap takes a name to end at its first space.
+        # In text files, pycolmap ends a name at its first space.
         known = {} if complete["bin"] else text_names(folder / "images.txt")
         model = pycolmap.Reconstruction(str(folder))
         named = {number: known.get(number) or model.images[number].name for number in model.reg_image_ids()}
@@ -166,7 +166,7 @@ def read_model(folder: Path) -> SparseModel:
             f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"
         ) from error
     if not images:
-        raise DataError(f"{folder} has no image with a pose; COLMAP could not register any")
+        raise DataError(f"{folder} has no image with a pose; COLMAP registered none")
     for name, pose in zip(names, poses, strict=True):
         _check(name, pose, folder)
     if left_out := len(model.points3D) - len(points):
@@ -177,10 +177,10 @@ def read_model(folder: Path) -> SparseModel:
 def _camera_to_worlds(images: Sequence[Any], names: Sequence[str], folder: Path) -> Tensor:
     """Return camera-to-world matrices (M, 4, 4) float64, OpenGL axes; COLMAP stores the inverse with OpenCV's axes."""
     stored = [image.cam_from_world for image in images]
-    stored = [pose() if callable(pose) else pose for pose in stored]  # a property before pycolmap 3.12, a method since
+    stored = [pose() if callable(pose) else pose for pose in stored]  # a property before pycolmap 3.12, then a method
     quaternions = torch.tensor(np.array([pose.rotation.quat for pose in stored]), dtype=torch.float64).view(-1, 4)
     translations = torch.tensor(np.array([pose.translation for pose in stored]), dtype=torch.float64).view(-1, 3)
-    # A quaternion of length 0 would pass for no rotation at all.
+    # A quaternion of length 0 would count as no rotation.
     unit = unit_quaternions(quaternions, [f"{folder}: image {name!r}" for name in names])
     rotation = rotations(unit).transpose(1, 2)
     result = torch.eye(4, dtype=torch.float64).repeat(len(images), 1, 1)
@@ -194,11 +194,11 @@ def _camera(camera: Any) -> SparseCamera:
 
 
 def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the finite sparse points, their errors, the lengths of their tracks, and which images see them.
+    """Return the finite sparse points, their errors, the lengths of their tracks, and the images that see them.
 
     Args:
         model: the reconstruction.
-        numbers: COLMAP's numbers of the images; sightings in others, which have no pose, are left out.
+        numbers: COLMAP's numbers of the images; sightings in other images, which have no pose, are left out.
     """
     rows = {number: row for row, number in enumerate(numbers)}
     positions: list[np.ndarray] = []
@@ -208,7 +208,7 @@ def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor,
     for point in model.points3D.values():
         if not np.isfinite(point.xyz).all():
             continue
-        # A track may meet an image twice.
+        # A track may contain an image twice.
         images = {rows[number] for number in (sighting.image_id for sighting in point.track.elements) if number in rows}
         sightings += [(image, len(positions)) for image in sorted(images)]
         positions.append(point.xyz)

@@ -1,4 +1,4 @@
-"""D-NeRF scenes: as NeRF-Synthetic, with a `time` from 0 to 1 in each frame.
+"""D-NeRF scenes: like NeRF-Synthetic, with a `time` from 0 to 1 in each frame.
 
 Pumarola et al. 2021.
 """

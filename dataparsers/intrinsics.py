@@ -1,4 +1,4 @@
-"""Intrinsics that a transforms file states: of all its frames together, of each frame, or as an angle of view."""
+"""Intrinsics in a transforms file: for all frames, per frame, or as an angle of view."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerfloom.dataparsers.reading import number, numbers, shown, side_or_none
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
 """Projection, and the file's names of its coefficients in the order of `LENSES`."""
 FISHEYE = ("fisheye", ("k1", "k2", "k3", "k4"))
-"""The same for a fisheye lens."""
+"""Projection and names of coefficients for a fisheye lens."""
 CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     **dict.fromkeys(("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), PERSPECTIVE),
     **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), FISHEYE),
@@ -30,9 +30,9 @@ CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """`camera_model` -> projection, and the file's name of each coefficient of `LENSES`; '' if it has none."""
 SMALLEST_ANGLE = 1e-6
-"""Minimum angle of view, radians; for a smaller one the focal length exceeds the range of float32."""
+"""Minimum angle of view, radians; for smaller angles the focal length exceeds float32."""
 SAME_FOCAL = 0.01
-"""Relative difference between a focal length and the one that an angle of view gives that is a matter of rounding."""
+"""Relative difference between a focal length and the one from an angle of view that counts as rounding."""
 NGP_SCALE = 0.33
 NGP_OFFSET = [0.5, 0.5, 0.5]
 """instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
@@ -40,34 +40,34 @@ NGP_OFFSET = [0.5, 0.5, 0.5]
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics of M frames, and a contradiction between what the file says of them."""
+    """Intrinsics of M frames, and a contradiction in the file, if any."""
 
     values: Tensor
     """(M, 4) float64 fx, fy, cx, cy in pixels of an image of `sizes`."""
     sizes: Tensor
-    """(M, 2) int64 width and height that the values refer to, which may differ from those of the image files."""
+    """(M, 2) int64 width and height that the values refer to, which may differ from the image files."""
     model: str
     """Projection, a key of `LENSES`."""
     lens: Tensor | None
     """(M, K) distortion coefficients in the order of `LENSES[model]`; None if the projection has none."""
     warning: str | None
-    """Message about focal lengths that are taken although the file states an angle that gives others; None if none."""
+    """Message about focal lengths that contradict an angle in the file; None if there is none."""
 
 
 def read_intrinsics(
     file: Path, content: dict[str, Any], frames: list[dict[str, Any]], labels: list[str], unstated: Callable[[], Tensor]
 ) -> Intrinsics:
-    """Return the intrinsics that a transforms file states.
+    """Return the intrinsics stated in a transforms file.
 
-    A frame's own values take precedence over those of all frames, and a focal length over an angle of view. The default
-    of a principal point is the image's centre, and that of a focal length along one axis the other's.
+    A frame's own values take precedence over those of all frames, and a focal length over an angle of view. The
+    principal point defaults to the image's centre. The focal length along one axis defaults to that along the other.
 
     Args:
         file: the file, for messages.
         content: the file's JSON object.
         frames: the JSON objects of M frames.
         labels: M names of the frames in messages.
-        unstated: returns width and height (M, 2) int64 of the images; called if the file does not state them for all.
+        unstated: returns width and height (M, 2) int64 of the images; called if the file does not state all of them.
 
     Raises:
         DataError: if a value is invalid, or there is no focal length.
@@ -108,7 +108,7 @@ def ngp_cube(content: dict[str, Any], file: Path) -> tuple[Tensor, float] | None
 
 
 def _value(frame: dict[str, Any], content: dict[str, Any], key: str) -> Any:
-    """Return a frame's own value, else the file's value for all frames; None if both are missing."""
+    """Return a frame's own value, otherwise the file's value for all frames; None if both are missing."""
     own = frame.get(key)
     return content.get(key) if own is None else own
 
@@ -161,7 +161,7 @@ def _focal(frame: dict[str, Any], content: dict[str, Any], axis: str, length: in
 
 
 def _focal_of_angle(source: dict[str, Any], axis: str, length: int, label: str) -> float:
-    """Return the focal length in pixels that the angle of view along an axis of `length` pixels gives."""
+    """Return the focal length in pixels for the angle of view along an axis of `length` pixels."""
     name = f"camera_angle_{axis}"
     angle = number(source[name], name, label, positive=True)
     if not SMALLEST_ANGLE < angle < math.pi:
@@ -182,6 +182,6 @@ def _contradiction(frame: dict[str, Any], label: str, content: dict[str, Any], s
         if abs(math.log(focal / other)) > SAME_FOCAL:
             return (
                 f"warning: {label}: 'fl_x' is {focal:.6g}, but 'camera_angle_x' gives {other:.6g} for a width of "
-                f"{size[0]} pixels; fl_x is taken"
+                f"{size[0]} pixels; using fl_x"
             )
     return None

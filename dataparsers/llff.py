@@ -26,8 +26,7 @@ POSES = "poses_bounds.npy"
 BOUNDS = f"the depth bounds of {POSES}"
 """Subject of error messages about the depth bounds."""
 NEAR_SHARE = 0.9
-"""Near distance as a fraction of the smallest depth bound: the bound is a percentile of depths, and a few are
-smaller."""
+"""Near distance as a fraction of the smallest depth bound. The bound is a percentile of depths; a few are smaller."""
 FORWARD = 0.7
 """Minimum cosine between a viewing direction and the mean direction in a forward-facing scene (45 degrees)."""
 
@@ -37,15 +36,15 @@ class Llff(Captured):
     """Flags of the llff format."""
 
     images_path: str = "images"
-    """Folder of the images in the data folder; reduced ones are in folders beside it, such as images_8."""
+    """Folder of the images in the data folder; reduced images are in folders beside it, such as images_8."""
     masks_path: str = "masks"
     """Folder of masks in the data folder: white for pixels to train on."""
     use_bounds: bool = True
-    """Use the file's depth bounds: rays start there, unless `near` is larger, and the box of a forward-facing scene
-    holds everything between the bounds, times `scene_scale`."""
+    """Use the file's depth bounds. Rays start there, unless `near` is larger; the box of a forward-facing scene holds
+    everything between the bounds, times `scene_scale`."""
     ndc: bool = False
-    """Train in normalised device coordinates, for forward-facing scenes: the box holds everything out to infinity,
-    near, far and scene_scale have no effect, and depths are in these coordinates."""
+    """Train in normalised device coordinates, for forward-facing scenes. The box holds everything up to infinity; near,
+    far and scene_scale have no effect; depths are in these coordinates."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -73,12 +72,12 @@ class Llff(Captured):
         return self._bounded(scene, placed, corners, bounds) if self.use_bounds else scene
 
     def _bounded(self, scene: ParsedScene, poses: Tensor, corners: Tensor, bounds: Tensor) -> ParsedScene:
-        """Return the scene with the file's near distance and, if it is forward-facing, with the file's box.
+        """Return the scene with the file's near distance and, if it is forward-facing, the file's box.
 
         Args:
             scene: the scene as placed by the flags.
             poses: (M, 3, 4) camera-to-world of all images, scene coordinates.
-            corners: (M, 4, 3) as `corner_directions` returns them.
+            corners: (M, 4, 3), from `corner_directions`.
             bounds: (M, 2) smallest and largest depth, scene units.
         """
         near = max(self.near or 0.0, NEAR_SHARE * float(bounds[:, 0].min()))
@@ -103,11 +102,11 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
         count: number of images M.
 
     Returns:
-        Camera-to-world matrices (M, 4, 4) float64, OpenGL axes; fx, fy, cx, cy (M, 4); width and height (M, 2) int64
-        that these refer to; smallest and largest depth (M, 2), in the input's units.
+        Camera-to-world matrices (M, 4, 4) float64, OpenGL axes; fx, fy, cx, cy (M, 4); their width and height (M, 2)
+        int64; smallest and largest depth (M, 2), in the input's units.
 
     Raises:
-        DataError: if the file is missing, damaged, or for another number of images.
+        DataError: if the file is missing, damaged, or has another number of images.
     """
     try:
         table = read_array(file)
@@ -119,7 +118,7 @@ def read_poses_bounds(file: Path, count: int) -> tuple[Tensor, Tensor, Tensor, T
         raise DataError(f"{file} holds an array of shape {table.shape}; it must be numbers of shape (images, 17)")
     if len(table) != count:
         raise DataError(
-            f"{file} has poses of {len(table)} images, but there are {count} images; remove those without a pose"
+            f"{file} has poses of {len(table)} images, but there are {count} images; remove images without a pose"
         )
     values = torch.from_numpy(table.astype(np.float64))
     bounds = values[:, 15:]
@@ -152,7 +151,7 @@ def faces_forward(poses: Tensor) -> bool:
 
 
 def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tensor:
-    """Return directions (M, 4, 3) through the corners of the images of M pinhole cameras, of depth 1.
+    """Return directions (M, 4, 3) of depth 1 through the image corners of M pinhole cameras.
 
     Args:
         poses: (M, 3, 4) camera-to-world.
@@ -165,16 +164,16 @@ def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tenso
 
 
 def _in_ndc(scene: ParsedScene, poses: Tensor, corners: Tensor, nears: Tensor) -> ParsedScene:
-    """Return the scene in normalised device coordinates, where everything visible is in the box."""
+    """Return the scene in normalised device coordinates; everything visible is in the box."""
     ndc = find_ndc(poses, corners, nears)
     box = checked_box(ndc_box(ndc, poses, corners).float(), BOUNDS)
     cameras = NdcCameras(**{f.name: getattr(scene.cameras, f.name) for f in fields(scene.cameras)}, ndc=ndc)
-    # No ray is longer than the box's diagonal.
+    # No ray is longer than the diagonal of the box.
     return replace(scene, cameras=cameras, box=box, near=0.0, far=float((box[1] - box[0]).norm()), unbounded=False)
 
 
 def _image_names(root: Path) -> list[str]:
-    """Return the sorted names of the images in a folder or, if there are none, in the first folder of reduced ones.
+    """Return the sorted names of the images in a folder or, if there are none, in the first folder of reduced images.
 
     Raises:
         DataError: if there are no images.

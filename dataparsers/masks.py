@@ -1,4 +1,4 @@
-"""Masks in a folder beside the images: the mask of each image."""
+"""Masks in a folder beside the images."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from nerfloom.data.names_on_disk import REDUCED, files_below, spelled, without_e
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:
     """Return the masks of M images, or None if no image has one.
 
-    A mask has the name of its image (`spelled`), with an ending appended to it (COLMAP) or exchanged.
+    A mask has the name of its image (`spelled`), with an additional (COLMAP) or another ending.
 
     Args:
-        root: folder of masks at full size; reduced ones are in folders beside it, such as masks_2.
+        root: folder of masks at full size; reduced masks are in folders beside it, such as masks_2.
         names: M names of images, relative to the images' folder.
 
     Returns:
@@ -31,9 +31,7 @@ def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | No
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(masks):
         if available:
-            say(
-                f"{root}: none of its {len(available)} files has an image's name, such as {names[0]}; they are not used"
-            )
+            say(f"{root}: none of its {len(available)} files is named like an image, such as {names[0]}; not used")
         return None
     if without:
         say(f"{root}: {len(without)} of {len(masks)} images have no mask and are used without, the first {without[0]}")

@@ -28,11 +28,11 @@ from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid, shown
 
 TRANSFORMS = "transforms.json"
-"""File by which the format is recognised."""
+"""File that identifies the format."""
 EvalMode = Literal["interval", "fraction", "filename", "all"]
-"""Rule by which images are held out."""
+"""Rule for held-out images."""
 MILLIMETRE = 0.001
-"""Units of the input per unit of a stored depth by default, as in nerfstudio."""
+"""Default units of the input per unit of a stored depth, as in nerfstudio."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Nerfstudio(Captured):
     """Flags of the nerfstudio format."""
 
     eval_mode: EvalMode = "interval"
-    """Rule by which images are held out: at an interval (--eval-interval); a fraction of them (--train-split-fraction);
-    those with eval, val or test in their name (filename); or none, with all images in every split. The file's own
-    train_filenames, val_filenames and test_filenames take precedence over all rules but the last."""
+    """Rule for held-out images. interval: every --eval-interval-th. fraction: all but --train-split-fraction. filename:
+    those with eval, val or test in their name. all: none, every split has all images. The file's own train_filenames,
+    val_filenames and test_filenames take precedence over all rules but the last."""
     train_split_fraction: float = 0.9
     """Fraction of images to train on, evenly spaced, with --eval-mode fraction."""
     depth_unit_scale_factor: float = MILLIMETRE
@@ -63,7 +63,7 @@ class Nerfstudio(Captured):
         content = read_json(file)
         images = _posed_images(file, content, split)
         if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
-            say("depths in EXR files are taken for millimetres; --depth-unit-scale-factor 1 takes them as they are")
+            say("depths in EXR files are read as millimetres; use --depth-unit-scale-factor 1 if they are in metres")
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
         scene = captured_scene(self, images, split, self._division(split, lists), _applied(content, file))
         scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
@@ -93,7 +93,7 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
     written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
     paths = on_disk(file.parent, written, quiet=split != "train")
     intrinsics = read_intrinsics(file, content, frames, labels, lambda: image_sizes(paths))
-    if intrinsics.warning and split == "train":  # once is enough
+    if intrinsics.warning and split == "train":  # reported once
         say(intrinsics.warning)
     poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed])
     return PosedImages(
@@ -125,7 +125,7 @@ def _companions(
     endings: Sequence[str],
     split: Split,
 ) -> tuple[Path | None, ...] | None:
-    """Return files that belong to the frames' images; None for a frame without, and None if no frame has one."""
+    """Return files that accompany the frames' images; None for a frame without one, and None if no frame has one."""
     named = [frame.get(key) for frame in frames]
     if all(name is None for name in named):
         return None
@@ -149,7 +149,7 @@ def _points(file: Path, content: dict[str, Any], split: Split) -> Tensor | None:
 def _tracks(
     file: Path, content: dict[str, Any], placed: list[tuple[dict[str, Any], str]], poses: Tensor
 ) -> Tracks | None:
-    """Return which images see which points of the COLMAP model beside the file, in the frame of the poses."""
+    """Return which images see which points, from the COLMAP model beside the file, in the frame of the poses."""
     names = [
         names_in_model(file_name(frame["file_path"], "file_path", label), frame.get("source_path"))
         for frame, label in placed
@@ -158,7 +158,7 @@ def _tracks(
 
 
 def _lists(file: Path, content: dict[str, Any], names: tuple[str, ...]) -> dict[str, set[str]]:
-    """Return split -> names of its images, for the splits that the file lists."""
+    """Return split -> image names, for the splits that the file lists."""
     lists, known = {}, {spelled(name): name for name in names}
     for split in ("train", "val", "test"):
         key = f"{split}_filenames"
@@ -179,7 +179,7 @@ def _sorted(names: list[str]) -> Tensor:
 
 
 def _listed(names: list[str], split: Split, lists: dict[str, set[str]]) -> Tensor:
-    """Select by the file's own lists. val and test substitute for each other; train is all that is not held out."""
+    """Select by the file's own lists. val and test substitute for each other; train is everything not held out."""
     alternative: Split = "test" if split == "val" else "val"
     if split == "train" and split not in lists:
         held = lists.get("val", set()) | lists.get("test", set())
@@ -191,7 +191,7 @@ def _listed(names: list[str], split: Split, lists: dict[str, set[str]]) -> Tenso
 
 
 def _fraction(names: list[str], split: Split, fraction: float) -> Tensor:
-    """Select evenly spaced images, first and last included, to train on; the others are held out."""
+    """Select evenly spaced images to train on, first and last included; the others are held out."""
     count = len(names)
     training = torch.zeros(count, dtype=torch.bool)
     training[evenly_spaced(count, math.ceil(count * fraction))] = True
@@ -207,8 +207,7 @@ def _by_name(names: list[str], split: Split) -> Tensor:
 def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_scale: float) -> ParsedScene:
     """Return the scene with instant-ngp's cube as box, if `aabb_scale` is given.
 
-    Placement transforms the cube's centre and its side, but does not rotate the cube: its edges are parallel to the
-    axes of the scene.
+    The placement moves and scales the cube but does not rotate it: its edges are parallel to the axes of the scene.
     """
     cube = ngp_cube(content, file)
     if cube is None or scene.transform is None:
@@ -221,7 +220,7 @@ def _with_cube(scene: ParsedScene, content: dict[str, Any], file: Path, scene_sc
 
 
 def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> ParsedScene:
-    """Return the scene with a transform from the frame that the file was made from, so that exports are in that frame.
+    """Return the scene with a transform from the original frame, before the file's transform, so that exports use it.
 
     The file's frame is `applied_scale * (applied_transform @ x)` of the original.
     """
@@ -232,7 +231,7 @@ def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> P
 
 
 def _applied(content: dict[str, Any], file: Path) -> tuple[Tensor, float]:
-    """Return rotation and translation (4, 4) float64, and then the scale, that led to the file's frame."""
+    """Return rotation and translation (4, 4) float64, and the scale after them, of the file's transform."""
     matrix, scale, name = content.get("applied_transform"), content.get("applied_scale"), f"{file}: 'applied_transform'"
     applied = torch.eye(4, dtype=torch.float64) if matrix is None else rigid(matrix, name, name)
     return applied, 1.0 if scale is None else number(scale, "applied_scale", str(file), positive=True)

@@ -1,6 +1,6 @@
-"""Phototourism collections: images of a landmark by many people, split by a .tsv (Jin et al. 2020).
+"""Phototourism collections: images of a landmark by many people, with splits in a .tsv (Jin et al. 2020).
 
-NeRF in the Wild (Martin-Brualla et al. 2021) lists its training images in such a file: a line each with `filename`,
+NeRF in the Wild (Martin-Brualla et al. 2021) lists its training images in such a file, with the columns `filename`,
 `id`, `split` and `dataset`; images without `id` have no pose.
 """
 
@@ -81,7 +81,7 @@ def read_splits(file: Path) -> dict[str, str]:
         file: the .tsv file.
 
     Raises:
-        DataError: if the file cannot be read, lacks a column, or has another split.
+        DataError: if the file cannot be read, lacks a column, or has an unknown split.
     """
     try:
         with file.open(encoding="utf-8", newline="") as handle:

@@ -1,4 +1,4 @@
-"""The placement of a captured scene: up, origin and scale by its cameras."""
+"""Placement of a captured scene: up direction, origin and scale, from its cameras."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.geometry.local_origin import local_origin, rounding
 
 Applied = tuple[Tensor, float]
-"""Rigid transform (4, 4) from an earlier frame to that of a format's poses, and units of the later per unit of the
-earlier: x becomes `scale * (transform @ x)`."""
+"""Rigid transform (4, 4) from the original frame to that of a format's poses, and units of the latter per unit of the
+original: x becomes `scale * (transform @ x)`."""
 
 
 def placement_of(flags: Captured, images: PosedImages, split: Split, applied: Applied | None) -> Placement:
-    """Return the placement of the scene that all images show, and say if it is enlarged or far from its origin.
+    """Return the placement of a scene, and report if it is enlarged or far from its origin.
 
     Args:
         flags: the format's flags.
         images: images of all splits.
-        split: the split that is read; training says what is unusual.
-        applied: what the poses were moved by before, which a placement that the flags name does not know.
+        split: the split to read; only training reports.
+        applied: the transform already applied to the poses, which a placement file does not include.
 
     Raises:
-        DataError: if the placement that the flags name cannot be read.
+        DataError: if the placement file cannot be read.
     """
     placement = _placement(flags, images, split, applied)
     positions = placement.points(images.poses[:, :3, 3])
@@ -46,31 +46,29 @@ def _placement(flags: Captured, images: PosedImages, split: Split, applied: Appl
     if flags.placement is not None:
         given = read_transforms(flags.placement)
         return given.after(*applied) if applied else given
-    # A device knows where gravity pulls, and its images are upright.
+    # A device measures gravity, and its images are upright.
     orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
     spread = camera_spread(images.poses, images.points if images.tracks is None else images.tracks.points)
     if spread is not None and spread < SMALL and split == "train" and images.model != "orthographic":
         say(warning(spread))
-    scaled = flags.auto_scale_poses and spread != 0  # the distances of cameras in one position are rounding
+    scaled = flags.auto_scale_poses and spread != 0  # distances of cameras in one position are rounding errors
     placement = place(images.poses, orientation, flags.center_method, scaled)
     if scaled and images.model != "orthographic":
         spreads = (images.sizes / images.intrinsics[:, :2]).amax(-1)
         factor = enlargement(placement.poses(images.poses), spreads)
         if factor > 1 and split == "train":
-            say(
-                f"cameras look at something small from afar: the scene is enlarged by {factor:.1f} (--auto-scale-poses)"
-            )
+            say(f"cameras see a small scene from afar: it is enlarged by {factor:.1f} (--auto-scale-poses)")
         placement = replace(placement, scale=placement.scale * factor)
     return replace(placement, scale=placement.scale * flags.scale_factor)
 
 
 def from_original(scene: ParsedScene, applied: Tensor, scale: float = 1.0) -> ParsedScene:
-    """Return the scene with `transform` and `scale` relative to an earlier frame.
+    """Return the scene with `transform` and `scale` relative to the original frame.
 
     Args:
-        scene: a scene with `transform` and `scale` relative to the later frame.
-        applied: (4, 4) rigid transform from the earlier frame to the later one, applied before `scale`.
-        scale: units of the later frame per unit of the earlier: x becomes `scale * (applied @ x)`.
+        scene: a scene with `transform` and `scale` relative to the format's frame.
+        applied: (4, 4) rigid transform from the original frame to the format's, applied before `scale`.
+        scale: units of the format's frame per unit of the original: x becomes `scale * (applied @ x)`.
     """
     placement = scene.placement.before(applied, scale)
     return replace(scene, transform=placement.transform, scale=placement.scale)

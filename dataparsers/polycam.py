@@ -1,4 +1,4 @@
-"""Polycam's raw exports: keyframes/corrected_images, or images, with a JSON file of the same name for each camera."""
+"""Polycam's raw exports: keyframes/corrected_images or keyframes/images, with a JSON file per camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.reading import number, read_json, rigid, side_or_none
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
-"""Folders of cameras and images in `keyframes`, the ones refined by Polycam first."""
+"""Folders of cameras and images in `keyframes`; those refined by Polycam come first."""
 Z_UP = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Rotation from Polycam's axes (y up) to the scene's (z up), as in nerfstudio."""
 
@@ -42,7 +42,7 @@ class Polycam(Captured):
             raise DataError(f"--depth-unit-scale-factor is {self.depth_unit_scale_factor}; it must be above zero")
         pairs = [pair for pair in CAMERAS if _is_pair(path, *pair)]
         if not pairs:
-            raise DataError(f"{path} has no keyframes/cameras with keyframes/images; export Polycam's raw data")
+            raise DataError(f"{path} lacks keyframes/cameras or keyframes/images; export Polycam's raw data")
         images = _posed_images(path / "keyframes", *pairs[0], split)
         scene = captured_scene(self, images, split, applied=(Z_UP, 1.0))
         return replace(from_original(scene, Z_UP), depth_unit=self.depth_unit_scale_factor)
@@ -55,7 +55,7 @@ def _is_pair(path: Path, cameras: str, images: str) -> bool:
 def _posed_images(folder: Path, cameras: str, images: str, split: Split) -> PosedImages:
     files = sorted((folder / cameras).glob("*.json"))
     if not files:
-        raise DataError(f"{folder / cameras} holds no camera (.json)")
+        raise DataError(f"{folder / cameras} has no cameras (.json)")
     stems = [file.stem for file in files]
     paths = on_disk(folder, [f"{images}/{stem}" for stem in stems], quiet=split != "train")
     poses, intrinsics, stated = [], [], []

@@ -1,4 +1,4 @@
-"""Validation of values read from untrusted files: errors name the file and the entry in one line."""
+"""Validation of values read from untrusted files; errors name the file and the entry in one line."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def read_json(file: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{file} is not JSON: {error}") from error
     if not isinstance(content, dict):
-        raise DataError(f"{file} must hold a JSON object: names and values in braces")
+        raise DataError(f"{file} must contain a JSON object: names and values in braces")
     return content
 
 
@@ -58,12 +58,12 @@ def read_pose(frame: Any, where: str, dtype: torch.dtype = torch.float32) -> Ten
 
 
 def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return a rigid motion (4, 4) from three or four rows of four numbers, whose rotation may be rounded.
+    """Return a rigid motion (4, 4) from three or four rows of four numbers; its rotation may be rounded.
 
     Args:
         matrix: the rows.
-        name: name of the matrix in the message if it is no matrix.
-        where: name of the pose in the message if it is invalid.
+        name: name of the matrix, for the message if it has another shape.
+        where: name of the pose, for the message if it is invalid.
         dtype: type of the result.
 
     Raises:
@@ -142,7 +142,7 @@ def side_or_none(value: Any, name: str, where: str) -> int | None:
     `value`, `name` and `where` are as in `number`.
 
     Raises:
-        DataError: as `side`.
+        DataError: see `side`.
     """
     return None if value is None else side(value, name, where)
 

@@ -30,7 +30,7 @@ class Record3D(Captured):
 
     poses: PoseSource = "device"
     max_images: int = 300
-    """Maximum number of images, evenly spaced over the recording; 0 takes all."""
+    """Maximum number of images, evenly spaced over the recording; 0 uses all."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -52,7 +52,7 @@ class Record3D(Captured):
         images = PosedImages(
             folder=folder,
             paths=paths,
-            names=tuple(f"{index:09d}" for index in range(len(paths))),  # padded, so that names sort as numbers
+            names=tuple(f"{index:09d}" for index in range(len(paths))),  # padded, so that names sort by number
             poses=poses,
             intrinsics=_intrinsics(content, file).expand(len(paths), 4),
             sizes=torch.tensor([[width, height]]).expand(len(paths), 2),
@@ -61,7 +61,7 @@ class Record3D(Captured):
 
 
 def _folder(path: Path) -> Path:
-    """Return the folder of the export: the folder that the user named, or one in it."""
+    """Return the folder of the export: the user's folder, or a folder in it."""
     return path / EXPORT if (path / EXPORT).is_dir() else path
 
 
@@ -76,7 +76,7 @@ def _poses(content: dict[str, Any], file: Path) -> Tensor:
     """Return camera-to-world matrices (M, 3, 4) from quaternions x, y, z, w and positions."""
     listed = content.get("poses")
     if not isinstance(listed, list) or not listed:
-        raise DataError(f"{file}: 'poses' must be a list of the camera's poses")
+        raise DataError(f"{file}: 'poses' must be a list of camera poses")
     values = [numbers(pose, 7, "poses", f"{file}: pose {index}") for index, pose in enumerate(listed)]
     table = torch.tensor(values, dtype=torch.float64)
     unit = unit_quaternions(table[:, :4], [f"{file}: pose {index}" for index in range(len(table))])

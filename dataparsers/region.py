@@ -1,4 +1,4 @@
-"""The part of space that a set of renders shows: a cube, by the silhouettes of matter, else by where cameras look."""
+"""The region shown in renders: a cube, from silhouettes of matter, otherwise from where cameras look."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from nerfloom.data.image_files import may_be_transparent, read_image
 from nerfloom.scene.enclosing_box import enclosing_box, is_larger
 
 HALF_SIZE = 1.5
-"""Half the side of a scene's box, scene units: that of NeRF-Synthetic, for which methods' settings were found."""
+"""Half the side of a scene's box, scene units: that of NeRF-Synthetic, for which methods' settings were tuned."""
 SHOWN = 1.034
-"""Half the side of NeRF-Synthetic's box, in half the width that its images show of the plane through the origin."""
+"""Half the side of NeRF-Synthetic's box, relative to half the width of the plane through the origin in its images."""
 MOST_IMAGES = 32
-"""Maximum number of images whose silhouettes are read."""
+"""Maximum number of images whose silhouettes are used."""
 SLACK = 0.8
-"""Rays start at this share of the smallest distance between a camera and the matter. Matter may end at this share of
-the distance where rays end, since cameras of other splits may be nearer or further."""
+"""Rays start at this fraction of the smallest distance between a camera and the matter. They end at the largest such
+distance divided by it. Cameras of other splits may be nearer or farther."""
 FAR = 1000.0
-"""Distance, scene units, at which a scene ends if nothing says where it does."""
+"""Far distance of an unbounded scene, scene units."""
 
-LOOKED_AT = "which the images show where the cameras look"
-"""Reason of a region that is not known by silhouettes."""
+LOOKED_AT = "where the cameras look"
+"""Description of a region not based on silhouettes."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +48,17 @@ class Region:
     unbounded: bool
     """Whether there may be visible content outside the cube."""
     reason: str
-    """What the cube is, as a clause of a message."""
+    """Description of the cube, as a clause for a message."""
 
     @property
     def placement(self) -> Placement:
-        """The placement that makes the cube the box of NeRF-Synthetic."""
+        """The placement that maps the cube to the box of NeRF-Synthetic."""
         transform = torch.cat([torch.eye(3, dtype=torch.float64), -self.center[:, None]], -1)
         return Placement(transform, HALF_SIZE / self.half)
 
     @property
     def description(self) -> str:
-        """Size, place and reason in words."""
+        """Size, position and reason in words."""
         center = ", ".join(f"{value:.4g}" for value in self.center.tolist())
         return f"in a cube of side {2 * self.half:.4g} around ({center}), {self.reason}"
 
@@ -66,18 +66,18 @@ class Region:
 def find_region(
     cameras: Cameras, images: Sequence[Path], moving: bool, cube: tuple[Tensor, float] | None = None
 ) -> Region:
-    """Return the region that renders show.
+    """Return the region shown in renders.
 
-    Of a still scene it is the cube around a box that holds all matter by the images' silhouettes (`enclosing_box`), if
-    they show enough of it. Otherwise it is around the point that the cameras look at, as large as the images show
-    there. If they look at no one point, it is the cube that the file states, else one around the cameras. Without
-    alpha, or if matter is larger than the images, there may be more outside.
+    In a static scene, the region is the cube around the box that the silhouettes leave for matter (`enclosing_box`), if
+    they determine one. Otherwise it is centred at the point that the cameras look at, with the size that images show
+    there. If they look at no common point, it is the cube stated in the file, or one around the cameras. Without alpha,
+    or if matter is larger than the images, there may be content outside.
 
     Args:
         cameras: M cameras in the input's frame.
         images: M files.
         moving: whether images show different times.
-        cube: centre (3,) float64 and edge of instant-ngp's cube; None if the file states none.
+        cube: centre (3,) float64 and edge of instant-ngp's cube; None if the file has none.
     """
     few = evenly_spaced(len(images), MOST_IMAGES)
     opaque = _opaque([images[index] for index in few.tolist()])
@@ -86,20 +86,20 @@ def find_region(
     if opaque is not None:
         ends = seen is not None and (moving or not is_larger(opaque))
         central = cameras.model not in ("orthographic", "equirectangular")
-        if central and not moving:  # silhouettes of different times say nothing together
+        if central and not moving:  # silhouettes of different times cannot be combined
             box = enclosing_box(cameras[few], opaque)
             if box is None and seen is not None and ends:
                 box = enclosing_box(cameras[few], opaque, _cube(*seen))
     if box is not None:
         center, half = box.mean(0), float((box[1] - box[0]).max()) / 2
-        ends, reason = True, f"which holds what the silhouettes of {len(few)} images leave"
+        ends, reason = True, f"from the silhouettes of {len(few)} images"
     elif seen is not None:
         center, half = seen
     elif cube is not None:
-        center, half, reason = cube[0], cube[1] / 2, "that of the file's aabb_scale"
+        center, half, reason = cube[0], cube[1] / 2, "from the file's aabb_scale"
     else:
         around = place(cameras.camera_to_worlds, "none", "poses")
-        center, half, reason = -around.transform[:, 3].double(), 1 / around.scale, "which holds the cameras"
+        center, half, reason = -around.transform[:, 3].double(), 1 / around.scale, "around the cameras"
     near, far = NEAR * half / HALF_SIZE, FAR * half / HALF_SIZE
     if ends:
         near, far = _distances(cameras, _cube(center, half) if box is None else box)
@@ -111,15 +111,15 @@ def _cube(center: Tensor, half: float) -> Tensor:
 
 
 def cube_at_origin(cameras: Cameras, half: float) -> Region:
-    """Return a cube of half side `half` around the origin, and near and far of `cameras` that see it."""
+    """Return a cube of half side `half` around the origin, with near and far for `cameras`."""
     center = torch.zeros(3, dtype=torch.float64)
-    return Region(center, half, *_distances(cameras, _cube(center, half)), False, "that of --half-size")
+    return Region(center, half, *_distances(cameras, _cube(center, half)), False, "from --half-size")
 
 
 def _opaque(images: Sequence[Path]) -> list[Tensor] | None:
-    """Return the pixels (H, W) bool of images that are not fully transparent; None if no image has a transparent one.
+    """Return the pixels (H, W) bool of images that are not fully transparent; None if no image has transparent pixels.
 
-    All pixels of an unreadable image count as opaque, so that it says nothing; it is reported when it is decoded.
+    All pixels of an unreadable image count as opaque, which adds no constraint; it is reported when it is decoded.
     """
     if not any(may_be_transparent(path) for path in images):
         return None
@@ -136,9 +136,9 @@ def _opaque_pixels(path: Path) -> Tensor:
 
 
 def _distances(cameras: Cameras, box: Tensor) -> tuple[float, float]:
-    """Return near and far by the smallest and the largest distance between `cameras` and points of `box` (2, 3).
+    """Return near and far, from the smallest and the largest distance between `cameras` and points of `box` (2, 3).
 
-    Near is at least a part of the box that cameras inside it hardly resolve.
+    Near is at least a small fraction of the box that cameras inside it hardly resolve.
     """
     origins = cameras.camera_to_worlds[:, :, 3].double()
     nearest = (origins - torch.minimum(torch.maximum(origins, box[0]), box[1])).norm(dim=-1)
@@ -148,14 +148,14 @@ def _distances(cameras: Cameras, box: Tensor) -> tuple[float, float]:
 
 
 def _where_cameras_look(cameras: Cameras, every: bool) -> tuple[Tensor, float] | None:
-    """Return the point (3,) float64 that most images show, nearest to the axes, and how far they show around it.
+    """Return the point (3,) float64 nearest to the optical axes, if most images show it, and the size they show there.
 
     Args:
         cameras: M cameras.
-        every: True for what the image that shows most shows, False for the median.
+        every: True for the largest size in any image, False for the median size.
 
     Returns:
-        Point and half the side of a cube; None if fewer than `MOST_LOOK` of the images show one point.
+        Point and half the side of a cube; None if fewer than `MOST_LOOK` of the images show a common point.
     """
     point = None if cameras.model == "equirectangular" else looked_at(cameras.camera_to_worlds)
     if point is None:
@@ -168,6 +168,6 @@ def _where_cameras_look(cameras: Cameras, every: bool) -> tuple[Tensor, float] |
     across = torch.maximum(cameras.cx, cameras.widths - cameras.cx) / cameras.fx
     down = torch.maximum(cameras.cy, cameras.heights - cameras.cy) / cameras.fy
     shown = torch.maximum(across, down).double()
-    if cameras.model != "orthographic":  # which shows as much at every distance
+    if cameras.model != "orthographic":  # orthographic images show the same size at all distances
         shown = shown * (cameras.camera_to_worlds[:, :, 3].double() - point).norm(dim=-1)
     return point, SHOWN * float(shown.max() if every else shown.median())

@@ -1,4 +1,4 @@
-"""The renders that a transforms_{split}.json lists: files, cameras, and what else the file states."""
+"""The renders listed in a transforms_{split}.json: files, cameras, and other entries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerfloom.dataparsers.posed_images import PosedImages
 from nerfloom.dataparsers.reading import file_name, read_json, read_pose, read_times
 
 OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
-"""Entries that state more of a lens than its angle of view."""
+"""Entries that describe a lens beyond its angle of view."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Renders:
     images: PosedImages
     """M images."""
     cube: tuple[Tensor, float] | None
-    """Centre (3,) float64 and edge of instant-ngp's cube, in the input's units; None if the file states none."""
+    """Centre (3,) float64 and edge of instant-ngp's cube, in the input's units; None if the file has none."""
     only_angle: bool
-    """Whether the file states an angle of view, and nothing else of lenses."""
+    """Whether the file states an angle of view and nothing else about lenses."""
 
 
 def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
@@ -40,7 +40,7 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
     Args:
         folder: folder of the file.
         split: the split to read.
-        is_wanted: False if the images only serve to place others; what is unusual about them is then not reported.
+        is_wanted: False if the images only determine the placement of others; problems are then not reported.
 
     Raises:
         DataError: if the file is missing or invalid, or none of its images exists.
@@ -58,7 +58,7 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
     size = image_size([paths[index] for index in keep.tolist()])
     frames, plain = [_without_sensor(frame) for frame in frames], _without_sensor(content)
     intrinsics = read_intrinsics(file, plain, frames, labels, lambda: torch.tensor([size]).expand(len(paths), 2))
-    if intrinsics.warning and is_wanted and split == "train":  # once is enough
+    if intrinsics.warning and is_wanted and split == "train":  # reported once
         say(intrinsics.warning)
     images = PosedImages(
         folder=folder,

@@ -1,6 +1,6 @@
-"""Rotations as files have them: as matrices and quaternions that were rounded when they were written.
+"""Rotations in files: matrices and quaternions rounded when written.
 
-What is a rotation up to rounding is made one, and nothing is said. What is none is left to be refused.
+Rounded rotations are corrected silently. Anything else stays unchanged, to be refused later.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from nerfloom import DataError
 from nerfloom.kernels.math import cross_matrix
 
 LARGEST_ROUNDING = 0.02
-"""Largest deviation of R R^T from the identity, and of a quaternion's length from 1, that rounding explains: that of
+"""Maximum deviation of R R^T from the identity, and of a quaternion's length from 1, that counts as rounding: that of
 numbers with two decimals."""
 EXACT = 1e-12
-"""Deviation below which a matrix is left as it is."""
+"""A matrix with a smaller deviation is left unchanged."""
 
 
 def nearest_rotation(matrix: Tensor) -> Tensor:
-    """Return the rotation (3, 3) nearest to a matrix that is one up to rounding; any other matrix as it is.
+    """Return the rotation (3, 3) nearest to a rounded rotation matrix; any other matrix is returned unchanged.
 
     It is U V^T of the singular value decomposition U S V^T (Higham 1989).
 
@@ -29,7 +29,7 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
         matrix: (3, 3) float64.
     """
     deviation = float((matrix @ matrix.T - torch.eye(3, dtype=matrix.dtype)).abs().max())
-    if not EXACT < deviation <= LARGEST_ROUNDING:  # NaN is left too
+    if not EXACT < deviation <= LARGEST_ROUNDING:  # NaN is unchanged too
         return matrix
     left, _, right = torch.linalg.svd(matrix)
     return left @ right
@@ -40,7 +40,7 @@ def unit_quaternions(quaternions: Tensor, labels: Sequence[str]) -> Tensor:
 
     Args:
         quaternions: (M, 4) float64.
-        labels: M names in messages.
+        labels: M names for messages.
 
     Raises:
         DataError: if a length is not 1 up to rounding.

@@ -1,4 +1,4 @@
-"""Sparse points of a captured scene: which of them are used, and for what."""
+"""Choice of a captured scene's sparse points, and their uses."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ class SparsePoints:
     """Sparse points in the scene's frame."""
 
     points: Tensor | None
-    """(K, 3) all points that may be used; None if there are none."""
+    """(K, 3) all usable points; None if there are none."""
     sound: Tensor | None
-    """(S, 3) those whose distances are believed, or all if there are none; None without points."""
+    """(S, 3) the points with trusted distances, or all points if there are none; None without points."""
     sightings: Sightings | None
-    """Which images see which points at a distance that is known; None without tracks."""
+    """Which images see which points at a known distance; None without tracks."""
 
 
 def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, known: Tensor | None) -> SparsePoints:
-    """Return the sparse points in the scene's frame, and say how many of them serve for what.
+    """Return the sparse points in the scene's frame, and report their number for each use.
 
-    A point that is too poor for distances still says about where a surface is. Left out are points beyond the range of
-    float32, and those that held-out images see and fewer than two others: only held-out images know of them. (The
-    others' positions were found by all images together, as all poses were.)
+    A point too inaccurate for distances still shows roughly where a surface is. Left out are points beyond the range of
+    float32, and points seen in held-out images and in fewer than two others, since only held-out images know them. (The
+    positions of the remaining points, like the poses, come from all images.)
 
     Args:
         images: M images.
         placement: placement of the scene.
         cameras: M cameras in the scene's frame.
-        known: the images of a split to train on, which alone may be learned from; None for all, and nothing is said.
+        known: the training images, from which alone a method may learn; None for all images, without a report.
     """
     points, sound, sightings, notes = None, None, None, []
     if images.tracks is not None and len(images.tracks.points):
@@ -74,7 +74,7 @@ def _others(known: Tensor, count: int) -> Tensor:
 
 
 def _on_distances(tracks: Tracks, centers: Tensor, chosen: Tensor) -> str:
-    """Return of how many of the `chosen` points (K,) images know the distance, and what the others lack."""
+    """Return a report on the `chosen` points (K,): how many have known distances, and what the others lack."""
     distant = torch.zeros(len(tracks.points), dtype=torch.bool)
     distant[tracks.seen[tracks.known_distances(centers)]] = True
     doubts = tracks.doubts[chosen & ~distant]
@@ -84,7 +84,7 @@ def _on_distances(tracks: Tracks, centers: Tensor, chosen: Tensor) -> str:
 
 
 def _note(count: int, total: int | None, what: str, lost: Mapping[str, int]) -> str:
-    """Return how many points serve for something, and for each reason how many do not."""
+    """Return how many points serve a purpose, and how many do not for each reason."""
     reasons = ", ".join(f"{number:,} {reason}" for reason, number in lost.items() if number)
     counted = f"{count:,}" if total is None else f"{count:,} of {total:,}"
     return f"{counted} {what}" + (f" (not {reasons})" if reasons else "")

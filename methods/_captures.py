@@ -1,4 +1,4 @@
-"""Settings, decisions and refined poses that methods for captures share."""
+"""Settings, decisions and pose refinement shared by methods for captures."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from nerfloom.scene.reasons import MARCHED_REASON, POSE_REASONS
 DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
 PAPER_SAMPLES = 64, 64
-"""Intervals a ray of each proposal in mip-NeRF 360 and in Zip-NeRF."""
+"""Intervals per ray of each proposal in mip-NeRF 360 and in Zip-NeRF."""
 POSE_WARMUP = 512
-"""Steps in which the learning rate of poses rises. Before there is a scene their gradients are noise, by which Adam
-would move each camera by about the rate times the square root of the number of steps: half a degree in 100 steps."""
+"""Steps over which the learning rate of poses rises. Before there is a scene, their gradients are noise, and Adam would
+move each camera by about the rate times the square root of the number of steps: half a degree in 100 steps."""
 MARCHED_SAMPLES = 2**16
-"""Samples a training step with an occupancy grid: as many as 2,048 rays have with proposals."""
+"""Samples per training step with an occupancy grid, about as many as 2,048 rays have with proposals."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class RefinedConfig(SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=
     RANGES: ClassVar[dict[str, Range]] = {"camera_learning_rate": AT_LEAST_0}
     """Allowed range of each numeric setting."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
-    """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them and proposals choose the
-    samples, else off."""
+    """Refinement of the training cameras' poses. auto: SO3xR3 if a device tracked them and proposals choose the
+    samples, otherwise off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""
 
@@ -53,12 +53,12 @@ class CaptureConfig(RefinedConfig):
     RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0}
     """Allowed range of each numeric setting."""
     contraction: Auto[bool] = AUTO
-    """Whether space outside the box is contracted. If not given: in unbounded scenes."""
+    """Whether to contract space outside the box. auto: in unbounded scenes."""
     distortion_loss_mult: Auto[float] = AUTO
-    """Weight of the distortion loss. If not given: 0.002 in unbounded scenes, else 0."""
+    """Weight of the distortion loss. auto: 0.002 in unbounded scenes, otherwise 0."""
     gradient_scaling: Auto[bool] = AUTO
-    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
-    floaters. If not given: in unbounded scenes."""
+    """Whether to scale down gradients near cameras, by squared distance up to half of the box's edge, against floaters.
+    auto: in unbounded scenes."""
 
 
 RefinedConfigT = TypeVar("RefinedConfigT", bound=RefinedConfig)
@@ -66,11 +66,11 @@ CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
 
 
 def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
-    """Return what samples rays: by `sampler_choice`, but proposals if poses are asked to be refined.
+    """Return the sampler from `sampler_choice`, or proposals if pose refinement is selected.
 
     Args:
         config: the method's settings.
-        contracted: whether the field sees space outside of the box.
+        contracted: whether the field covers space outside the box.
     """
     choice = sampler_choice(config, contracted)
     if config.camera_optimizer in ("SO3xR3", "SE3") and not contracted:
@@ -79,7 +79,7 @@ def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
 
 
 def refinement_choice(config: RefinedConfig, scene: Scene) -> Choice:
-    """Return whether poses are refined.
+    """Return whether to refine poses.
 
     Args:
         config: the method's settings; the sampler is chosen.
@@ -95,16 +95,16 @@ def refinement_choice(config: RefinedConfig, scene: Scene) -> Choice:
 def decide_capture(
     config: CaptureConfigT, scene: Scene, *own: Choice, proposals: tuple[int, ...] = PROPOSAL_SAMPLES
 ) -> tuple[CaptureConfigT, list[Decision]]:
-    """Decide the settings that methods for captures share, and a method's own.
+    """Decide the settings shared by methods for captures, and a method's own.
 
     Args:
-        config: the method's settings; those left open are filled in.
+        config: the method's settings; open ones are filled in.
         scene: properties of the data.
-        own: choices of the method's own.
-        proposals: intervals of each proposal without a limit of time.
+        own: the method's own choices.
+        proposals: intervals of each proposal without a time limit.
 
     Returns:
-        The settings, and a record of each that was filled in.
+        The settings, and a record of each setting that was filled in.
     """
     contracted = scene.unbounded if is_open(config.contraction) else config.contraction
     config, made = fill(config, refined_sampler_choice(config, contracted))
@@ -127,7 +127,7 @@ class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
     """A model whose training poses can be refined.
 
     Raises:
-        ConfigError: if poses are to be refined in normalised device coordinates or with another sampler than proposals.
+        ConfigError: if poses are refined in normalised device coordinates or without proposals.
     """
 
     def __init__(

@@ -17,16 +17,16 @@ class GridsConfig(HashGridConfig):
     RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0, "grid_width": (1, 2**14)}
     """Allowed range of each numeric setting."""
     grid_learning_rate: float = 1e-2
-    """Initial learning rate of the hash grids and of the networks that read them (hash-grid)."""
+    """Initial learning rate of the hash grids and of the networks on them (hash-grid)."""
     grid_width: int = 64
-    """Features per hidden layer of the networks that read the grids (hash-grid)."""
+    """Features per hidden layer of the networks on the grids (hash-grid)."""
 
 
 def grid_optimiser(config: GridsConfig, name: str = "grids") -> Optimised:
-    """Return how hash grids and their networks are optimised.
+    """Return the optimiser settings of hash grids and their networks.
 
     Args:
         config: the method's settings, decided.
-        name: name of the group of parameters.
+        name: name of the parameter group.
     """
     return Optimised(name, config.grid_learning_rate, betas=(0.9, 0.99), eps=1e-15, schedule="hold-exponential")

@@ -1,4 +1,4 @@
-"""D-NeRF: a canonical radiance field and a network that deforms it over time; T-NeRF as its option.
+"""D-NeRF: a canonical radiance field and a network that deforms it over time; T-NeRF is an option.
 
 Pumarola et al., "D-NeRF: Neural Radiance Fields for Dynamic Scenes", CVPR 2021.
 """
@@ -28,7 +28,7 @@ from nerfloom.scene.motion import MotionConfig, slices_choice
 NUM_STEPS, HASH_NUM_STEPS = 192, 384
 """Steps along the diagonal of the box: with networks, and with a hash grid."""
 HASH_SAMPLES_PER_BATCH = 2**13
-"""Samples of a training step with a hash grid, whose networks are small, and an occupancy grid."""
+"""Samples per training step with a hash grid, whose networks are small, and an occupancy grid."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class DNeRFConfig(
 ):
     """Settings of dnerf; the defaults of networks, samples and learning rate are the paper's.
 
-    Unlike in the paper, images with alpha are composited over random colours in training. Over white, white objects
-    are learnt as empty space and stay empty.
+    Unlike in the paper, images with alpha are composited over random colours in training. Over white, a model would
+    learn white objects as empty space, which stays empty.
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -75,23 +75,23 @@ class DNeRFConfig(
     hidden_width: int = 256
     """Features per layer of the canonical network."""
     deformation_layers: Auto[int] = AUTO
-    """Hidden layers of the deformation network. If not given: 8, or 4 with a hash grid."""
+    """Hidden layers of the deformation network. auto: 8, or 4 with a hash grid."""
     deformation_width: Auto[int] = AUTO
-    """Features per layer of the deformation network. If not given: 256, or 64 with a hash grid."""
+    """Features per layer of the deformation network. auto: 256, or 64 with a hash grid."""
     position_frequencies: int = 10
     """Number of frequencies in the encoding of positions."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions."""
     time_frequencies: Auto[int] = AUTO
-    """Number of frequencies in the encoding of times. If not given: 4, or 6 with a hash grid."""
+    """Number of frequencies in the encoding of times. auto: 4, or 6 with a hash grid."""
     deformation_frequencies: Auto[int] = AUTO
-    """Number of frequencies in the encoding of positions that the deformation network reads. If not given: those of
-    `position_frequencies`, or 4 with a hash grid."""
+    """Number of frequencies in the encoding of positions for the deformation network. auto: `position_frequencies`, or
+    4 with a hash grid."""
     ambient_dims: Auto[int] = AUTO
-    """Outputs of the deformation network that a hash grid's networks read beside the displaced position. If not given:
-    4 with a hash grid; none otherwise, as in the paper."""
+    """Further outputs of the deformation network, inputs of a hash grid's networks beside the displaced position. auto:
+    4 with a hash grid; otherwise none, as in the paper."""
     grid_learning_rate: float = 1e-2
-    """Initial learning rate of the hash grid and of the two networks that read it."""
+    """Initial learning rate of the hash grid and of the two networks on it."""
     max_resolution: int = 512
     """Cells per axis at the finest level of the hash grid."""
     log2_table_size: int = 16
@@ -99,14 +99,14 @@ class DNeRFConfig(
     sparse_updates: bool = True
     """Whether Adam updates only the entries of the hash grid that a step used."""
     grid_resolution: int = 64
-    """Cells per axis of the occupancy grid. A cell counts as occupied if it is at any time of its slice."""
+    """Cells per axis of the occupancy grid. A cell counts as occupied if it is so at any time of its slice."""
     from_first_image: bool = False
     """Whether nothing is displaced at time 0, as in the paper, so that the canonical field is the scene at that time.
-    If not, that image is one like the others."""
+    Otherwise the first image is treated like the others."""
 
 
 class DNeRF(MovingModel[DNeRFConfig], plain=True):
-    """A model of a scene that moves; of a scene without times, the canonical field alone."""
+    """A model of a moving scene; for a scene without times it is the canonical field alone."""
 
     losses = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES, TransparentOpacity())
     steps_repeat = True
@@ -116,7 +116,7 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     """Fill in the settings that depend on the scene.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     grid = config.canonical == "hash-grid" and not (scene.moving and config.variant == "t-nerf")
     network = f"the canonical field is a {'hash grid' if grid else 'network'}"
@@ -134,15 +134,15 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     )
     config, rates = fill(
         config,
-        Choice("lr_schedule", "hold-exponential" if grid else "exponential", network, "learning rate's schedule"),
-        Choice("lr_final", 0.02 if grid else 0.1, network, "learning rate at the end, of the first"),
+        Choice("lr_schedule", "hold-exponential" if grid else "exponential", network, "schedule of the learning rate"),
+        Choice("lr_final", 0.02 if grid else 0.1, network, "final learning rate, relative to the initial one"),
     )
     config, slices = fill(config, slices_choice(scene, config.sampler))
     made += rates * grid + slices * (config.time_slices > 1)
     config, steps = fill(
         config,
         Choice("num_steps", HASH_NUM_STEPS if grid else NUM_STEPS, network, "steps along the box's diagonal"),
-        Choice("eval_step_scale", 0.5 if grid else 1.0, "edges are sharper so", "length of a step in rendering"),
+        Choice("eval_step_scale", 0.5 if grid else 1.0, "edges are sharper", "length of a step in rendering"),
         Choice("thin_gradients", 0.5 if grid else 0.0, network),
     )
     made += steps * (grid and config.sampler == "occupancy")

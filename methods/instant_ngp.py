@@ -1,7 +1,7 @@
 """Instant-NGP: a multiresolution hash grid, two small networks and an occupancy grid.
 
 Mueller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding", SIGGRAPH 2022. With
-`--background-model sphere` a second grid shows what is outside of a sphere, as in NeRF++ (Zhang et al. 2020).
+`--background-model sphere` a second grid shows the outside of a sphere, as in NeRF++ (Zhang et al. 2020).
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ from nerfloom.samplers.choice import contracted_box
 from nerfloom.samplers.inside import make_foreground_sampler
 
 FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
-"""Seconds of training on two threads of a CPU, and pixels of the longer side of the images, from which `plan` counts.
-Its settings were found by trials on Lego, 400 x 400, after 15, 45, 150 and 300 s."""
+"""Reference for `plan`: seconds of training on two CPU threads, and pixels of the images' longer side. Its settings
+come from trials on Lego, 400 x 400, after 15, 45, 150 and 300 s."""
 TABLE_SECONDS, STEPS_SECONDS, LARGE_STEP_SECONDS = 60.0, 110.0, 300.0
-"""Seconds at which tables have 2^17 entries, from which steps along rays shorten, and at which a training step has 2^16
-samples. On Lego, 2^17 entries were 0.30 and 0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
+"""Seconds at which tables have 2^17 entries, after which steps along rays shorten, and at which a training step has
+2^16 samples. On Lego, 2^17 entries were 0.30 and 0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
 LEAST_SAMPLES, MOST_SAMPLES = 24 * 2**10, 2**16
-"""Samples of a step in the shortest time and the longest."""
+"""Samples per step in the shortest and in the longest time."""
 HASTE_SECONDS, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS = 15.0, 45.0, 150.0
-"""Seconds up to which a run is in all haste, from which it is in none, and from which 75 % of the time has one ray a
-pixel, where it is 90 % of shorter runs."""
+"""Runs up to the first number of seconds use the fastest settings, and runs beyond the second the usual ones. Training
+has one ray per pixel for 90 % of the time up to the second number, and for 75 % from the third on."""
 
 THIN = 0.5
-"""Share of the mean gradient below which samples are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
-steps without it, 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
+"""Samples below this fraction of the mean gradient are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
+steps without thinning, and 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
 
 SPARSE_FROM = 17
-"""log2 of the table size from which updates are sparse. On Lego, three runs of 45 s with 2^16 entries were 0.06, 0.23
-and 0.25 dB better with dense updates, which move rarely used entries further; after 300 s with 2^18 entries, sparse
-updates were 0.21 dB better."""
+"""log2 of the table size from which on updates are sparse. On Lego, three runs of 45 s with 2^16 entries were 0.06,
+0.23 and 0.25 dB better with dense updates, which move rarely used entries further. After 300 s with 2^18 entries,
+sparse updates were 0.21 dB better."""
 
 
 @dataclass(frozen=True)
@@ -75,22 +75,22 @@ class InstantNGPConfig(
     }
     """Allowed range of each numeric setting."""
     max_resolution: Auto[int] = AUTO
-    """Cells per axis at the finest level. If not given: a power of two, at least `detail` cells per pixel."""
+    """Cells per axis at the finest level. auto: a power of two, at least `detail` cells per pixel."""
     detail: Auto[int] = AUTO
-    """Cells of the finest level per pixel of the longer side of the images. If not given: depends on --max-seconds."""
+    """Cells of the finest level per pixel of the images' longer side. auto: depends on --max-seconds."""
     log2_table_size: Auto[int] = AUTO
-    """Maximum number of table entries per level, log2. If not given: depends on --max-seconds."""
+    """Maximum number of table entries per level, log2. auto: depends on --max-seconds."""
     sparse_updates: Auto[bool] = AUTO
-    """Whether Adam updates only the table entries that a step used. If not given: from 2^17 entries per level on."""
+    """Whether Adam updates only the table entries that a step used. auto: with 2^17 or more entries per level."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
     view_dependence: bool = True
-    """Whether colour depends on the viewing direction. Most scenes need it; False saves a few per cent of the time."""
+    """Whether colour depends on the viewing direction. Most scenes need it; False saves a few per cent of time."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings that suit a time. Small tables and batches learn fastest; large ones reach a higher PSNR."""
+    """Settings for a given time. Small tables and batches learn fastest; large ones reach a higher PSNR."""
 
     log2_table_size: int
     """log2 of the number of table entries per level."""
@@ -99,40 +99,40 @@ class Plan:
     samples: int
     """Samples per training step."""
     detail: int
-    """Cells of the finest level per pixel of the longer side of the images."""
+    """Cells of the finest level per pixel of the images' longer side."""
     learning_rate: float
     """Initial learning rate of Adam."""
     several_rays_from: float
-    """Fraction of the time after which several rays a pixel are trained."""
+    """Fraction of the time after which training uses several rays per pixel."""
     thin: float
-    """Share of the mean gradient below which samples are thinned."""
+    """Samples below this fraction of the mean gradient are thinned."""
     eval_step_scale: float
-    """Length of a step in rendering, relative to one in training."""
+    """Length of a step in rendering, relative to a training step."""
 
 
 def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
-    """Return the settings that suit a time and a size of images.
+    """Return the settings that suit a training time and an image size.
 
-    With twice the time tables double, to 2^17 entries after 60 s on two threads, from 2^16 to 2^18; so do the steps
-    along the diagonal and the cells of a pixel, to 704 and 2 after 150 s, from 512 and 1 after 45 s to 1,024 and 2.
-    The samples of a step grow with the square root of time, to 2^16 after 300 s, from 24,576. Images larger than
-    400 pixels, up to twice as large, have more for tables to hold, up to 2^19 entries after 600 s, and need as many
-    times longer before they get 2 cells a pixel.
+    Table sizes are proportional to the time, with 2^17 entries at 60 s on two threads, between 2^16 and 2^18. The steps
+    along the diagonal and the cells per pixel also grow: 512 and 1 at 45 s, 704 and 2 at 150 s, at most 1,024 and 2.
+    The samples per step grow with the square root of time, from 24,576 to 2^16 at 300 s. Images larger than 400 pixels,
+    up to twice as large, have more detail. Their tables grow up to 2^19 entries at 600 s, and they get 2 cells per
+    pixel correspondingly later.
 
-    Less than 45 s are made more of by larger and coarser steps: up to 15 s, twice the learning rate, twice the
-    thinning, and 384 steps along the diagonal, whose length rendering halves. Several rays a pixel are trained from
-    90 % of up to 45 s on, and from 75 % of 150 s.
+    Runs below 45 s use larger and coarser steps: up to 15 s, twice the learning rate, twice the thinning, and 384 steps
+    along the diagonal (halved in length for rendering). Training uses several rays per pixel after 90 % of the time in
+    runs up to 45 s, and after 75 % from 150 s on.
 
     Args:
-        seconds: maximum seconds of training; infinity without a maximum.
+        seconds: maximum training time, seconds; infinity without a limit.
         image_size: longer side of the largest image, pixels.
         speed: speed of this machine, relative to two threads of a CPU.
     """
     time, size = seconds * speed / FITTED_SECONDS, min(max(image_size / FITTED_PIXELS, 1.0), 2.0)
     longer = min(max(seconds * speed / STEPS_SECONDS, 1.0), 2.0)
-    share = (seconds * speed / LARGE_STEP_SECONDS) ** 0.5  # of the most samples
+    share = (seconds * speed / LARGE_STEP_SECONDS) ** 0.5  # of the maximum samples
     haste = way_between(seconds * speed, NO_HASTE_SECONDS, HASTE_SECONDS)
-    entries = max(min(seconds * speed / TABLE_SECONDS, 2.0), min(time, 2 * size), 0.5)  # in those of 2^17
+    entries = max(min(seconds * speed / TABLE_SECONDS, 2.0), min(time, 2 * size), 0.5)  # relative to 2^17
     return Plan(
         log2_table_size=17 + round(math.log2(entries)),
         num_steps=32 * round(16 * longer - 4 * haste),
@@ -146,14 +146,14 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
 
 
 def way_between(seconds: float, first: float, last: float) -> float:
-    """Return how far a time is on the way between two others, measured on the logarithm of time.
+    """Return the position of a time between two others on a logarithmic scale.
 
     Args:
         seconds: the time, seconds.
-        first, last: the others, seconds; `last` may be the earlier one.
+        first, last: the other times, seconds; `last` may be earlier.
 
     Returns:
-        0 at `first` and before it, 1 at `last` and beyond.
+        0 at or before `first`, 1 at or beyond `last`.
     """
     return min(max(math.log(seconds / first) / math.log(last / first), 0.0), 1.0)
 
@@ -162,12 +162,12 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
     """Fill in the settings that depend on the time budget and the scene.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     seconds = math.inf if config.max_seconds is None else config.max_seconds
     suited = plan(seconds, scene.image_size, relative_speed(config.machine))
     suits = "that suits the time" if seconds < math.inf else "there is time for it"
-    finer = suited.eval_step_scale if is_open(config.num_steps) else 1.0  # it makes up for longer steps in training
+    finer = suited.eval_step_scale if is_open(config.num_steps) else 1.0  # compensates for longer steps in training
     config, made = decide_background(config, scene)
     config, sizes = fill(
         config,
@@ -178,11 +178,11 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
     config, rates = fill(
         config,
         Choice("learning_rate", suited.learning_rate, suits),
-        Choice("train_rays_per_pixel_from", suited.several_rays_from, suits, "share of the time with one ray a pixel"),
+        Choice("train_rays_per_pixel_from", suited.several_rays_from, suits, "share of time with one ray per pixel"),
         Choice("eval_step_scale", finer, suits, "length of a step in rendering"),
         Choice("thin_gradients", suited.thin, suits, "gradients thinned, of the mean"),
     )
-    config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution that follows
+    config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution below
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
     pays = config.log2_table_size >= SPARSE_FROM
     config, more = fill(
@@ -196,7 +196,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
     )
     config, few = decide_few_images(config, scene)
-    hasty = suited.several_rays_from > plan(math.inf, scene.image_size).several_rays_from  # else all are as usual
+    hasty = suited.several_rays_from > plan(math.inf, scene.image_size).several_rays_from  # otherwise all are usual
     return config, made + sizes + more + few + (rates if hasty else [])
 
 
@@ -214,10 +214,10 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
 
 
 def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
-    """Return a field of the same sizes for what is outside of the sphere.
+    """Return a field of the same size for the outside of the sphere.
 
     Args:
-        config: the method's settings, none left open.
+        config: the method's settings, decided.
         scene: properties of the data; not used.
     """
     grid = HashGrid.of(config, config.open_levels_until)
@@ -225,7 +225,7 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
 
 
 class InstantNGP(RayModel[InstantNGPConfig], plain=True):
-    """A model that learns from colours alone, where no distances are known and samples are not proposed."""
+    """A model that learns from colours only, if there are no known distances and no proposals."""
 
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES)
     steps_repeat = True

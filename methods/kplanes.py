@@ -30,14 +30,14 @@ from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_bo
 from nerfloom.scene.motion import MotionConfig, slices_choice, vertices_in_time
 
 FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL = 2**14, 2**15, 75.0
-"""Samples of a training step of a still scene, in a short time and in a long one, and seconds from which on they grow.
-On Lego 2^14 and 2^15 samples gave 28.58 and 27.84 dB after 45 s, 32.70 and 33.18 dB after 150 s."""
+"""Samples per training step of a static scene, for short and long times, and the seconds after which they grow. On Lego
+2^14 and 2^15 samples gave 28.58 and 27.84 dB after 45 s, 32.70 and 33.18 dB after 150 s."""
 MOVING_SAMPLES, MOVING_SAMPLES_OF_A_GPU = 2**13, 2**16
-"""Samples of a training step of a scene that moves, on a CPU and on a GPU, whose steps cost little more for more."""
+"""Samples per training step of a moving scene, on a CPU and on a GPU, where more samples cost little."""
 NUM_STEPS, MOVING_NUM_STEPS = 512, 224
-"""Steps along the diagonal of the box, of a still scene and of one that moves."""
+"""Steps along the diagonal of the box, for static and for moving scenes."""
 MAX_SCALES = 4
-"""Maximum number of scales if the setting is left open; the paper's number."""
+"""Maximum number of scales if the setting is open; the paper's number."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +69,16 @@ class KPlanesConfig(
     }
     """Allowed range of each numeric setting."""
     decoder: Literal["hybrid", "explicit"] = "hybrid"
-    """hybrid: two small networks. explicit: density linear in the features, and a learned colour basis."""
+    """hybrid: two small networks. explicit: density linear in the features, and a learnt colour basis."""
     base_resolution: int = 64
     """Vertices per axis of space at the coarsest scale; each further scale has twice as many."""
     num_scales: Auto[int] = AUTO
-    """Number of scales. If not given: until the finest has a vertex per pixel of the images, but at most 4."""
+    """Number of scales. auto: until the finest has a vertex per image pixel, but at most 4."""
     time_resolution: Auto[int] = AUTO
-    """Vertices along the time axis at every scale; second differences need 3. If not given: a sixth of the number of
-    times of the images. The paper has half of it, for training that takes many times as long."""
+    """Vertices along the time axis at every scale, at least 3. auto: a sixth of the number of image times. The paper
+    uses half of that number, with many times longer training."""
     grid_resolution: Auto[int] = AUTO
-    """Cells along each axis of the occupancy grid (occupancy). If not given: 128, or 64 with slices of time."""
+    """Cells along each axis of the occupancy grid (occupancy). auto: 128, or 64 with time slices."""
     features_per_scale: int = 32
     """Features per vertex of a plane."""
     hidden_width: int = 64
@@ -88,13 +88,13 @@ class KPlanesConfig(
     time_smoothness: float = 0.1
     """Weight of the squared second differences of the planes along time."""
     time_sparsity: float = 1e-4
-    """Weight of the mean distance of the time planes from one, their value where nothing moves."""
+    """Weight of the mean distance of time planes from one, their value where nothing moves."""
     sparse_updates: bool = True
     """Whether Adam updates only the table entries that a step used."""
 
 
 class ExplicitField(BoxField):
-    """A field whose density is linear in the features, as is colour with a learned basis (section 3.4).
+    """A field with density linear in the features, and colour linear in them with a learnt basis (section 3.4).
 
     The basis is a small network of the direction.
 
@@ -120,11 +120,11 @@ class ExplicitField(BoxField):
 
 
 class PlaneRegularity(LossTerm):
-    """Total variation in space, roughness in time and distance of time planes from one (equations 4 to 6).
+    """Total variation in space, roughness in time, and distance of time planes from one (equations 4 to 6).
 
-    Each is a mean over planes, estimated without bias by what a step can afford to read: a random band of rows of each
-    space plane, and one of the time planes, whole. On a GPU all planes of time cost little more than one, and steps
-    that look at all of them can be recorded.
+    Each is a mean over planes, estimated without bias from a small part: a random band of rows of each space plane, and
+    one whole time plane. On a GPU all time planes cost little more than one, and a step that always reads all of them
+    can be captured.
     """
 
     def __init__(self) -> None:
@@ -146,8 +146,8 @@ class PlaneRegularity(LossTerm):
 
         Args:
             field: the field of planes.
-            zero: () the result where there are no planes of time.
-            turn: number, modulo theirs, of the plane of time; all if not given.
+            zero: () result if there are no time planes.
+            turn: index, modulo their number, of the time plane; None for all.
         """
         planes = field.encoding
         assert isinstance(planes, FeaturePlanes)
@@ -175,9 +175,9 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
     """Fill in the settings that depend on the scene.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
-    scales = 1  # until a plane has at least a vertex per pixel
+    scales = 1  # grows until a plane has at least a vertex per pixel
     while scales < MAX_SCALES and config.base_resolution << (scales - 1) < scene.image_size:
         scales += 1
     config, made = fill(
@@ -192,7 +192,7 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
         samples = Choice("samples_per_batch", count, "the scene moves", "samples a step")
     steps = Choice("num_steps", MOVING_NUM_STEPS if scene.moving else NUM_STEPS, "the scene moves")
     shorter = Choice(
-        "eval_step_scale", 0.5 if scene.moving else 1.0, "edges are sharper so", "length of a step in rendering"
+        "eval_step_scale", 0.5 if scene.moving else 1.0, "edges are sharper", "length of a step in rendering"
     )
     config, batch = fill(config, samples)
     config, paces = fill(config, steps, shorter)

@@ -1,8 +1,8 @@
-"""Mip-NeRF: one network that is asked about cones instead of points, against aliasing between scales.
+"""Mip-NeRF: one network evaluated for cones instead of points, against aliasing between scales.
 
-Barron et al., "Mip-NeRF: A Multiscale Representation for Anti-Aliasing Neural Radiance Fields", ICCV 2021. Its
-multiscale Blender images are made by `ns-train mip-nerf ... blender --multiscale 4`. With `--sampler occupancy`, space
-that is empty or hidden is skipped, as vanilla-nerf does.
+Barron et al., "Mip-NeRF: A Multiscale Representation for Anti-Aliasing Neural Radiance Fields", ICCV 2021.
+`ns-train mip-nerf ... blender --multiscale 4` makes its multiscale Blender images. With `--sampler occupancy`, empty
+and hidden space is skipped, as in vanilla-nerf.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_
 from nerfloom.samplers.proposal import half_edge
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
-"""Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""
+"""Samples per training step with the occupancy grid; the number of samples per ray varies a hundredfold."""
 OCCUPANCY_RATE = 2.0
-"""Factor of the learning rate with the occupancy grid, as for vanilla-nerf, whose steps have as many samples."""
+"""Factor of the learning rate with the occupancy grid, as in vanilla-nerf, whose steps have as many samples."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class MipNeRFConfig(
     hidden_width: int = 256
     """Features per layer."""
     position_frequencies: int = 16
-    """Number of frequencies in the integrated encoding of positions; those finer than a cone average to 0."""
+    """Number of frequencies in the integrated encoding of positions; frequencies finer than a cone average to 0."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions."""
 
 
 class MipNeRF(RayModel[MipNeRFConfig], plain=True):
-    """A model whose coarse level, the same network on the same rays, counts a tenth (section 3.3)."""
+    """A model whose coarse level, the same network on the same rays, has a weight of a tenth (section 3.3)."""
 
     losses = (COLOR_ERROR, CoarseColorError(0.1), SamplerLoss(), *KNOWN_DISTANCES)
     steps_repeat = True
@@ -68,7 +68,7 @@ def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Dec
     """Fill in the settings that depend on the scene.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     config, made = decide_sampler(config, scene)
     config, samples = decide_samples(config, OCCUPANCY_SAMPLES_PER_BATCH)
@@ -76,7 +76,7 @@ def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Dec
 
 
 def make_field(config: MipNeRFConfig, scene: Scene) -> Field:
-    """Return the network, of NeRF's shape, on the integrated encoding."""
+    """Return a network like NeRF's on the integrated encoding."""
     encoding = IntegratedEncoding(
         scene.box,
         config.position_frequencies,

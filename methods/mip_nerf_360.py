@@ -1,8 +1,8 @@
-"""Mip-NeRF 360: Gaussians in contracted space and an online proposal network, for scenes without bounds.
+"""Mip-NeRF 360: Gaussians in contracted space and an online proposal network, for unbounded scenes.
 
 Barron et al., "Mip-NeRF 360: Unbounded Anti-Aliased Neural Radiance Fields", CVPR 2022. `--encoding integrated` has the
-paper's networks, for a GPU. `--encoding hash-grid` puts the same ideas on hash grids (Mueller et al. 2022), for a
-processor: a grid's levels count less for Gaussians that are larger than their cells (Zip-NeRF, Barron et al. 2023).
+paper's networks, for a GPU. `--encoding hash-grid` applies the same ideas to hash grids (Mueller et al. 2022), for a
+CPU: levels have less weight for Gaussians larger than their cells (Zip-NeRF, Barron et al. 2023).
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ from nerfloom.samplers.proposal import LEARN_EVERY, half_edge
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""
 NETWORKS_FROM = 3600.0
-"""Seconds of training on a GPU from which on the paper's networks are taken. After 45 s on a data-centre GPU they had
-20.2 dB of a can, and hash grids 34.8 dB; longer runs were not measured."""
+"""Training time on a GPU, in seconds, from which on the default is the paper's networks. After 45 s on a data-centre
+GPU they reached 20.2 dB on a can, and hash grids 34.8 dB; longer runs were not measured."""
 PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
-"""Levels of the proposals' hash grids, cells per axis of the first, and entries of each at most, as a power of two."""
+"""Levels of the proposals' hash grids, cells per axis of the first level, and log2 of the entries per level."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class MipNeRF360Config(
 ):
     """Settings of mip-nerf-360; the defaults are the paper's, with an eighth of its rays and a quarter of its warm-up.
 
-    Not as in the paper: gradients are not clipped, and histograms are not dilated before intervals are drawn from them.
+    Unlike in the paper, gradients are not clipped, and histograms are not dilated before drawing intervals.
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -85,7 +85,7 @@ class MipNeRF360Config(
     encoding: Auto[Literal["integrated", "hash-grid"]] = AUTO
     """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
     distortion_loss_mult: Auto[float] = AUTO
-    """Weight of the distortion loss. If not given: 0.01 in unbounded scenes, else 0."""
+    """Weight of the distortion loss. auto: 0.01 in unbounded scenes, otherwise 0."""
     num_layers: int = 8
     """Layers of the network before its density output (integrated)."""
     hidden_width: int = 1_024
@@ -101,10 +101,10 @@ class MipNeRF360Config(
 
 
 class RobustColorError(ColorError):
-    """Smooth absolute error of colours where scenes have no bounds (section 5); else the mean of squares.
+    """Smooth absolute error of colours in unbounded scenes (section 5), otherwise the mean squared error.
 
-    In a box absolute errors are least in empty space if most of a picture is background, and from there nothing is
-    learnt any more.
+    In a box, if most of the image is background, an empty scene minimises absolute errors. Training cannot leave that
+    state.
     """
 
     def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
@@ -114,7 +114,7 @@ class RobustColorError(ColorError):
 
 
 class MipNeRF360(RefinedModel[MipNeRF360Config], plain=True):
-    """A model with a robust error of colours and the distortion of rays."""
+    """A model with a robust colour error and the distortion loss."""
 
     losses = (RobustColorError(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(of_marched=False))
     steps_repeat = True
@@ -124,7 +124,7 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
     """Fill in the settings that depend on the scene and on the machine.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     encoding, reason = "integrated", "a GPU runs the paper's networks"
     if device_kind(config.machine) == "cpu":
@@ -190,7 +190,7 @@ def _encoding(config: MipNeRF360Config, scene: Scene) -> IntegratedEncoding:
 
 
 def sampler(config: MipNeRF360Config, scene: Scene) -> Sampler:
-    """Return the configured sampler. The proposal network learns in every step, hash grids less often."""
+    """Return the configured sampler. A proposal network learns in every step, hash grids less often."""
     learn_every = 1 if config.encoding == "integrated" else LEARN_EVERY
     proposals = make_proposals(config, scene) if config.sampler == "proposal" else None
     return make_sampler(config, scene, proposals=proposals, learn_every=learn_every)

@@ -1,9 +1,9 @@
-"""NeRF++: two fields for captures without bounds, one inside of a sphere around the cameras and one outside of it.
+"""NeRF++: two fields for unbounded captures, one inside a sphere around the cameras and one outside.
 
 Zhang et al., "NeRF++: Analyzing and Improving Neural Radiance Fields", arXiv 2020. `--encoding frequency` has the
-paper's networks, NeRF's inside and one of the same shape on the inverted sphere outside, each coarse and fine: for a
-GPU. `--encoding hash-grid` puts the same two fields on hash grids (Mueller et al. 2022), with an occupancy grid inside:
-for a processor. Other methods take the background alone (`--background-model sphere`).
+paper's networks, for a GPU: NeRF's network inside, and one of the same shape on the inverted sphere outside, each
+coarse and fine. `--encoding hash-grid` uses hash grids (Mueller et al. 2022) for both fields, with an occupancy grid
+inside, for a CPU. Other methods can use the background alone (`--background-model sphere`).
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from nerfloom.samplers.choice import contracted_box, decide_samples
 from nerfloom.samplers.inside import make_foreground_sampler
 
 GRID_SAMPLES_PER_BATCH = 2**16
-"""Samples of a training step on hash grids, instant-ngp's."""
+"""Samples per training step on hash grids, as in instant-ngp."""
 
 
 @dataclass(frozen=True)
 class NeRFPlusPlusConfig(GridsConfig, VanillaNeRFConfig, num_rays_per_batch=1_024):
-    """Settings of nerf-plus-plus; those of the networks are vanilla-nerf's, which are the paper's too."""
+    """Settings of nerf-plus-plus; the network settings are vanilla-nerf's, as in the paper."""
 
     encoding: Literal["frequency", "hash-grid"] = "frequency"
-    """frequency: the paper's networks. hash-grid: hash grids with small networks, which learn in minutes on a CPU."""
+    """frequency: the paper's networks. hash-grid: hash grids with small networks, which train in minutes on a CPU."""
 
 
 def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene: a sphere, if there may be something outside of its box.
+    """Fill in the settings that depend on the scene, with a sphere if there may be something outside its box.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     grids = config.encoding == "hash-grid"
     config, made = decide_background(config, scene, "sphere", bounded="occupancy" if grids else None)
@@ -51,7 +51,7 @@ def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig
 
 
 def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
-    """Return the field inside of the sphere, or of all of the scene if there is no sphere."""
+    """Return the field inside the sphere, or of the whole scene if there is no sphere."""
     if config.encoding == "frequency":
         return vanilla_nerf.make_field(config, scene)
     scene = foreground(config, scene)
@@ -62,7 +62,7 @@ def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
 
 
 def make_background(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
-    """Return the field outside of the sphere, at points of the inverted sphere."""
+    """Return the field outside the sphere, at points of the inverted sphere."""
     if config.encoding == "frequency":
         return vanilla_nerf.make_background(config, scene)
     field = InvertedField(_grid(config), config.grid_width)

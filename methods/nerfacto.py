@@ -1,4 +1,4 @@
-"""Nerfacto: hash grid, contraction and proposal sampling for real captures; further parts depend on the data.
+"""Nerfacto: hash grid, contraction and proposal sampling for real captures; other parts depend on the data.
 
 Tancik et al., "Nerfstudio: A Modular Framework for Neural Radiance Field Development", SIGGRAPH 2023, section 4. Its
 parts: hash grid (Mueller et al. 2022); contraction, proposals and distortion loss (Barron et al. 2022); appearance
@@ -43,11 +43,11 @@ from nerfloom.samplers.choice import batch_choice, make_sampler
 from nerfloom.scene.reasons import LIGHT_REASONS
 
 APPEARANCE_SIZE = 16
-"""Default length of appearance vectors where the appearance varies."""
+"""Default length of appearance vectors if the appearance varies."""
 FEWEST_SAMPLES, FEWEST_UNTIL = 2**15, 150.0
-"""Samples of a training step with an occupancy grid over a box, and seconds on two threads up to which it has them."""
+"""Minimum samples per training step with an occupancy grid over a box, used up to this many seconds on two threads."""
 THIN = 0.5
-"""Share of the mean gradient below which such samples are thinned: 1.1 times the steps, with the same PSNR in 45 s."""
+"""Samples are thinned below this fraction of the mean gradient: 1.1 times the steps, with the same PSNR in 45 s."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class NerfactoConfig(
     eval_num_rays_per_chunk=4_096,
     thin_gradients=AUTO,
 ):
-    """Settings of nerfacto; those not given depend on the scene."""
+    """Settings of nerfacto; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
@@ -75,7 +75,7 @@ class NerfactoConfig(
     }
     """Allowed range of each numeric setting."""
     appearance_embedding_dim: Auto[int] = AUTO
-    """Length of each image's appearance vector. If not given: 16 if light or exposure differ between images, else 0."""
+    """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     predict_normals: bool = False
     """Whether to predict normals, which are smoother than those of the density's gradient."""
     orientation_loss_mult: float = 0.1
@@ -86,12 +86,12 @@ class NerfactoConfig(
 
 
 class NormalRenderer(VolumeRenderer):
-    """Volume rendering with predicted normals, and in training with their penalties.
+    """Volume rendering with predicted normals and, in training, their penalties.
 
     Args:
         normals: the network that predicts normals.
         unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
-        thin: share of the mean gradient below which samples are thinned; 0 for none.
+        thin: samples are thinned below this fraction of the mean gradient; 0 for none.
     """
 
     outputs = (NORMALS,)
@@ -117,7 +117,7 @@ class NormalRenderer(VolumeRenderer):
 
 
 class NormalPenalty(LossTerm):
-    """Penalty on predicted normals, a value a ray that the renderer computes."""
+    """Penalty on predicted normals; the renderer computes it per ray."""
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return model.config.predict_normals
@@ -151,7 +151,7 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     """Fill in the settings that depend on the scene.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
@@ -159,11 +159,11 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     config, made = decide_capture(config, scene, appearance)
     if config.sampler == "occupancy" and not config.contraction:
         config, samples = fill(config, batch_choice(config, FEWEST_SAMPLES, MARCHED_SAMPLES, FEWEST_UNTIL))
-        reason = "most samples that an occupancy grid chooses learn little"
+        reason = "most samples of an occupancy grid have small gradients"
         config, thinned = fill(config, Choice("thin_gradients", THIN, reason, "gradients thinned, of the mean"))
         made += samples + thinned
     else:
-        config, _ = fill(config, Choice("thin_gradients", 0.0, "all samples of proposals count"))
+        config, _ = fill(config, Choice("thin_gradients", 0.0, "proposals choose samples that matter"))
     config, few = decide_few_images(config, scene)
     return config, made + few
 
@@ -184,7 +184,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
 
 
 def sampler(config: NerfactoConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler, over all of space if it is contracted."""
+    """Return the configured sampler; it covers all of space if that is contracted."""
     return make_sampler(config, replace(scene, unbounded=config.contraction))
 
 

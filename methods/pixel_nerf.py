@@ -1,8 +1,8 @@
-"""PixelNeRF: one network for many scenes, which renders a new one from a few images, without training on it.
+"""PixelNeRF: one network for many scenes; it renders a new scene from a few images, without training on it.
 
-Yu et al., "pixelNeRF: Neural Radiance Fields from One or Few Images", CVPR 2021. It learns from data that shows many
-scenes, such as `ns-train pixel-nerf procedural --num-scenes 200 --size 32`, and is judged by scenes that it never saw.
-The image encoder is small and learnt from the start: no weights are shipped, ImageNet's neither.
+Yu et al., "pixelNeRF: Neural Radiance Fields from One or Few Images", CVPR 2021. It trains on data with many scenes,
+such as `ns-train pixel-nerf procedural --num-scenes 200 --size 32`, and is evaluated on scenes it has never seen. The
+image encoder is small and trained from scratch: no pretrained weights are shipped, not even ImageNet's.
 """
 
 from __future__ import annotations
@@ -69,8 +69,7 @@ class PixelNeRFConfig(
     num_coarse_samples: int = 32
     """Stratified intervals per ray (64 in the paper)."""
     num_fine_samples: int = 32
-    """Intervals per ray that are drawn from the weights of the coarse ones (16, and 16 around the depth, in the
-    paper)."""
+    """Intervals per ray drawn from the weights of the coarse ones (16, and 16 around the depth, in the paper)."""
     hidden_width: int = 64
     """Features per layer (512 in the paper)."""
     num_view_blocks: int = 3
@@ -78,11 +77,11 @@ class PixelNeRFConfig(
     position_frequencies: int = 6
     """Number of frequencies in the encoding of positions, in the frames of the source cameras."""
     encoder_widths: tuple[int, ...] = (32, 32, 64)
-    """Features of each level of the image encoder, from the finest; each further one is half as fine."""
+    """Features of each level of the image encoder, finest first; each has half the resolution of the one before."""
 
 
 class PixelNeRF(RayModel[PixelNeRFConfig]):
-    """A model of many scenes: its encoder sees images of a scene, and its field looks up their features.
+    """A model of many scenes: the encoder takes images of a scene, and the field looks up their features.
 
     Args:
         config: the method's settings, decided.
@@ -100,28 +99,28 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
         super().__init__(config, scene, field, sampler, renderer)
         self.encoder = ImageEncoder(config.encoder_widths)
         self.learnt: Dataset | None = None
-        """The training images: each may be rendered from others of its scene."""
+        """The training images; each can be rendered from others of its scene."""
         self.unseen: Dataset | None = None
-        """Images of further scenes, which are rendered from their source images."""
+        """Images of other scenes, which are rendered from their source images."""
 
     def show_images(self, dataset: Dataset) -> None:
-        """Take the images of `dataset` to render from: those of training, or of scenes beside those of training.
+        """Set the images to render from: `dataset` has the training images, or images of other scenes.
 
         Raises:
-            DataError: if there are fewer than two training images of a scene.
+            DataError: if a scene has fewer than two training images.
         """
         if dataset.source_images is not None:
             self.unseen = dataset
             return
         scenes = [None] if dataset.scene_indices is None else dataset.scene_indices.unique().tolist()
         if min(len(images_of(dataset, scene)) for scene in scenes) < 2:
-            raise DataError("pixel-nerf renders an image from others of its scene: it needs at least 2 of each")
+            raise DataError("pixel-nerf renders an image from others of its scene: each scene needs at least 2 images")
         self.learnt = dataset
 
     # -- source views -----------------------------------------------------------------------------------------
 
     def drawn_views(self, image: int) -> SourceViews:
-        """Return source views for learning a training image: others of its scene, drawn at random.
+        """Return source views for a training image: random other images of its scene.
 
         Args:
             image: index of the training image.
@@ -132,13 +131,13 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
         return self.encoded(dataset, others[torch.randperm(len(others))[: self.config.num_source_views]])
 
     def nearest_views(self, view: View) -> SourceViews:
-        """Return source views for rendering a `view`: of those of its scene, the nearest to it in direction."""
+        """Return source views for a `view`: the images of its scene nearest in direction."""
         dataset, pose = self._training_images(), view.camera.camera_to_worlds[0]
         if self.unseen is not None and view.scene is not None and len(images_of(self.unseen, view.scene)):
             dataset = self.unseen
         others = other_images(dataset, images_of(dataset, view.scene), pose)
         if not len(others):
-            raise DataError(f"pixel-nerf was shown no image of scene {view.scene}, and cannot render it")
+            raise DataError(f"pixel-nerf has no images of scene {view.scene}, and cannot render it")
         return self.encoded(dataset, nearest_in_direction(dataset, others, pose, self.config.num_source_views))
 
     def encoded(self, dataset: Dataset, images: Tensor) -> SourceViews:
@@ -158,10 +157,10 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
 
     @contextmanager
     def looking_at(self, views: SourceViews) -> Iterator[None]:
-        """Let the field look at source views.
+        """Set the field's source views within a `with` block.
 
         Args:
-            views: images of the scene that is rendered.
+            views: images of the rendered scene.
         """
         before, self.field.views = self.field.views, views
         try:
@@ -171,11 +170,11 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
 
     def _training_images(self) -> Dataset:
         if self.learnt is None:
-            raise ConfigError("pixel-nerf renders from images, and was shown none: it needs the data of its training")
+            raise ConfigError("pixel-nerf renders from images and has none: it needs its training data")
         return self.learnt
 
     def _looking(self) -> AbstractContextManager[None]:
-        """Look at evenly spread views of the first scene, if nothing else is looked at, as by exports."""
+        """Set evenly spread views of the first scene unless views are already set; for exports."""
         if self.field.views is not None:
             return nullcontext()
         images = images_of(self._training_images(), None)
@@ -185,7 +184,7 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
     # -- learning and rendering -------------------------------------------------------------------------------
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the loss of the pixels of a few images, each of which is rendered from others of its scene.
+        """Return the loss of pixels of a few images; each image is rendered from others of its scene.
 
         Args:
             batch: pixels with their true colours.
@@ -225,14 +224,14 @@ def make_field(config: PixelNeRFConfig, scene: Scene) -> PixelAlignedField:
         ConfigError: if rays are in normalised device coordinates, where images cannot be looked up.
     """
     if scene.warped:
-        raise ConfigError("pixel-nerf looks up positions in images: use --ndc False")
+        raise ConfigError("pixel-nerf does not work in normalised device coordinates: use --ndc False")
     blocks = config.num_view_blocks, BLOCKS_AFTER
     features, unit = sum(config.encoder_widths), half_edge(scene.box)
     return PixelAlignedField(features, unit, config.hidden_width, *blocks, config.position_frequencies)
 
 
 def sampler(config: PixelNeRFConfig, scene: Scene) -> Sampler:
-    """Return hierarchical sampling, whose coarse level is the field itself."""
+    """Return a hierarchical sampler with the field itself as its coarse level."""
     return HierarchicalSampler(None, config.num_coarse_samples, config.num_fine_samples)
 
 

@@ -29,14 +29,14 @@ from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
 
 BLIND_STEPS = 128
-"""Steps before the occupancy grid is updated: the field starts nearly empty, and would mark every cell as empty."""
+"""Steps before the first update of the occupancy grid: the field is nearly empty then, and would empty all cells."""
 FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
-"""Vertices per axis of the first and the last grid, if cubes (section 5)."""
+"""Vertices per axis of the first and the last grid, for a cubic box (section 5)."""
 VERTICES_PER_PIXEL = 2
-"""Maximum number of vertices per axis, per pixel of the images' longer side: the images cannot resolve more."""
+"""Maximum number of vertices per axis, per pixel of the images' longer side; the images do not resolve more."""
 FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL = 2**13, 2**15, 150.0
-"""Samples of a training step in a short time and in a long one, and seconds from which on they grow. On Lego 2^13 and
-2^14 samples gave 32.18 and 31.91 dB after 150 s."""
+"""Samples per training step for short and long times, and the seconds after which they grow. On Lego 2^13 and 2^14
+samples gave 32.18 and 31.91 dB after 150 s."""
 MARGIN = 1
 """Cells of the occupancy grid kept around the occupied ones when the box shrinks."""
 
@@ -69,22 +69,21 @@ class TensoRFConfig(
     network_learning_rate: float = 1e-3
     """Initial learning rate of the basis and the colour network."""
     decomposition: Literal["vm", "cp"] = "vm"
-    """vm: planes and lines. cp: lines alone, which take less than 4 MB and learn more slowly."""
+    """vm: planes and lines. cp: lines only, which take less than 4 MB and learn more slowly."""
     density_components: Auto[int] = AUTO
-    """Components of density per group. If not given: 16 (vm) or 96 (cp)."""
+    """Components of density per group. auto: 16 (vm) or 96 (cp)."""
     appearance_components: Auto[int] = AUTO
-    """Components of appearance per group. If not given: 48 (vm) or 288 (cp)."""
+    """Components of appearance per group. auto: 48 (vm) or 288 (cp)."""
     first_voxels: Auto[int] = AUTO
-    """Vertices of the first grid. If not given: 128^3, or fewer if the images cannot resolve as many."""
+    """Vertices of the first grid. auto: 128^3, or fewer if the images do not resolve as many."""
     last_voxels: Auto[int] = AUTO
-    """Vertices of the last grid. If not given: 300^3 (vm) or 500^3 (cp), or fewer as for --first-voxels."""
+    """Vertices of the last grid. auto: 300^3 (vm) or 500^3 (cp), or fewer if the images do not resolve as many."""
     upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
     """Fractions of the budget at which the grid grows, by equal ratios, and the box shrinks to occupied space."""
     sparsity: float = 8e-5
-    """Weight of the mean absolute values of the density factors; halved once the grid has grown."""
+    """Weight of the mean absolute values of the density factors; halved after the first growth."""
     total_variation: float = 0.0
-    """Weight of the total variation of the density factors; a tenth of it for appearance. Real scenes need 0.01 or
-    more."""
+    """Weight of the total variation of the density factors; appearance has a tenth. Real scenes need 0.01 or more."""
     hidden_width: int = 128
     """Features per hidden layer of the colour network."""
     sparse_updates: bool = True
@@ -92,7 +91,7 @@ class TensoRFConfig(
 
 
 class Sparsity(LossTerm):
-    """Mean magnitude of the factors of density (section 4.4), which counts half from the first growth on."""
+    """Mean magnitude of the density factors (section 4.4); its weight halves at the first growth."""
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         model = shown.model
@@ -103,7 +102,7 @@ class Sparsity(LossTerm):
 
 
 class TotalVariation(LossTerm):
-    """Total variation of the factors (section 4.4); those of appearance count a tenth."""
+    """Total variation of the factors (section 4.4); appearance factors have a tenth of the weight."""
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         field = shown.model.field
@@ -120,7 +119,7 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
 
     Args:
-        config: the method's settings, none left open.
+        config: the method's settings, decided.
         scene: properties of the data.
         field: the `TensorField`.
         sampler: chooses the samples along rays.
@@ -128,7 +127,7 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     """
 
     growths: Tensor
-    """Number of times that the grid has grown."""
+    """Number of growths so far."""
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *REGULARISERS, *FEW_IMAGES)
     steps_repeat = True
 
@@ -139,12 +138,12 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
 
     @property
     def has_grown(self) -> bool:
-        """True if the grid has grown."""
+        """True if the grid has grown at least once."""
         return self._growths.of(self.growths) > 0
 
     @property
     def factors(self) -> TensorField:
-        """The field, whose factors are resampled."""
+        """The field whose factors are resampled."""
         assert isinstance(self.field, TensorField)
         return self.field
 
@@ -158,10 +157,10 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
 
     def step_kind(self, step: int) -> StepKind:
         kind = super().step_kind(step)
-        return replace(kind, of=(*kind.of, self._growths.of(self.growths)))  # factors of another size
+        return replace(kind, of=(*kind.of, self._growths.of(self.growths)))  # the size of the factors
 
     def _shares(self) -> tuple[float, ...]:
-        """Return when the grid grows; with few images, the last time when the levels of other encodings are open."""
+        """Return when the grid grows. With few images, growth ends when other encodings have all levels open."""
         shares, until = self.config.upsample_at, self.config.open_levels_until
         return tuple(until / max(shares) * share for share in shares) if until and any(shares) else shares
 
@@ -180,9 +179,9 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
         field.box.copy_(box)
 
     def _occupied_box(self) -> Tensor:
-        """Return corners (2, 3) around all occupied cells and a margin; the field's box if no cell is occupied.
+        """Return corners (2, 3) around all occupied cells with a margin; the field's box if no cell is occupied.
 
-        Around nested boxes the field contracts space, and keeps its box.
+        With nested boxes the field contracts space and keeps its box.
         """
         sampler, box = self.sampler, self.factors.box
         if not isinstance(sampler, SkipsCells) or self.factors.unbounded:
@@ -196,7 +195,7 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
     """Fill in the settings that depend on the scene and on the resolution of the images.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     density, appearance = (16, 48) if config.decomposition == "vm" else (96, 288)
     resolved = VERTICES_PER_PIXEL * scene.image_size
@@ -224,7 +223,7 @@ def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     """
     axes = VM if config.decomposition == "vm" else CP
     counts = config.density_components, config.appearance_components
-    for voxels in (config.first_voxels, config.last_voxels):  # check both now: the last is made late in training
+    for voxels in (config.first_voxels, config.last_voxels):  # check both now: the last grid is made late in training
         layout = PlanesLayout.build((cubic_vertices(voxels, scene.box),) * len(axes), axes)
         require(4.0 * layout.num_entries * sum(counts), "a grid")
     vertices = (cubic_vertices(config.first_voxels, scene.box),) * len(axes)
@@ -236,7 +235,7 @@ def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     field.optimised = Optimised("networks", learning_rate=config.network_learning_rate)
     for factors in (density, appearance):
         factors.optimised = Optimised("tables", config.learning_rate, sparse=config.sparse_updates)
-        with torch.no_grad():  # CP multiplies three factors, which are larger, as in the authors' code
+        with torch.no_grad():  # CP multiplies three factors, so they start larger, as in the authors' code
             factors.table.normal_(0, 0.1 if config.decomposition == "vm" else 0.2)
     return field
 

@@ -1,9 +1,8 @@
 """NeRF: large networks on frequency encodings, with coarse and fine sampling.
 
-Mildenhall et al., "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis", ECCV 2020. With
-`--sampler occupancy`, one network of the same shape is sampled with an occupancy grid instead, which skips empty and
-hidden space (as in NerfAcc, Li et al. 2023). With `--background-model sphere` a second network shows what is outside
-of a sphere, as in NeRF++ (Zhang et al. 2020).
+Mildenhall et al., "NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis", ECCV 2020. With `--sampler
+occupancy`, a single network with an occupancy grid skips empty and hidden space (as in NerfAcc, Li et al. 2023). With
+`--background-model sphere` a second network shows the outside of a sphere, as in NeRF++ (Zhang et al. 2020).
 """
 
 from __future__ import annotations
@@ -27,14 +26,15 @@ from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_
 from nerfloom.samplers.inside import make_foreground_sampler
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
-"""Samples of a training step with the occupancy grid, where the number of samples per ray varies a hundredfold."""
+"""Samples per training step with the occupancy grid; the number of samples per ray varies a hundredfold."""
 """Reason for a fixed number of samples, rather than of rays, per training step."""
 OCCUPANCY_RATE = 2.0
 """Factor of the learning rate with the occupancy grid. On Lego after 90 s on two cores, smaller batches and longer
-marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 512 steps and the paper's rate, 17 dB."""
+marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 512 steps and the paper's rate reached 17
+dB."""
 
 OPEN_UNTIL = 0.5
-"""Share of the budget in which frequencies open if there are few images, as in FreeNeRF's shorter Blender settings."""
+"""Fraction of the budget in which frequencies open with few images, as in FreeNeRF's shorter Blender settings."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
     """Fill in the settings that depend on the scene.
 
     Returns:
-        Settings without open ones, and a record of each that was filled in.
+        Settings without open ones, and a record of each setting that was filled in.
     """
     config, made = decide_background(config, scene)
     config, few = decide_few_images(config, scene, OPEN_UNTIL)
@@ -82,15 +82,15 @@ def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, 
 
 
 def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
-    """Return the network of the fine field; the coarse one has the same shape."""
+    """Return the fine network; the coarse one has the same shape."""
     return _network(config, contracted=contracted_box(config, foreground(config, scene)))
 
 
 def make_background(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
-    """Return the network of what is outside of the sphere, at points of the inverted sphere.
+    """Return the network for the outside of the sphere, at points of the inverted sphere.
 
     Args:
-        config: the method's settings, none left open.
+        config: the method's settings, decided.
         scene: properties of the data; not used.
     """
     return _network(config, dims=4)
@@ -118,7 +118,7 @@ def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
 
 
 class VanillaNeRF(RayModel[VanillaNeRFConfig], plain=True):
-    """A model whose coarse and fine colours are compared with the images (section 5.3)."""
+    """A model whose coarse and fine colours are both compared with the images (section 5.3)."""
 
     losses = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES)
     steps_repeat = True

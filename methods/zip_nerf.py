@@ -1,11 +1,15 @@
-"""Zip-NeRF: a hash grid that sees cones, with multisampling, features weighted by scale, and anti-aliased proposals.
+"""Zip-NeRF: a hash grid for cones, with multisampling, features weighted by scale, and anti-aliased proposals.
 
-Barron et al., "Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields", ICCV 2023. Sizes are for a processor: tables
-of 2^18 entries and grids of up to 2048 cells an axis, where the paper has 2^21 and 8192. The networks are nerfacto's.
-Other than in the paper, a scene that ends at its box is sampled by an occupancy grid, proposals are looked up at one
-point of each interval and the grid does not decay if not asked for, the loss of colours is the mean squared error, the
-networks are not told of levels' weights, gradients are scaled down near cameras (Philip and Deschaintre 2023), and an
-image's exposure is an affine transform of its colours.
+Barron et al., "Zip-NeRF: Anti-Aliased Grid-Based Neural Radiance Fields", ICCV 2023. Sizes are for a CPU: tables of
+2^18 entries and grids of up to 2048 cells per axis, where the paper has 2^21 and 8192. The networks are nerfacto's.
+Further differences from the paper:
+
+- A scene that ends at its box is sampled with an occupancy grid.
+- Proposals are looked up at one point per interval, and the grid does not decay, unless selected.
+- The colour loss is the mean squared error.
+- The networks do not get the levels' weights.
+- Gradients near cameras are scaled down (Philip and Deschaintre 2023).
+- An image's exposure is an affine transform of its colours.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.scene.reasons import LIGHT_REASONS
 
 SAMPLES_PER_BATCH = 2**14
-"""Samples a training step with an occupancy grid over a box."""
+"""Samples per training step with an occupancy grid over a box."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class ZipNeRFConfig(
     features_per_level=4,
     thin_gradients=0.5,
 ):
-    """Settings of zip-nerf; those not given depend on the scene."""
+    """Settings of zip-nerf; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "power_ladder": (-1e3, 1),
@@ -67,19 +71,19 @@ class ZipNeRFConfig(
     }
     """Allowed range of each numeric setting."""
     power_ladder: float = -1.5
-    """Exponent of the power ladder by which distances are spaced where space is contracted."""
+    """Exponent of the power ladder that spaces distances if space is contracted."""
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
-    """Radius of the box that blurs the samples' histogram in the loss of each proposal, in normalised distance."""
+    """Radius of the box filter on the samples' histogram in each proposal's loss, in normalised distance."""
     hash_decay_mult: float = 0.0
     """Weight of the mean square of each level's features. The paper has 0.1, and 10 for objects, which suits its 25,000
-    steps of 65,536 rays and its loss, whose gradient is larger; in a run of minutes 0.1 costs 0.6 to 1.4 dB."""
+    steps of 65,536 rays and its loss with a larger gradient; in runs of minutes, 0.1 costs 0.6 to 1.4 dB."""
     exposure: Auto[bool] = AUTO
-    """Whether each image has an affine transform of colours. If not given: if light or exposure differ between them."""
+    """Whether each image has an affine transform of colours. auto: if light or exposure differ between images."""
     exposure_learning_rate: float = 1e-3
     """Initial learning rate of these transforms."""
     multisampled_proposals: bool = False
-    """Whether the proposals, too, are looked up at several points of each interval, in grids of one feature per vertex,
-    as in the paper, not at one point and two features. The paper's grids are of up to 512 and 2048 cells an axis."""
+    """Whether proposals are also looked up at several points per interval, in grids of one feature per vertex, as in
+    the paper; otherwise at one point, with two features. The paper's grids have up to 512 and 2048 cells per axis."""
     num_proposal_levels: int = 5
     """Number of levels of each proposal's hash grid."""
     proposal_resolutions: tuple[int, ...] = (128, 256)
@@ -99,7 +103,7 @@ class ZipNeRFConfig(
 
 
 class ZipNeRF(RefinedModel[ZipNeRFConfig]):
-    """A model with exposures of images, refined poses and the distortion loss."""
+    """A model with exposures per image, refined poses and the distortion loss."""
 
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, Distortion())
     steps_repeat = True
@@ -136,7 +140,7 @@ def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
 
 
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
-    """Return proposals with the anti-aliased loss for `scene`, or the sampler that `config` names."""
+    """Return proposals with the anti-aliased loss for `scene`, or the sampler named by `config`."""
     scene = replace(scene, unbounded=config.contraction)
     if config.sampler != "proposal":
         return make_sampler(config, scene)

@@ -62,7 +62,7 @@ def test_a_later_run_decodes_nothing_and_says_so(
     assert "decoding them once into" in capsys.readouterr().err.replace("\n", " ")
     monkeypatch.setattr("nerfloom.data.decoding.read_image", lambda *_: pytest.fail("decoded again"))
     second = cached(scene, folder)
-    assert "that an earlier run decoded into" in capsys.readouterr().err.replace("\n", " ")
+    assert "using decoded pixels of an earlier run" in capsys.readouterr().err.replace("\n", " ")
     assert torch.equal(first.pixels, second.pixels)
 
 

@@ -77,7 +77,7 @@ def test_alpha_shows_what_is_empty_so_that_fewer_images_are_few() -> None:
 
 
 def test_no_view_between_cameras_in_normalised_device_coordinates_or_in_motion() -> None:
-    with pytest.raises(ConfigError, match="no rays in normalised device coordinates"):
+    with pytest.raises(ConfigError, match="do not work in normalised device coordinates"):
         decided("nerfacto", 3, dataclasses.replace(CAPTURE, warped=True, unbounded=False), unseen_loss_mult=0.1)
     assert not decided("kplanes", 3, dataclasses.replace(CAPTURE, moving=True))[0].few_images
 

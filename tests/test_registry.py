@@ -210,5 +210,5 @@ def test_recognition(shared_tiny: Path, tmp_path: Path) -> None:
         find_data(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"a{100}\.\.\.$"):  # an error of a line, however long the name
         find_data(tmp_path / ("a" * 5000))
-    with pytest.raises(DataError, match="no known data format"):
+    with pytest.raises(DataError, match="format is unknown"):
         find_data(tmp_path)

@@ -94,7 +94,7 @@ def test_each_number_makes_a_model_or_one_line(method: str) -> None:
         ("kplanes", {"num_scales": 17}, "--num-scales is 17; it must be from 1 to 16"),
         ("tensorf", {"last_voxels": 2**40}, "--last-voxels is 1099511627776; it must be from 8 to 1073741824"),
         ("vanilla-nerf", {"hidden_width": 10**7}, "--hidden-width is 10000000; it must be from 2 to 16384"),
-        ("nerfacto", {"num_proposal_samples": [8] * 30}, "must name 1 to 8 proposals"),
+        ("nerfacto", {"num_proposal_samples": [8] * 30}, "takes 1 to 8 numbers"),
         ("nerfacto", {"machine": {"seed": 2**64}}, "seed"),
     ],
 )

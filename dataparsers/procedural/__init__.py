@@ -1,8 +1,8 @@
-"""The embedded scene: solids with exact depth and normals, rendered in seconds, used if no data is given.
+"""The embedded scene: solids with exact depth and normals, rendered in seconds; used if no data is given.
 
-It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, else XDG_CACHE_HOME, else
-~/.cache), and read from there. With `--num-scenes` there are many random scenes instead, for methods that learn from
-scenes.
+It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, otherwise XDG_CACHE_HOME,
+otherwise ~/.cache), and read from there. `--num-scenes` renders many random scenes instead, for methods that learn from
+several scenes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from nerfloom.data.dataset import Split
 from nerfloom.dataparsers.blender import Blender
 
 VERSION = 1
-"""Version of the scene's appearance; raised whenever it changes, so that old caches are not used."""
+"""Version of the scene's appearance; increase it with every change, so that old caches are not used."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,16 @@ class Procedural(DataParser):
     moving: bool = False
     """Use the moving variant of the scene."""
     scene_seed: int = 0
-    """Seed of the camera positions, and of random scenes."""
+    """Seed of the camera positions and of random scenes."""
     num_scenes: int = 1
-    """Number of scenes to learn from; with more than one, each is another random arrangement of balls and boxes, and
-    the held-out images are of further ones."""
+    """Number of training scenes. With more than one, each is a random arrangement of balls and boxes, and the held-out
+    images show further scenes."""
     views_per_scene: int = 12
-    """Images of each of many scenes. Of a held-out scene every fourth is judged, and the others are given."""
+    """Images of each random scene. Of a held-out scene, every fourth is evaluated and the others are sources."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
-        return False  # it has no data folder
+        return False  # there is no data folder
 
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is not None:
@@ -80,7 +80,7 @@ class Procedural(DataParser):
 
     def _render(self, folder: Path) -> None:
         if self.num_scenes > 1:
-            from nerfloom.dataparsers.procedural.many import write_scenes  # only if something must be rendered
+            from nerfloom.dataparsers.procedural.many import write_scenes  # imported only to render
 
             views = self.views_per_scene
             write_scenes(
@@ -94,7 +94,7 @@ class Procedural(DataParser):
 
 
 def _of_many(parsed: ParsedScene, split: Split) -> ParsedScene:
-    """Return parsed images with the scenes that they show."""
+    """Return parsed images with the indices of their scenes."""
     from nerfloom.dataparsers.procedural.many import what_is_shown
 
     numbers, given = what_is_shown(parsed.image_paths, split)

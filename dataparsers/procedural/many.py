@@ -1,7 +1,7 @@
-"""Many random scenes: balls and boxes of random size, place and colour, for methods that learn from scenes.
+"""Many random scenes: balls and boxes of random size, position and colour, for methods that learn from several scenes.
 
-A data set has scenes to learn from and, in its other splits, scenes that are in no other split. Of these, every fourth
-view is judged; the others are what a method is given to render it from.
+A data set has training scenes and, in its other splits, scenes that are in no other split. Of these, every fourth view
+is evaluated; the others are source images.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from nerfloom.dataparsers.procedural.shapes import Box, Shape, Sphere
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, complete_folder, render_view
 
 UNSEEN = {"val": 4, "test": 8}
-"""Number of scenes of the splits that nothing is learnt from."""
+"""Number of held-out scenes of each split."""
 JUDGED_EVERY = 4
-"""Distance between the views of such a scene that are judged."""
+"""Distance between evaluated views of a held-out scene."""
 FEWEST, MOST = 2, 5
 """Number of solids in a scene."""
 REACH = 1.35
@@ -35,11 +35,11 @@ REACH = 1.35
 
 
 def random_parts(seed: int, scene: int) -> Parts:
-    """Return the solids of a scene; they may intersect, and all are matte.
+    """Return the solids of a scene; they are matte and may intersect.
 
     Args:
         seed: seed of the data set.
-        scene: number of the scene.
+        scene: index of the scene.
     """
     random = np.random.default_rng([seed, scene])
     return {f"solid {index}": _random_part(random) for index in range(random.integers(FEWEST, MOST + 1))}
@@ -49,7 +49,7 @@ def _random_part(random: np.random.Generator) -> Part:
     size = random.uniform(0.0, 1.0)
     shape: Shape = Sphere(0.25 + 0.25 * size) if random.random() < 0.5 else Box(0.2 + 0.2 * size)
     direction = random.normal(size=3)
-    distance = (REACH - shape.bound) * random.uniform() ** (1 / 3)  # uniform in the ball that it fits into
+    distance = (REACH - shape.bound) * random.uniform() ** (1 / 3)  # uniform in the ball where it fits
     x, y, z = (distance * direction / np.linalg.norm(direction)).tolist()
     colour = colorsys.hsv_to_rgb(random.uniform(), random.uniform(0.5, 1.0), random.uniform(0.3, 0.9))
     return Part(shape, (x, y, z), random.uniform(0.0, math.pi / 2), partial(_plain, colour), 0.0)
@@ -61,11 +61,11 @@ def _plain(colour: Colour, p: Tensor) -> Tensor:
 
 
 def scene_numbers(split: str, num_scenes: int) -> range:
-    """Return the numbers of the scenes that a split shows; no scene is in two splits.
+    """Return the indices of a split's scenes; no scene is in two splits.
 
     Args:
         split: train, val or test.
-        num_scenes: number of scenes to learn from.
+        num_scenes: number of training scenes.
     """
     if split == "train":
         return range(num_scenes)
@@ -74,14 +74,14 @@ def scene_numbers(split: str, num_scenes: int) -> range:
 
 
 def what_is_shown(paths: tuple[Path, ...], split: str) -> tuple[Tensor, Tensor | None]:
-    """Return which scene each image shows, and which images a method is given without being judged by them.
+    """Return the scene of each image, and which images are sources that are not evaluated.
 
     Args:
-        paths: M images that `write_scenes` has written.
+        paths: M images written by `write_scenes`.
         split: their split.
 
     Returns:
-        (M,) int64 numbers of the scenes; and (M,) bool, or None for the scenes to learn from.
+        (M,) int64 indices of the scenes; and (M,) bool, or None for training scenes.
     """
     numbers = torch.tensor([[int(number) for number in path.stem.split("_")[1::2]] for path in paths])
     given = numbers[:, 1] % JUDGED_EVERY != JUDGED_EVERY - 1
@@ -102,7 +102,7 @@ def write_scenes(
     Args:
         folder: folder to create. If another process creates it meanwhile, its content is kept.
         size: width and height of the images, pixels.
-        num_scenes: number of scenes to learn from.
+        num_scenes: number of training scenes.
         views: number of views of each scene.
         seed: seed of the scenes and the cameras. The same seed gives the same bytes.
         progress: wrapper of the iteration over scenes, called with the iterable, a title and the number of scenes.
@@ -125,7 +125,7 @@ def write_scenes(
 
 
 def _write_scene(folder: Path, scene: int, size: int, views: int, seed: int) -> list[dict[str, Any]]:
-    """Write the images of a scene, and return what the JSON file says of them."""
+    """Write the images of a scene and return their entries for the JSON file."""
     folder.mkdir(parents=True, exist_ok=True)
     parts, frames = random_parts(seed, scene), []
     for index, pose in enumerate(camera_poses("train", views, seed * 1_000_003 + scene)):

@@ -1,9 +1,8 @@
 """The embedded scene: solids with procedural textures in sunlight, ray traced in closed form.
 
 Coordinates are scene units with z up; everything lies strictly inside +-1.4. Depth, normals and occupancy are exact up
-to rounding in the floating point type of the rays, so the scene is also the ground truth of the accuracy tests. Colours
-are display values in [0, 1], as stored in a PNG. Vectors are (3, R) in this file; the public functions take and return
-(R, 3).
+to rounding in the floating point type of the rays, so the scene is also the ground truth of accuracy tests. Colours are
+display values in [0, 1], as stored in a PNG. Vectors are (3, R) in this file; public functions take and return (R, 3).
 """
 
 from __future__ import annotations
@@ -151,7 +150,7 @@ PARTS: dict[str, Part] = {
     "string": Part(Cylinder(0.015, 0.11), (0.0, 0.0, 0.39), 0.0, lambda p: _blend(_BRASS, _BRASS, p[0]), 0.0),
     "bob": Part(Sphere(0.13), (0.0, 0.0, 0.16), 0.0, _bob_texture, 0.0),
 }
-"""The solids of the embedded scene by name; the ball and the box are those that can move."""
+"""The solids of the embedded scene by name; the ball and the box can move."""
 _LIGHT_AZIMUTH, _LIGHT_HEIGHT = math.radians(-118.0), math.radians(54.0)
 LIGHT: Colour = (  # unit vector towards the sun
     math.cos(_LIGHT_HEIGHT) * math.cos(_LIGHT_AZIMUTH),
@@ -314,7 +313,7 @@ def trace_rows(
         parts: the solids of the scene.
 
     Returns:
-        As `trace`, but normals and rgb as (3, R).
+        Same as `trace`, but normals and rgb are (3, R).
     """
     poses = _poses(time, directions, parts)
     depth, part_index = _first_hits(poses, origins, directions)
@@ -339,8 +338,8 @@ def trace(origins: Tensor, directions: Tensor, time: float | Tensor = 0.0) -> Hi
     """Return the first surface along each ray.
 
     Args:
-        origins: (R, 3) outside of the solids; a ray that starts inside a solid does not hit that solid.
-        directions: (R, 3) unit vectors of the same floating point type, in which everything is computed: float64 is
+        origins: (R, 3) outside the solids; a ray that starts inside a solid does not hit that solid.
+        directions: (R, 3) unit vectors of the same floating point type. All computations use this type: float64 is
             exact to about 1e-9, float32 to about 1e-5.
         time: in [0, 1], a number or (R,); 0 is the static scene.
     """

@@ -23,7 +23,7 @@ class Shape(Protocol):
     """A solid around the origin. Points, offsets and directions are (3, R), distances and parameters (R,).
 
     A line is `offset + t * direction`, where `offset` is its point closest to the origin (perpendicular to the unit
-    `direction`); with this origin, all quadratics and quartics below are well conditioned.
+    `direction`). With this choice, all quadratics and quartics below are well conditioned.
     """
 
     @property
@@ -161,7 +161,7 @@ class Torus(Shape):
     Args:
         major: radius of the circle in the middle of the tube.
         minor: radius of the tube.
-        half: whether to keep only the part with z > 0, an arch whose feet are inside another solid.
+        half: whether to keep only the part with z > 0, an arch with its feet inside another solid.
     """
 
     major: float

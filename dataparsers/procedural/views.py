@@ -1,4 +1,4 @@
-"""Views of the embedded scene, and the data set that consists of them."""
+"""Views of the embedded scene, and the data set made of them."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def camera_poses(split: str, count: int, seed: int) -> list[npt.NDArray[np.float
     heights = low + (high - low) * (np.arange(count) + random.uniform(0.2, 0.8, count)) / count
     golden = math.pi * (3.0 - math.sqrt(5.0))
     azimuths = random.uniform(0, 2 * math.pi) + golden * np.arange(count) + random.uniform(-0.2, 0.2, count)
-    order = random.permutation(count)  # so that a moving scene is seen from high and low at all times
+    order = random.permutation(count)  # a moving scene is seen from high and low at all times
     return [camera_pose(azimuths[index], math.asin(heights[index])) for index in order]
 
 
@@ -197,7 +197,7 @@ def write_dataset(
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """Give the temporary name of a folder, which is renamed to `folder` when all is written, or removed if it fails.
+    """Yield a temporary folder that is renamed to `folder` on success and removed on failure.
 
     Args:
         folder: folder to create. If another process creates it meanwhile, its content is kept.
@@ -212,7 +212,7 @@ def complete_folder(folder: Path) -> Iterator[Path]:
         try:
             temporary.rename(folder)
         except OSError:
-            if not folder.is_dir():  # otherwise another process was faster, with the same bytes
+            if not folder.is_dir():  # otherwise another process was faster and wrote the same bytes
                 raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

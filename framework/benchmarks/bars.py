@@ -1,4 +1,4 @@
-"""Bar charts of the times of kernels, compiled and in torch, with the machine's limits."""
+"""Bar charts of kernel times, compiled and in torch, with the machine's limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits of a device, with which the times of kernels are compared: copying, matrix products and gathers."""
+"""Limits of a device for comparison with kernel times: copying, matrix products and gathers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from nerfloom.benchmarks.timing import now
 
 TABLES = (1, 8, 64)
-"""Sizes of the tables from which is gathered, MiB."""
+"""Sizes of the tables for gathers, MiB."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Work:
     gathers: float = 0.0
     """Number of reads of 8 bytes at random places."""
     table_bytes: float = 0.0
-    """Size of the table from which is gathered, bytes."""
+    """Size of the table for gathers, bytes."""
     flops: float = 0.0
-    """Floating-point operations of matrix products; a multiplication and an addition are two."""
+    """Floating-point operations of matrix products; a multiplication and an addition count as two."""
     bfloat16: bool = False
     """Whether the products are in bfloat16."""
 
@@ -47,7 +47,7 @@ class Ceilings:
         """Measure the limits on torch's default device, each as the best of eight runs.
 
         Args:
-            copied: number of values that are copied.
+            copied: number of values to copy.
             edge: rows and columns of the matrices.
         """
         source = torch.rand(copied)
@@ -67,10 +67,10 @@ class Ceilings:
         )
 
     def seconds(self, work: Work) -> float:
-        """Return the seconds of the slowest part of some `work` at its maximum rate.
+        """Return the seconds of the slowest part of `work` at its maximum rate.
 
         For gathers, the rate is that of random reads from the smallest measured table that is large enough. Neighbours
-        in space read many of the same entries, so that a kernel can be faster.
+        in space share many entries, so a kernel can be faster.
         """
         size = next((size for size in TABLES if size * 2**20 >= work.table_bytes), TABLES[-1])
         products = self.bfloat16 if work.bfloat16 else self.float32

@@ -1,4 +1,4 @@
-"""A compiled kernel beside its torch reference: runs of both, and their errors against float64."""
+"""A compiled kernel and its torch reference: runs of both, and their errors against float64."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from nerfloom.benchmarks.timing import Run, differentiated
 class Errors:
     """Relative errors against float64.
 
-    The maximum error of a gradient would say little, as gradients are discontinuous at faces of cells and with ReLU.
+    The maximum error of a gradient would say little, because gradients are discontinuous at faces of cells and with
+    ReLU.
     """
 
     value: float
     """Maximum error over the maximum value."""
     gradient: float | None
-    """Root mean square of the error over that of the gradient, for the worst input; None without gradients."""
+    """Root mean square error divided by that of the gradient, for the worst input; None without gradients."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,13 @@ def of_function(
     work: Work,
     backward: bool = True,
 ) -> Kernel:
-    """Return the kernel `name`, a function of tensors, of which the first has a row per sample.
+    """Return the kernel `name`, a function of tensors whose first argument has a row per sample.
 
     Args:
         inputs: arguments of both functions.
         compiled, reference: the functions.
         work: work of the forward pass per sample.
-        backward: whether the backward pass is measured too.
+        backward: whether to measure the backward pass too.
     """
     return Kernel(
         name,

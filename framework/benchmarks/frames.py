@@ -1,4 +1,4 @@
-"""Pictures a second of trained runs, in colour, along the cameras of their held-out images."""
+"""Frames per second of trained runs, in colour, along the cameras of their held-out images."""
 
 from __future__ import annotations
 
@@ -21,46 +21,46 @@ from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.trained import load_trained
 
 WARM_UP = 4
-"""Pictures before those that are measured."""
+"""Number of pictures before the measurement."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Seconds of the pictures of one run at one size."""
+    """Rendering times of one run at one size."""
 
     run: str
-    """Last three folders of the run: data, method and time."""
+    """Last three folders of the run's path: data, method and time."""
     method: str
     """Name of the method."""
     num_gaussians: int | None
-    """Number of its Gaussians; None of other methods."""
+    """Number of Gaussians; None for other methods."""
     width: int
     """Width of the pictures, pixels."""
     height: int
-    """Height of the first one, pixels."""
+    """Height of the first picture, pixels."""
     threads: int
     """Number of CPU threads."""
     pictures: int
     """Number of pictures."""
     per_second: float
-    """Pictures a second: their number over the sum of their seconds."""
+    """Pictures per second: their number over the sum of their seconds."""
     median: float
     """Median of the seconds of a picture."""
     slowest: float
     """Longest time of a picture, seconds."""
     kernels: dict[str, float]
-    """Mean seconds of a picture in each compiled kernel, by its name."""
+    """Mean seconds per picture in each compiled kernel, by name."""
 
 
 @torch.no_grad()
 def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count: int) -> list[Frames]:
-    """Draw pictures of a trained run on the CPU and measure how long each takes.
+    """Render pictures of a trained run on the CPU and measure the time of each.
 
     Args:
         run: the run's folder.
         widths: widths of the pictures, pixels; heights follow from the cameras.
         threads: numbers of CPU threads.
-        count: number of pictures at each size, of as many held-out cameras in turn.
+        count: number of pictures at each size, one held-out camera after another.
     """
     trained = load_trained(run, device_type="cpu")
     model, cameras = trained.model, trained.run.parse("test").cameras

@@ -1,4 +1,4 @@
-"""Kernels on a GPU, with their errors, torch's times and the device's limits; steps as CUDA graphs; PSNR by seconds."""
+"""Kernels on a GPU, with errors, torch's times and the device's limits; steps as CUDA graphs; PSNR over time."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from nerfloom.training.trainer import Trainer
 COPIED, EDGE = 2**28, 8192
 """Values copied, and rows of the matrices multiplied, to measure a GPU's limits."""
 METHODS = ("instant-ngp", "gaussian-splatting")
-"""Methods that are trained."""
+"""Methods to train."""
 MOMENTS = (2, 5, 15, 60)
 """Seconds of training after which the PSNR is reported."""
 BINS = 64
-"""Intervals of a ray."""
+"""Intervals per ray."""
 SCENES = {"nerfacto": ball_under_a_sky, "instant-ngp": ball_in_a_box}
 """Methods whose steps are timed as CUDA graphs, and the scene of each."""
 SIZE = 200
@@ -57,14 +57,14 @@ SIZE = 200
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a benchmark that has a limit of time."""
+    """A part of a benchmark, under a common time limit."""
 
     name: str
-    """What it measures, in words."""
+    """Description of the measurement."""
     least: float
-    """Seconds that must be left for it to begin."""
+    """Minimum remaining seconds to start it."""
     measure: Callable[[float], dict[str, Any]]
-    """Function from the seconds that are left to its results, as plain data."""
+    """Function from the remaining seconds to its results, as plain data."""
 
 
 def in_time(
@@ -73,13 +73,14 @@ def in_time(
     keep: Callable[[dict[str, Any]], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Measure parts in their order, and leave out those for which too little time is left.
+    """Measure parts in order, and skip those for which too little time remains.
 
     Args:
-        parts: the parts, the most important first.
-        limit: seconds for all of them.
-        keep: called with all results so far after each part, also one that is left out; so an error later loses none.
-        clock: seconds since any moment.
+        parts: the parts, most important first.
+        limit: total seconds.
+        keep: called with all results so far after each part, including skipped ones, so that a later error loses
+            nothing.
+        clock: seconds since an arbitrary moment.
     """
     start, found, late = clock(), dict[str, Any](), list[str]()
     for part in parts:
@@ -93,13 +94,13 @@ def in_time(
 
 
 def measured_kernels(device: torch.device, samples: int, repeats: int, seconds: float = math.inf) -> dict[str, Any]:
-    """Measure every kernel on a device, and print a table; the errors first, as they matter most.
+    """Measure every kernel on a device and print a table; errors come first, because they matter most.
 
     Args:
         device: the device.
         samples: number of samples in a batch.
-        repeats: number of runs, of which medians are taken.
-        seconds: after which no further kernel is timed.
+        repeats: number of runs for medians.
+        seconds: time after which no further kernel is timed.
 
     Returns:
         The machine, its limits, the names of kernels that were not timed, and a row for each kernel, as plain data.
@@ -186,16 +187,16 @@ def along_rays(count: int) -> Iterator[Kernel]:
 
 
 def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) -> list[dict[str, Any]]:
-    """Time training steps of nerfacto and instant-ngp, as they are and repeated as CUDA graphs.
+    """Time training steps of nerfacto and instant-ngp, unchanged and repeated as CUDA graphs.
 
     Args:
         device: the device.
-        before: steps before those that are timed, in which kernels are compiled and steps are recorded.
-        steps: steps that are timed.
+        before: untimed steps at the beginning, in which kernels are compiled and steps are captured.
+        steps: number of timed steps.
         settings: settings of the methods other than their defaults.
 
     Returns:
-        A row for each, as plain data: milliseconds a step, how many steps were repeated, and the PSNR of batches, which
+        A row for each, as plain data: milliseconds per step, number of repeated steps, and the PSNR of batches, which
         should agree.
     """
     return [_timed(method, mode, device, before, steps, settings) for method in SCENES for mode in ("off", "auto")]
@@ -248,7 +249,7 @@ def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:
 
 
 def reached(rows: Sequence[Compared]) -> list[dict[str, Any]]:
-    """Return what the methods reached, as plain data.
+    """Return the methods' results as plain data.
 
     Args:
         rows: rows of the comparison's table.
@@ -268,7 +269,7 @@ def reached(rows: Sequence[Compared]) -> list[dict[str, Any]]:
 
 
 def psnr_at(curve: Curve, seconds: float) -> float | None:
-    """Return the PSNR, dB, of the last evaluation that was not later than some `seconds`; None before the first.
+    """Return the PSNR, dB, of the last evaluation within `seconds`; None before the first.
 
     Args:
         curve: pairs of seconds of training and PSNR, in order.

@@ -1,8 +1,8 @@
-"""Inputs of every operation that Triton has a kernel for: random ones, extreme ones, and none.
+"""Inputs of every operation with a Triton kernel: random, extreme and empty ones.
 
-An extreme input has what a run meets rarely and must survive: densities and lengths without bound, light that is spent,
-positions on faces, outside and infinitely far, rays that miss, Gaussians behind the camera or without size. A case is a
-function of named tensors, whose type and device decide which implementation runs.
+An extreme input has values that are rare in a run but must be survived: unbounded densities and lengths, exhausted
+light, positions on faces, outside and infinitely far, rays that miss, Gaussians behind the camera or without size. A
+case is a function of named tensors, whose type and device determine the implementation.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ WIDTHS, REACHES = [Record.U_X, Record.V_Y], [Record.REACH_X, Record.REACH_Y]
 
 @dataclass(frozen=True)
 class Case:
-    """An operation at some inputs."""
+    """An operation with given inputs."""
 
     kernel: str
     """Name of the operation in the table of operations."""
@@ -64,7 +64,7 @@ class Case:
 
 
 def cases() -> Iterator[Case]:
-    """Yield all cases, those of an operation one after another."""
+    """Yield all cases, grouped by operation."""
     torch.manual_seed(0)
     for kernel, run, followed, inputs in (*_along_rays(), *_at_points(), *_marched(), *_projected(), *_on_images()):
         for kind, given in zip(KINDS, inputs, strict=True):
@@ -166,7 +166,7 @@ def _at_points() -> Iterator[Family]:
     poles = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
     usual, hard, none = ({"directions": rows} for rows in (unit, poles, unit[:0]))
     yield "spherical_harmonics", lambda directions: (spherical_harmonics(directions, 4),), "", (usual, hard, none)
-    bits = (torch.randn(90, 3) * 256).round() / 256  # few, so that x times 2^k is the same angle in both types
+    bits = (torch.randn(90, 3) * 256).round() / 256  # few bits, so that x times 2^k is the same angle in both types
     far = torch.tensor([[0.0, 8191, -100.5], [1e-30, 2.0**-20, 4096]])
     usual, hard, none = ({"x": rows} for rows in (bits, far, bits[:0]))
     yield "frequency_encoding", lambda x: (frequency_encoding(x, 6),), "x", (usual, hard, none)
@@ -198,7 +198,7 @@ def _grid(like: Tensor, full: bool = True) -> Occupancy:
 
 
 def _marched() -> Iterator[Family]:
-    """Marches through a full grid, where no step depends on rounding but the last; and what follows them."""
+    """Marches through a full grid, where only the last step depends on rounding, and the operations after them."""
 
     def rays(origins: Tensor, directions: Tensor) -> Rays:
         return Rays(origins, directions, torch.full_like(origins[:, 0], 0.1), torch.full_like(origins[:, 0], 20.0))
@@ -213,7 +213,7 @@ def _marched() -> Iterator[Family]:
         return counts, places
 
     def in_slots(origins: Tensor, directions: Tensor) -> Sequence[Tensor]:
-        if not len(origins):  # which the sampler does not ask for
+        if not len(origins):  # the sampler never calls it without rays
             return (origins,)
         grid = _grid(origins, full=bool((origins[:, 0] < 50).all()))
         found = fill(rays(origins, directions), grid, STEP, STEPS, None, (4096, 2048)).placed
@@ -286,7 +286,7 @@ def _on_images() -> Iterator[Family]:
         return found
 
     def listed(records: Tensor) -> Sequence[Tensor]:
-        """Which Gaussian is in the list of the tile that its centre is in, and how it is ordered there."""
+        """Return which Gaussian is in the list of the tile with its centre, and its order there."""
         lists: TileLists = tile_lists(records, WIDTH, HEIGHT)
         sizes, last = lists.offsets.diff().long(), len(lists.ids)
         tiles = torch.repeat_interleave(sizes, output_size=last)

@@ -1,7 +1,7 @@
-"""Largest errors of Triton's kernels, values and gradients, against the references in float64.
+"""Maximum errors of Triton's kernels, values and gradients, against the references in float64.
 
-On a GPU the kernels run there, otherwise in Triton's interpreter, on the CPU, in a process of its own: Triton must know
-before it is imported whether it interprets.
+On a GPU the kernels run there. Otherwise they run in Triton's interpreter on the CPU, in a separate process, because
+Triton must know before its import whether it interprets.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from nerfloom.kernels import dispatch, triton_backend
 from nerfloom.kernels.dispatch import Operation
 
 LEAST = 1e-6
-"""Largest value below which an error is reported relative to this instead."""
+"""For values below this, errors are reported relative to this instead."""
 LARGEST_FLOAT = torch.finfo(torch.float32).max
 
 
@@ -42,9 +42,9 @@ class Error:
     kind: str
     """random, extreme or empty."""
     value: float
-    """Largest error of a value, relative to the largest value; infinity where a value is not finite and should be."""
+    """Maximum error of a value, relative to the largest value; infinity if a value is not finite but should be."""
     gradient: float | None
-    """Largest error of a gradient likewise; None without gradients."""
+    """Maximum error of a gradient, relative to the largest; None without gradients."""
 
 
 def measured(device: torch.device) -> list[Error]:
@@ -54,13 +54,13 @@ def measured(device: torch.device) -> list[Error]:
         device: the GPU, or the CPU if Triton interprets.
 
     Raises:
-        ConfigError: if an operation of Triton's has no case, or is not the one that runs.
+        ConfigError: if a Triton operation has no case or did not run.
     """
     found = [_of_case(case, device) for case in cases()]
     table = dispatch.table()
     missing = {name for name, backends in table.items() if "triton" in backends} - {each.kernel for each in found}
     if missing:
-        raise ConfigError(f"kernel_cases.py has no inputs of {', '.join(sorted(missing))}; add them")
+        raise ConfigError(f"kernel_cases.py has no inputs for {', '.join(sorted(missing))}; add them")
     return found
 
 
@@ -76,7 +76,7 @@ def _of_case(case: Case, device: torch.device) -> Error:
     with patch.object(Operation, "choose", noted):
         values, gradients = _computed(case, device, torch.float32)
     if (case.kernel, "triton") not in taken and case.kind != "empty":
-        raise ConfigError(f"{case.kernel} on {device.type} was not computed by Triton but by {sorted(taken)}")
+        raise ConfigError(f"{case.kernel} on {device.type} was computed by {sorted(taken)}, not by Triton")
     exact_values, exact_gradients = _computed(case, torch.device("cpu"), torch.float64)
     slopes = [largest_error(*pair) for pair in zip(gradients, exact_gradients, strict=True)]
     errors = [largest_error(*pair) for pair in zip(values, exact_values, strict=True)]
@@ -94,7 +94,7 @@ def _computed(case: Case, device: torch.device, kind: torch.dtype) -> tuple[list
     random, total = torch.Generator().manual_seed(7), torch.zeros((), dtype=kind, device=device)
     for result in results:
         factors = (torch.rand(result.shape, generator=random) * 2 - 0.5).to(result)
-        if result.requires_grad:  # what is infinite or NaN would hide all gradients
+        if result.requires_grad:  # infinite or NaN results would hide all gradients
             total = total + (result * factors).masked_fill(~result.detach().isfinite(), 0).sum()
     gradients = torch.autograd.grad(total, followed, allow_unused=True)
     zeros = [torch.zeros_like(leaf) for leaf in followed]
@@ -102,18 +102,18 @@ def _computed(case: Case, device: torch.device, kind: torch.dtype) -> tuple[list
 
 
 def largest_error(value: Tensor, truth: Tensor) -> float:
-    """Return the largest error relative to the largest value; infinity where only one of the two is finite.
+    """Return the maximum error relative to the largest value; infinity where only one of the two is finite.
 
     Args:
-        value: what was computed.
-        truth: what is true, of the same shape.
+        value: computed values.
+        truth: true values, of the same shape.
     """
     value, truth = value.detach().double().cpu(), truth.detach().double().cpu()
     if value.shape != truth.shape:
         return float("inf")
     if not truth.numel():
         return 0.0
-    truth = torch.where(truth.abs() > LARGEST_FLOAT, truth.sign() * torch.inf, truth)  # which float32 does not hold
+    truth = torch.where(truth.abs() > LARGEST_FLOAT, truth.sign() * torch.inf, truth)  # out of range of float32
     odd = ~truth.isfinite()
     if not torch.equal(odd, ~value.isfinite()):
         return float("inf")
@@ -155,7 +155,7 @@ def _shown(row: Error) -> str:
 
 
 def faster_interpreter() -> None:
-    """Let Triton's interpreter replace Triton's functions once a file; at each call it takes most of the time."""
+    """Make Triton's interpreter replace Triton's functions once per file; at each call it takes most of the time."""
     from triton.language import core
     from triton.runtime import interpreter
 
@@ -169,7 +169,7 @@ def faster_interpreter() -> None:
         if id(function.__globals__) not in replaced:
             replaced.add(id(function.__globals__))
             replace(function)
-            # Triton 3.6's takes arrays of one number for numbers, which numpy 2.4 refuses.
+            # Triton 3.6's converts arrays of one number to numbers, which numpy 2.4 refuses.
             core.tensor.__index__ = lambda self: int(self.handle.data.squeeze())
         return Kept()
 

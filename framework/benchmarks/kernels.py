@@ -1,4 +1,4 @@
-"""Time and error of each compiled kernel and of its torch reference, with the machine's limits.
+"""Time and error of each compiled kernel and its torch reference, with the machine's limits.
 
 Both run in one process, in turn, on one thread and on all. Errors of both are against float64. NERFLOOM_KERNELS=avx2 in
 the environment selects that variant.
@@ -52,10 +52,10 @@ LENSES: tuple[tuple[str, list[float]], ...] = (
 
 @dataclass(frozen=True)
 class Row:
-    """Measurements of `kernel` with `count` units per run on some `threads`; times are ns per `unit`.
+    """Measurements of `kernel` with `count` units per run on `threads` threads; times are ns per `unit`.
 
-    Times are `forward` and `backward`, the reference's `reference_forward` and `reference_backward`; `errors` and
-    `reference_errors` are those of each.
+    Times are `forward` and `backward`, and the reference's `reference_forward` and `reference_backward`; `errors` and
+    `reference_errors` are the errors of each.
     """
 
     kernel: str
@@ -79,7 +79,7 @@ def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
 
     Args:
         samples: number of samples in a batch.
-        repeats: number of runs, of which medians are taken.
+        repeats: number of runs for medians.
 
     Returns:
         The rows, and rows, machine and limits as plain data.
@@ -88,7 +88,7 @@ def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
         ConfigError: if there are no compiled kernels.
     """
     if not native.available():
-        raise ConfigError("there are no compiled kernels to measure; reinstall nerfloom with a C++ compiler at hand")
+        raise ConfigError("there are no compiled kernels to measure; install a C++ compiler and reinstall nerfloom")
     threads, ceilings, rows = torch.get_num_threads(), Ceilings.measured(), []
     for line in ceilings.lines():
         say(f"ceiling: {line}")
@@ -167,7 +167,7 @@ def kernels(count: int) -> Iterator[Kernel]:
 
 
 def on_any_device(count: int) -> Iterator[Kernel]:
-    """Yield the kernels that processors and GPUs have, on torch's default device, with batches of `count` samples."""
+    """Yield the kernels for both CPUs and GPUs, on torch's default device, with batches of `count` samples."""
     torch.manual_seed(0)
     positions = rays_and_positions(count)[1]
     for log2 in (15, 17, 19):
@@ -198,7 +198,7 @@ def on_any_device(count: int) -> Iterator[Kernel]:
 
 
 def rays_and_positions(count: int) -> tuple[Rays, Tensor]:
-    """Return rays through the unit box, and `count` positions, 16 close together per ray as in a trained scene."""
+    """Return rays through the unit box, and `count` positions, with 16 close together per ray as in a trained scene."""
     origins = normalize(torch.randn(count // 16, 3), dim=-1) * 2 + 0.5
     directions = normalize(torch.rand(count // 16, 3) - origins, dim=-1)
     rays = Rays(origins, directions, torch.zeros(count // 16), torch.full((count // 16,), 9.0))
@@ -214,7 +214,7 @@ Described = tuple[list[Tensor], Callable[..., Tensor], Callable[..., Tensor], Wo
 def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
     layout = HashGridLayout.build(16, 16, 1024, log2)
     values = torch.randn(layout.num_entries, 2)
-    # Without gradients of positions, as in most fields, they are detached.
+    # As in most fields, there are no gradients of positions, so they are detached.
     attached = (lambda x: x) if of_positions else torch.Tensor.detach
     return (
         [positions, values],
@@ -225,7 +225,7 @@ def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
 
 
 def _multisampled(count: int) -> Described:
-    """Look up 6 points around each position, as far apart as those of frustums, with deviations of half of that."""
+    """Look up 6 points around each position, spaced like those of frustums, with half of that as deviations."""
     layout, spread = HashGridLayout.build(8, 16, 2048, 18), 0.003
     values = torch.randn(layout.num_entries, 4)
     around = rays_and_positions(count)[1][:, None] + spread * torch.randn(count, 6, 3)
@@ -239,7 +239,7 @@ def _multisampled(count: int) -> Described:
 
 
 def _blurring(rays: int) -> Kernel:
-    """Compute the loss of 64 proposed intervals on each ray against 32 that are blurred: Zip-NeRF's."""
+    """Compute Zip-NeRF's loss of 64 proposed intervals per ray against 32 blurred ones."""
     edges, proposed = (torch.rand(rays, bins + 1).sort(dim=-1).values for bins in (32, 64))
     weights, given = (normalize(torch.rand(rays, bins), p=1, dim=-1) for bins in (32, 64))
 
@@ -293,7 +293,7 @@ def _compositing(count: int) -> Described:
 
 
 def _plane_lookup(name: str, layout: PlanesLayout, features: int, count: int) -> Kernel:
-    """Compare with torch's `grid_sample`; the limit is copying, as the features of a corner are adjacent."""
+    """Compare with torch's `grid_sample`; the limit is copying, because the features of a corner are adjacent."""
     positions = torch.rand(count, layout.dims)
     values = torch.rand(layout.num_entries, features) + 0.5
     gradient = torch.randn(count, layout.num_groups * features)
@@ -350,13 +350,13 @@ def _updating() -> Kernel:
 
         return step
 
-    work = Work(bytes=4 * (2 * 4 + 1) * 2)  # 2 values, gradients and moments of both kinds, and uses: read and written
+    work = Work(bytes=4 * (2 * 4 + 1) * 2)  # 2 values, gradients, moments of both kinds, and counts: read and written
     runs = steps(sparse_adam), steps(sparse_adam_reference)
     return Kernel("sparse Adam, half of 2^19 x 2", "entry", updated, runs, work)
 
 
 def _similarity() -> Kernel:
-    """Compute the loss of an image of 400 x 400, absolute error and SSIM; the forward pass has the derivative too."""
+    """Compute the loss of a 400 x 400 image, absolute error and SSIM; the forward pass includes the derivative."""
     target = torch.nn.functional.avg_pool2d(torch.rand(3, 406, 406), 7, 1).permute(1, 2, 0).contiguous()
     image = (target + 0.05 * torch.randn_like(target)).clamp(0, 1)
 

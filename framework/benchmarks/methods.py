@@ -19,7 +19,7 @@ STANDARD = (
     "vanilla-nerf --sampler occupancy",
     "dnerf --sampler occupancy --canonical hash-grid",
 )
-"""All built-in methods, with the flags with which they are meant to be used on a CPU."""
+"""All built-in methods, with their recommended flags for a CPU."""
 
 
 def standard_plan(data: Path | None, max_seconds: float, repeats: int, folder: Path) -> Plan:
@@ -56,7 +56,7 @@ def published(folder: Path) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Write the report's plot of time against error as a file; report it if it cannot be drawn.
+    """Write the report's plot of time against error to a file; report it if that fails.
 
     Args:
         rows: rows of the comparison's table.

@@ -1,4 +1,4 @@
-"""Features of planes and lines by torch's `grid_sample`, with which the compiled lookup is compared."""
+"""Features of planes and lines by torch's `grid_sample`, for comparison with the compiled look-up."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nerfloom.kernels.grids.planes import PlanesLayout
 
 
 def layouts() -> list[tuple[str, PlanesLayout, int]]:
-    """Return names, layouts and features per group of K-Planes, still and moving, and of TensoRF."""
+    """Return names, layouts and features per group of K-Planes, static and moving, and of TensoRF."""
     scales = tuple((64 << s,) * 3 for s in range(4))
     moving = tuple((64 << s,) * 3 + (25,) for s in range(4))
     vm = (((0, 1), (2,)), ((0, 2), (1,)), ((1, 2), (0,)))
@@ -42,7 +42,7 @@ def grid_samples(positions: Tensor, images: list[Tensor], layout: PlanesLayout) 
 
     Args:
         positions: (N, D) positions in [0, 1].
-        images: factors as from `planes_of`.
+        images: factors from `planes_of`.
         layout: axes and resolutions of the factors.
     """
     remaining, groups = iter(images), []

@@ -1,4 +1,4 @@
-"""Time of a training step: of each compiled kernel of the CPU, and of Python and torch."""
+"""Time of a training step, in each compiled CPU kernel and in Python and torch."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from nerfloom.training.machine import kernels, machine
 from nerfloom.training.run import Run
 
 MEASURED, FEWEST, LONGEST = 200, 8, 30.0
-"""Number of steps over which times are averaged; fewer, but not fewer than the second, where they take longer than the
+"""Number of steps over which times are averaged; fewer, but at least the second number, if they take longer than the
 third, seconds."""
 
 
 def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
-    """Train a method, measure `MEASURED` further steps at most, and print a line for each kernel of the CPU.
+    """Train a method, measure up to `MEASURED` further steps, and print a line for each CPU kernel.
 
     Args:
-        run: what to train.
+        run: the run to train.
         steps: training steps before the measurement, in which the occupancy grid finds empty space.
-        max_seconds: time budget, seconds, for which the method chooses its settings.
+        max_seconds: time budget, seconds, for the method's choice of settings.
 
     Returns:
         Milliseconds per step, in total and by kernel, as plain data.

@@ -1,7 +1,7 @@
-"""The kernels of Gaussian splatting and their references, as `ns-bench kernels` measures them.
+"""The kernels of Gaussian splatting and their references, in the form for `ns-bench kernels`.
 
-A pair is a Gaussian and a pixel that it is blended into. What is evaluated and then found to be below the cutoff is
-part of the time per pair, not of their number.
+A pair is a Gaussian and a pixel it is blended into. Evaluations that turn out to be below the cutoff count for the time
+per pair, not for the number of pairs.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_refe
 COUNT, WIDTH, HEIGHT = 20_000, 300, 300
 """Gaussians, and the image's size in pixels."""
 BOUND = 20.0
-"""Addend to the exponent of the cutoff where errors are measured: whether a pixel is within must not matter there."""
+"""Added to the exponent of the cutoff for error measurements, where it must not matter whether a pixel is within."""
 
 
 def splatting() -> Iterator[Kernel]:
-    """Yield projection, lists of tiles, and blending, of 20 000 Gaussians on an image of 300 x 300."""
+    """Yield projection, tile lists, and blending, of 20 000 Gaussians on a 300 x 300 image."""
     camera = SplatCamera(torch.eye(3, 4), (300.0, 300.0, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
     centers, sizes = torch.randn(COUNT, 3) * 0.5 + torch.tensor([0.0, 0.0, 3.0]), torch.randn(COUNT, 3) * 0.5 - 4
     shades = torch.randn(COUNT, 3), torch.randn(COUNT, 3, 15) * 0.1

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def now() -> float:
-    """Return the time in seconds when all work that the GPU was given is done."""
+    """Return the time in seconds, after waiting for all work on the GPU."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -32,11 +32,11 @@ class Times:
     reference: list[float]
     """Median seconds of each stage of the second."""
     speed_up: float
-    """Median ratio of the second's time to the first's, of neighbouring runs with all stages."""
+    """Median ratio of the second's time to the first's, over neighbouring runs with all stages."""
 
 
 def alternating(compiled: Run, reference: Run, repeats: int) -> Times:
-    """Run two implementations in turn, after a run of each to warm up.
+    """Run two implementations in turn, after a warm-up run of each.
 
     Args:
         compiled: the first implementation.
@@ -72,8 +72,8 @@ def differentiated(
     Args:
         function: the function.
         inputs: its arguments, which require gradients.
-        gradient: gradient of the function's value; ones if None.
-        backward: whether the backward stage is run.
+        gradient: gradient of the function's value; None for ones.
+        backward: whether to run the backward stage.
     """
 
     def timed() -> list[float]:

@@ -1,4 +1,4 @@
-"""The trainer of benchmarks of speed."""
+"""The trainer for benchmarks of speed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def default_run(method: str, data: Path) -> Run:
 
     Args:
         method: name of the method.
-        data: folder of the data set, whose format is recognised.
+        data: folder of the data set; its format is detected.
 
     Raises:
         DataError: if no format recognises the data.
@@ -28,13 +28,13 @@ def default_run(method: str, data: Path) -> Run:
 
 
 def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:
-    """Return a trainer with the settings for a time budget, but without the budget.
+    """Return a trainer with the settings for a time budget, but without the budget itself.
 
-    With a budget, the learning rate would fall over time, and a run that reached its end would not be typical.
+    With a budget, the learning rate would fall over time, and a run that reaches its end would not be typical.
 
     Args:
-        run: what to train; its own budget and folder are not used.
-        seconds: time budget, seconds, for which the method chooses its settings.
+        run: the run to train; its own budget and folder are not used.
+        seconds: time budget, seconds, for the method's choice of settings.
         folder: folder in which the run's folder is created.
     """
     config = dataclasses.replace(run.config, vis="none", max_seconds=seconds)

@@ -1,9 +1,9 @@
 """Camera paths in files: the camera_path.json that nerfstudio's viewer writes, read and written.
 
-Poses are camera-to-world matrices with OpenGL axes in the frame of the trained scene, after the data format has placed
-the input, as in nerfstudio. A capture is placed here by nerfstudio's rules, and NeRF-Synthetic data not at all, so that
-a path made there for the same data shows the same here. A file of ours also holds the placement that it was made with
-(`placement`, which nerfstudio ignores), and fits a run of the same data that is placed in another way.
+Poses are camera-to-world matrices with OpenGL axes, in the frame of the trained scene after the data format has placed
+the input, as in nerfstudio. Captures are placed by nerfstudio's rules and NeRF-Synthetic data is not moved, so a path
+made in nerfstudio shows the same views here. Files written here also hold the placement of their scene (`placement`,
+which nerfstudio ignores). So they fit a run of the same data with another placement.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ ANGLES = (0.01, 179.0)
 SPEEDS = (0.01, 1000.0)
 """Range of the number of frames per second."""
 PANORAMA_FOV = 90.0
-"""Field of view that is written for a panorama, which does not use it, degrees."""
+"""Field of view written for a panorama, degrees; panoramas do not use it."""
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A camera that a user has placed, and between which an editor interpolates."""
+    """A camera placed by a user; an editor interpolates between keyframes."""
 
     pose: Tensor
     """(3, 4) camera-to-scene, float64."""
@@ -51,7 +51,7 @@ class Keyframe:
     time: float | None = None
     """Time in [0, 1]; None for a static scene."""
     transition: float | None = None
-    """Seconds from the keyframe before; None for the path's own."""
+    """Seconds from the previous keyframe; None for the path's default."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ class CameraPath:
     smoothness_value: float = 0.0
     """Tension of the spline through the keyframes."""
     keyframes: tuple[Keyframe, ...] = ()
-    """Cameras that the path was made of; empty if unknown."""
+    """Cameras from which the path was made; empty if unknown."""
     placement: Placement | None = None
-    """Placement of the input in the scene for which the path was made; None if unknown."""
+    """Placement of the input in the path's scene; None if unknown."""
     has_crop: bool = False
     """Whether the file asks for a crop box, which is not read."""
 
@@ -125,7 +125,7 @@ def write_camera_path(file: Path, path: CameraPath) -> None:
         path: the path.
 
     Raises:
-        OSError: if the file cannot be written; it is then as before.
+        OSError: if the file cannot be written; the old file is then unchanged.
     """
     aspect = path.width / path.height
     frames = [
@@ -182,12 +182,12 @@ def read_camera_path(file: Path) -> CameraPath:
         file: JSON file in the format of nerfstudio's viewer.
 
     Raises:
-        DataError: if the file cannot be read, is of another format, or holds values that make no cameras.
+        DataError: if the file cannot be read, has another format, or holds invalid cameras.
     """
     content = _object(_json(file), str(file))
     width, height = (_side(content, f"render_{name}", file) for name in ("width", "height"))
     if width * height > LARGEST_IMAGE:
-        raise DataError(f"{file}: images of {width}x{height} pixels are too large; the most are {LARGEST_IMAGE}")
+        raise DataError(f"{file}: images of {width}x{height} pixels are too large; the limit is {LARGEST_IMAGE} pixels")
     camera_type = content.get("camera_type", "perspective")
     if camera_type not in get_args(CameraType):
         hint = nearest(camera_type, CAMERA_TYPES) if isinstance(camera_type, str) else nearest("", CAMERA_TYPES)
@@ -236,7 +236,7 @@ def read_placement(content: Any, where: str) -> Placement:
         where: name of the object in messages.
 
     Raises:
-        DataError: if it is no similarity.
+        DataError: if the content is not a similarity.
     """
     values = _object(content, where)
     transform = _rigid(values.get("transform"), f"{where}: 'transform'")
@@ -307,7 +307,7 @@ def _seconds(content: dict[str, Any], frames: int, where: str) -> float:
         seconds = frames / _number(content, "fps", where, above=0.0)
     if not seconds * SPEEDS[0] <= frames <= seconds * SPEEDS[1]:
         raise DataError(
-            f"{where}: {frames} frames in {seconds:g} seconds; it must be {SPEEDS[0]:g} to {SPEEDS[1]:g} in a second"
+            f"{where}: {frames} frames in {seconds:g} seconds; allowed are {SPEEDS[0]:g} to {SPEEDS[1]:g} per second"
         )
     return seconds
 
@@ -322,7 +322,7 @@ def _fov(content: dict[str, Any], camera_type: str, where: str) -> float:
 
 
 def _times(placed: list[tuple[dict[str, Any], str]]) -> Tensor | None:
-    """Return the times of all frames, or None if no frame has one. A spline may leave [0, 1] a little."""
+    """Return the times of all frames, or None if no frame has one. Splines can slightly overshoot [0, 1]."""
     if not any("render_time" in frame for frame, _ in placed):
         return None
     times = [_number(frame, "render_time", label) for frame, label in placed]
@@ -351,11 +351,11 @@ def _rigid(value: Any, where: str) -> Tensor:
 
 
 def _keyframes(content: dict[str, Any], camera_type: str, file: Path) -> tuple[Keyframe, ...]:
-    """Return the keyframes; none for those of nerfstudio's first viewer, whose matrices are text."""
+    """Return the keyframes; none for files of nerfstudio's first viewer, whose matrices are text."""
     given = content.get("keyframes")
     given = [] if given is None else _list(content, "keyframes", file)
     if len(given) > MOST_FRAMES:
-        raise DataError(f"{file}: 'keyframes' has {len(given)} cameras; the most are {MOST_FRAMES}")
+        raise DataError(f"{file}: 'keyframes' has {len(given)} cameras; the limit is {MOST_FRAMES}")
     found = []
     for index, value in enumerate(given):
         where = f"{file}: {index} of 'keyframes'"

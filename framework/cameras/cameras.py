@@ -27,11 +27,11 @@ from nerfloom.kernels.dispatch import CPP, Operation
 ROTATION_TOLERANCE = 1e-3
 """Maximum deviation of a pose's rotation matrix from an orthonormal one."""
 LARGEST_SIDE = 10**9
-"""Maximum width or height of an image that a file may state, pixels; file formats have room for 2^64."""
+"""Maximum width or height that a file may state, pixels; file formats allow up to 2^64."""
 CENTER = torch.zeros(1, 2)
 """The pixel's centre as the only sample position, in columns and rows from the centre."""
 TESTED_POSITIONS = 9
-"""Positions along each side of an image, edges included, by which it is found how many iterations a lens needs."""
+"""Number of positions tested along each side of an image, edges included, to find the iterations that a lens needs."""
 COMPILED = ("pinhole", *DISTORTED)
 """Models whose rays are compiled, in the order of the kernel's enumeration."""
 
@@ -90,7 +90,7 @@ class Cameras:
     def scaled(self, factor: float | Tensor) -> Cameras:
         """Return the cameras of resized images.
 
-        Sizes are rounded down, as those of images reduced by an integer factor are.
+        Sizes are rounded down, as for images reduced by an integer factor.
 
         Args:
             factor: new size over old size, of all cameras or (M,) of each; 2.0 doubles the width.
@@ -182,7 +182,7 @@ class Cameras:
         return replace(found, iterations=self._iterations(found)) if runs_ahead(lens.device) else found
 
     def _iterations(self, lenses: Distortion) -> int:
-        """Return how many iterations `undistort` needs anywhere in the images, so that no step waits for the answer."""
+        """Return the number of iterations of `undistort` that suffices for all pixels, so that no step has to check."""
         shares = torch.linspace(0, 1, TESTED_POSITIONS, device=self.fx.device)
         x = (self.widths[:, None] * shares - self.cx[:, None]) / self.fx[:, None]
         y = (self.heights[:, None] * shares - self.cy[:, None]) / self.fy[:, None]
@@ -191,7 +191,7 @@ class Cameras:
 
     @cached_property
     def offsets(self) -> Tensor:
-        """(M + 1,) index of each camera's first pixel, when all pixels are numbered consecutively, row by row."""
+        """(M + 1,) index of each camera's first pixel; pixels of all images are numbered consecutively, row by row."""
         sizes = (self.widths * self.heights).cumsum(0)
         return torch.cat([torch.zeros_like(sizes[:1]), sizes])
 
@@ -216,7 +216,7 @@ class Cameras:
         """Return the rays of pixels given by consecutive number.
 
         Args:
-            flat: (P,) int64 numbers of the pixels, counted through all images.
+            flat: (P,) int64 numbers of the pixels, consecutive over all images.
             near, far: distances at which the rays start and end.
             times: (M,) time of each camera.
             subpixels: (K, 2) positions in a pixel, in columns and rows from its centre.
@@ -246,14 +246,14 @@ class Cameras:
         return self.rays(indices.repeat_interleave(len(subpixels)), columns, rows, near, far, times)
 
     def image_pixels(self, index: int) -> Tensor:
-        """Return the numbers (H * W,) of the pixels of image `index`, row by row, counted through all images."""
+        """Return the numbers (H * W,) of the pixels of image `index`, row by row, consecutive over all images."""
         start, end = self.ends[index : index + 2]
         return torch.arange(start, end, device=self.fx.device)
 
 
 @lru_cache(maxsize=16)
 def subpixels(count: int, device: torch.device | None = None) -> Tensor:
-    """Return positions in a pixel, whose mean colour is the pixel's: columns and rows (count, 2) from its centre.
+    """Return the positions in a pixel whose colours are averaged: columns and rows (count, 2) from its centre.
 
     For count = n^2, the positions form a square grid, rotated so that no two share a row or a column. Edges close to
     horizontal or vertical, where aliasing is most visible, then have count + 1 levels instead of n + 1. For n = 2 it is
@@ -261,7 +261,7 @@ def subpixels(count: int, device: torch.device | None = None) -> Tensor:
 
     Args:
         count: number of positions, a square number.
-        device: device of the result; the CPU if None. It is kept, since bringing it there means to wait for the device.
+        device: device of the result; the CPU if None. The result is cached, because a copy to the device waits for it.
 
     Raises:
         ValueError: if `count` is not a square number.
@@ -275,7 +275,7 @@ def subpixels(count: int, device: torch.device | None = None) -> Tensor:
 
 
 def join_cameras(parts: Sequence[Cameras]) -> Cameras:
-    """Concatenate cameras. A mixture of pinhole and opencv becomes opencv, without distortion for pinhole.
+    """Concatenate cameras. If some are pinhole and some opencv, all become opencv; pinhole gets zero distortion.
 
     Args:
         parts: one or more sets of cameras.
@@ -290,7 +290,7 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
         model = parts[0].model
     else:
         raise DataError(
-            f"the cameras are of different models ({', '.join(sorted(models))}), and a scene must have one; "
+            f"the cameras are of different models ({', '.join(sorted(models))}), but a scene needs a single model; "
             "convert the images to one model, for example with 'colmap image_undistorter'"
         )
     joined: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Poses of other cameras, carried along as the poses of the training cameras around them are refined."""
+"""Move poses of other cameras along with the refined poses of nearby training cameras."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from torch import Tensor
 from nerfloom.geometry.alignment import align_cameras, nearest_rotations
 
 WIDTH = 3.0
-"""Distance within which training cameras count alike, in median distances of one to the nearest other: a camera that
-passes among them follows no single one's error."""
+"""Training cameras within this distance have about equal weight, so that no single camera's error dominates. The unit
+is the median distance from a camera to its nearest neighbour."""
 FALL = 4.0
-"""Power of the distance with which they count less farther away (Shepard 1968)."""
+"""Exponent of the distance by which weights of farther cameras fall off (Shepard 1968)."""
 MEASURED = 64
-"""Most cameras of which the distance to the nearest other is measured."""
+"""Maximum number of cameras used to estimate the spacing."""
 
 
 def carried_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Tensor, float]:
     """Move poses as the cameras near them were moved.
 
-    All follow the similarity from given to refined poses, and the mean of what is left over of the motions of the
-    training cameras, weighted by nearness: a device's errors change slowly as it moves, so that they are those of the
-    photographs taken around it. Far from all cameras it is the similarity alone.
+    Every pose follows the similarity from given to refined poses. It also gets the weighted mean of the remaining
+    motions of nearby training cameras: a device's pose error changes slowly as it moves, so neighbouring photographs
+    share it. Far from all training cameras only the similarity remains.
 
     Args:
         poses: (N, 3, 4) camera-to-scene poses of other cameras, in the frame of `given`.
         given: (M, 3, 4) poses of the training cameras, M >= 1.
-        refined: (M, 3, 4) the same after refinement.
+        refined: (M, 3, 4) the same poses after refinement.
 
     Returns:
-        The moved poses (N, 3, 4), and the scale of the similarity, by which lengths grow.
+        The moved poses (N, 3, 4), and the scale of the similarity, a factor for lengths.
     """
     before, after, others = (part.cpu().double() for part in (given, refined, poses))
     scale, rotation, translation = align_cameras(before, after)
@@ -43,11 +43,11 @@ def carried_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Tensor
 
 
 def _nearness(positions: Tensor, centers: Tensor) -> Tensor:
-    """Return the weights (N, M), of sum 1, that cameras at `centers` (M, 3) have at `positions` (N, 3)."""
+    """Return the weights (N, M) of cameras at `centers` (M, 3) for `positions` (N, 3); each row sums to 1."""
     spacing = 0.0
     if len(centers) > 1:
         some = centers[:: -(-len(centers) // MEASURED)]
         spacing = float(torch.cdist(some, centers).topk(2, largest=False).values[:, 1].median())
     squares = (positions[:, None] - centers).square().sum(-1) + (WIDTH * spacing) ** 2
-    # By logarithms, as all may be at one place.
+    # In logarithms, because all cameras may be at one place.
     return (-FALL / 2 * (squares + torch.finfo(squares.dtype).tiny).log()).softmax(dim=-1)

@@ -1,4 +1,4 @@
-"""Conversion of COLMAP's camera models. COLMAP too measures pixels from the image's corner, with centres at 0.5."""
+"""Conversion of COLMAP's camera models. Pixel coordinates agree: COLMAP also places pixel centres at 0.5."""
 
 from __future__ import annotations
 

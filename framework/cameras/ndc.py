@@ -1,8 +1,8 @@
-"""Normalised device coordinates: the space that forward-facing cameras see, out to infinity, mapped to a box.
+"""Normalised device coordinates: map the space that forward-facing cameras see, up to infinity, to a box.
 
-NeRF (Mildenhall et al. 2020), appendix C. The map keeps rays straight, so they are rendered there as elsewhere, with
-the same pixels as the images; steps along a ray are in disparity, not in distance. The scene is learnt in the box and
-not in scene coordinates: directions, depths and positions are the box's.
+NeRF (Mildenhall et al. 2020), appendix C. The map keeps rays straight, so that the usual rendering works in the box,
+for the same pixels. Steps along a ray are uniform in disparity, not in distance. The scene is learnt in the box:
+directions, depths and positions are in box coordinates, not in scene coordinates.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from nerfloom.cameras.cameras import CENTER, Cameras
 from nerfloom.geometry.rays import Rays
 
 LEAST_AHEAD = 1e-3
-"""Minimum cosine of the angle between a ray and the common axis; other rays have no image in the box."""
+"""Minimum cosine of the angle between a ray and the common axis; other rays do not reach the box."""
 
 
 @dataclass(frozen=True)
 class Ndc:
     """The frame of a camera in the middle of all cameras, and the frustum that is mapped to the box from -1 to 1.
 
-    The fields are plain numbers, so that they belong to no device.
+    The fields are plain numbers, independent of any device.
     """
 
     frame: tuple[tuple[float, ...], ...]
@@ -111,10 +111,10 @@ def find_ndc(poses: Tensor, corners: Tensor, nears: Tensor) -> Ndc:
     Args:
         poses: (M, 3, 4) camera-to-world, scene coordinates.
         corners: (M, 4, 3) directions through the corners of the images, scene coordinates, of depth 1 in their camera.
-        nears: (M,) depth before which the camera sees nothing.
+        nears: (M,) depth up to which the camera sees nothing.
 
     Raises:
-        DataError: if the cameras do not look the same way, or the space that one of them sees starts behind another.
+        DataError: if the cameras do not look the same way, or one camera is behind the near plane of another.
     """
     frame = middle_frame(poses)
     ahead = corners @ frame[:, :3].T
@@ -123,8 +123,8 @@ def find_ndc(poses: Tensor, corners: Tensor, nears: Tensor) -> Ndc:
     near = float(-(positions[:, None] + nears[:, None, None] * ahead)[:, :, 2].max())
     if not bool((-ahead[:, :, 2] > LEAST_AHEAD * ahead.norm(dim=-1)).all()) or near <= max(largest_depth, 0):
         raise DataError(
-            "normalised device coordinates need cameras that look the same way, all in front of the scene, and "
-            "these do not; use --ndc False"
+            "normalised device coordinates need cameras that all look the same way, in front of the scene; "
+            "these cameras do not: use --ndc False"
         )
     slopes = (ahead[:, :, :2] / -ahead[:, :, 2:]).abs().reshape(-1, 2).amax(0)
     rows = tuple(tuple(row) for row in frame.tolist())

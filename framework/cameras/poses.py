@@ -21,18 +21,18 @@ NEAR = 0.05
 NEAR_SHARE = 0.5
 """Near distance as a fraction of the distance to the nearest sparse points."""
 SMALL_VIEW = 0.5
-"""Scene units that images show where their cameras look below which a scene is enlarged (`enlargement`)."""
+"""Scenes whose images show less than this where their cameras look are enlarged (`enlargement`), scene units."""
 MOST_LOOK = 0.9
-"""Share of the cameras that must have the place where they look in the picture for a scene to be enlarged."""
+"""Fraction of the cameras that must see the common point they look at, for a scene to be enlarged."""
 MOST_POINTS = 2000
-"""Maximum number of sparse points that are used."""
+"""Maximum number of sparse points used."""
 
 
 @dataclass(frozen=True)
 class Placement:
     """A similarity transform from the input's frame to the scene's: `scale * (transform @ x)`.
 
-    It is computed in float64, as the input may be millions of units from its origin; scene coordinates fit float32.
+    It uses float64, because the input may be millions of units from its origin; scene coordinates fit float32.
     """
 
     transform: Tensor
@@ -43,7 +43,7 @@ class Placement:
 
     @classmethod
     def of(cls, transform: Any, scale: float) -> Placement:
-        """Construct a placement from a transform as scenes, files and checkpoints hold it.
+        """Construct a placement from a transform as stored in scenes, files and checkpoints.
 
         Args:
             transform: (3, 4) tensor of any type and device, or rows of numbers; None for the identity.
@@ -80,28 +80,28 @@ class Placement:
         return self._turned_back, 1 / self.scale, -self._turned_back @ self.transform[:, 3]
 
     def about(self, origin: Tensor) -> Placement:
-        """Return the placement of coordinates of the input that are counted from another `origin` (3,) of its frame."""
+        """Return the same placement for input coordinates relative to `origin` (3,), a point in the input's frame."""
         rotation = self.transform[:, :3]
         shift = self.transform[:, 3] + rotation @ origin.double()
         return Placement(torch.cat([rotation, shift[:, None]], dim=-1), self.scale)
 
     def after(self, applied: Tensor, scale: float) -> Placement:
-        """Return the placement of a later frame by which the scene is where it is by this one.
+        """Return the placement for a transformed input that puts the scene where this one does.
 
         Args:
-            applied: (4, 4) rigid transform from the input's frame to the later one, applied before `scale`.
-            scale: units of the later frame per unit of the input.
+            applied: (4, 4) rigid transform from the input's frame to the transformed one, applied before `scale`.
+            scale: units of the transformed frame per unit of the input.
         """
         rotation = self.transform[:, :3] @ applied[:3, :3].double().T
         shift = scale * (self.transform[:, 3] - rotation @ applied[:3, 3].double())
         return Placement(torch.cat([rotation, shift[:, None]], dim=-1), self.scale / scale)
 
     def before(self, applied: Tensor, scale: float) -> Placement:
-        """Return the placement of an earlier frame that leaves the scene where this one puts it.
+        """Return the placement for the untransformed input that puts the scene where this one does.
 
         Args:
-            applied: (4, 4) rigid transform from the earlier frame to the input's, applied before `scale`.
-            scale: units of the input per unit of the earlier frame.
+            applied: (4, 4) rigid transform from the untransformed frame to the input's, applied before `scale`.
+            scale: units of the input per unit of the untransformed frame.
         """
         # s (R (a A x) + t) = s a (R A x + t / a)
         moved = self.transform[:, :3] @ applied[:3].double()
@@ -125,11 +125,9 @@ def place(
 
     Args:
         poses: (M, 3 or 4, 4) camera-to-world, OpenGL axes.
-        orientation: up: the cameras' mean up direction becomes +z. auto: the same, but of photographs that lie on their
-            side what is up by `sideways_up`. pca: the directions of largest spread of the camera positions become x and
-            y. none: unchanged.
-        center: poses: the cameras' mean position becomes the origin. focus: the point closest to all optical axes
-            (least squares) does. none: unchanged.
+        orientation: up: the cameras' mean up direction becomes +z. auto: as up, but if the photographs lie on their
+            side, `sideways_up` gives the up direction. pca: the directions of largest spread of the camera positions
+            become x and y. none: unchanged.
         auto_scale: whether to scale the camera positions so that their largest absolute coordinate is 1.
     """
     precise = poses[:, :3].double()
@@ -203,19 +201,18 @@ def looked_at(poses: Tensor) -> Tensor | None:
 
 
 def enlargement(poses: Tensor, spreads: Tensor) -> float:
-    """Return a factor for scenes that cameras see from afar through long lenses, so that they do not fill their box.
+    """Return a scale factor for scenes seen from afar through long lenses, which would fill little of their box.
 
-    The rules of `place` fit a box to the cameras. What these look at may be a small part of it: a statue that strangers
-    photographed from afar is a tenth of the box high, and a cell of a hash grid as wide as five pixels. If the images
-    show less than `SMALL_VIEW` where their cameras look, in the median, the factor makes that 1. Other scenes stay as
-    they are.
+    `place` fits the box to the cameras, but the subject may be a small part of it: a statue photographed by many people
+    from afar filled a tenth of the box's height, and a cell of the hash grid was five pixels wide. If the images show
+    less than `SMALL_VIEW` at the point that their cameras look at, in the median, the factor enlarges that to 1.
 
     Args:
         poses: (M, 3, 4) camera-to-world, OpenGL axes, scene coordinates.
-        spreads: (M,) length that the longer side of each image shows, for each unit of distance.
+        spreads: (M,) length shown by the longer side of each image at distance 1.
 
     Returns:
-        The factor; 1 if not `MOST_LOOK` of the cameras look at one place, or if they see enough of it.
+        The factor; 1 if fewer than `MOST_LOOK` of the cameras see a common point, or if they see enough around it.
     """
     point = looked_at(poses)
     if point is None:
@@ -240,10 +237,10 @@ def _principal_axes(points: Tensor, up: Tensor) -> Tensor:
 
 
 def estimate_near(cameras: Cameras, points: Tensor | None) -> float:
-    """Return a distance in scene units before which no image shows anything, estimated from sparse points.
+    """Estimate from sparse points a distance in scene units up to which images show nothing.
 
-    Few images constrain the space right in front of the cameras: for a can in 62 images, the PSNR of held-out images
-    was 3 dB higher when rays started at 0.3 rather than at 0.05.
+    With few images, little constrains the space right in front of the cameras: for a can in 62 images, the PSNR of
+    held-out images was 3 dB higher when rays started at 0.3 rather than at 0.05.
 
     Args:
         cameras: the cameras that observe the points.
@@ -263,7 +260,7 @@ def estimate_near(cameras: Cameras, points: Tensor | None) -> float:
 
 
 def held_out(names: list[str], split: Split, every: int = 8) -> Tensor:
-    """Return the indices of a split, sorted by name; every `every`-th name, from the first, is held out.
+    """Return the indices of a split; sorted by name, every `every`-th image from the first is held out.
 
     The val and test splits are the same images. If `every` is 0, no image is held out, and each split has all images.
 

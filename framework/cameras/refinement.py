@@ -25,8 +25,8 @@ class PoseRefinement(nn.Module):
         count: number of cameras.
         group: SO3xR3: the camera is rotated about its own centre, and the centre is translated. SE3: one screw motion
             about the scene's origin.
-        given: (count, 3, 4) the poses to be refined. Other cameras then follow those around them (`carried_poses`), as
-            all of them together may drift along with the scene. If None, other cameras stay unchanged.
+        given: (count, 3, 4) poses to be refined. Other cameras then follow nearby training cameras (`carried_poses`),
+            because all training cameras may drift together with the scene. If None, other cameras stay unchanged.
     """
 
     given: Tensor | None
@@ -47,7 +47,7 @@ class PoseRefinement(nn.Module):
         return rigid_motions(self.tangents[chosen], self.group == "SE3")
 
     def forward(self, rays: Rays) -> Rays:
-        """Move the rays of training cameras by their refinements, and those of other cameras as those around them."""
+        """Move the rays of training cameras by their refinements, and those of other cameras as their neighbours."""
         if rays.camera_indices is None:
             return self.carried(rays)
         # Not `motions[camera_indices]`: the order of summation of its gradient depends on the threads.
@@ -64,7 +64,7 @@ class PoseRefinement(nn.Module):
         if self.given is None:
             return rays
         origins = rays.origins
-        if bool((origins == origins[:1]).all()):  # as of a view
+        if bool((origins == origins[:1]).all()):  # rays of one view
             origins = origins[:1]
         axes = torch.eye(3).to(origins).expand(len(origins), 3, 3)
         poses = torch.cat([axes, origins[:, :, None]], dim=-1)
@@ -79,7 +79,7 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def carried_pose(self, pose: Tensor) -> Tensor:
-        """Transform the pose of a camera that is no training camera, as those around it were moved.
+        """Move the pose of another camera like nearby training cameras (`carried_poses`).
 
         Args:
             pose: (3, 4) camera-to-scene pose.
@@ -90,8 +90,8 @@ class PoseRefinement(nn.Module):
         """Return the refined pose (3, 4) of a training camera, with a gradient.
 
         Args:
-            index: which of the training cameras.
-            given: (3, 4) its pose as it is given.
+            index: index of the training camera.
+            given: (3, 4) its given pose.
         """
         return self._moved(given[None], slice(index, index + 1))[0]
 

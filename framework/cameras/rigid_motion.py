@@ -18,7 +18,7 @@ from nerfloom.kernels.dispatch import TORCH, Operation
 from nerfloom.kernels.math import cross_matrix
 
 SMALL = 0.25
-"""Squared angle below which the factors are their series, which neither divide by 0 nor cancel."""
+"""Below this squared angle the factors are computed as series, which neither divide by 0 nor cancel."""
 
 
 def rigid_motions_reference(tangents: Tensor, screw: bool) -> Tensor:
@@ -36,8 +36,8 @@ def rigid_motions(tangents: Tensor, screw: bool) -> Tensor:
 
     Args:
         tangents: (M, 6) translations, and rotation vectors in radians.
-        screw: whether a motion is one screw about the origin, the exponential of SE(3); if not, the rotation is that of
-            SO(3), and the translation is as given.
+        screw: whether a motion is one screw about the origin, the exponential of SE(3). Otherwise only the rotation is
+            an exponential, of SO(3), and the translation is used unchanged.
 
     Returns:
         (M, 3, 4) rotations and translations.
@@ -50,11 +50,11 @@ RIGID_MOTIONS = Operation("rigid_motions", rigid_motions_reference)
 
 @RIGID_MOTIONS.implementation(TORCH, types=None, order=torch.inf)
 def _closed_form(tangents: Tensor, screw: bool) -> Tensor:
-    """Compute `rigid_motions` in closed form, which takes less time, and asks the device nothing."""
+    """Compute `rigid_motions` in closed form, which is faster and does not wait for the device."""
     translation, rotation = tangents[:, :3], tangents[:, 3:]
     squared = rotation.square().sum(-1)[:, None, None]
     small = squared < SMALL
-    # Each form is given what it can take, so that the one that is not used has a finite gradient.
+    # Each form gets valid arguments, so that the unused one has a finite gradient.
     near, angle = torch.where(small, squared, 0), torch.where(small, 1, squared).sqrt()
     first = torch.where(small, _series(near, 1), angle.sin() / angle)
     second = torch.where(small, _series(near, 2), 2 * ((angle / 2).sin() / angle).square())

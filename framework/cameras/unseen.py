@@ -1,4 +1,4 @@
-"""Views that nobody has taken, between and around the training cameras: RegNeRF (Niemeyer et al. 2022), section 3.2."""
+"""Unobserved views between and around the training cameras: RegNeRF (Niemeyer et al. 2022), section 3.2."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.math import safe_normalize
 
 NEIGHBOURS = 3
-"""Number of cameras, near each other, of which the pose of an unseen view is a mean."""
+"""Number of neighbouring cameras whose poses are averaged into an unobserved view."""
 REACH = 1.25
-"""Size of the triangle of positions around these cameras, relative to the triangle that they form."""
+"""Size of the triangle from which positions are drawn, relative to the triangle of the three cameras."""
 
 
 def unseen_patches(rays: Rays, poses: Tensor, side: int, stride: float = 1.0) -> Rays:
     """Return square patches of rays through random views, one for each of P rays of training cameras.
 
-    Such a ray is carried along as its camera moves to a view between and around it and its neighbours, and becomes the
-    middle of a patch. So patches have the fields of view, lenses and times of the training cameras.
+    A camera moves to a view between and around itself and its neighbours. Its ray moves along and becomes the centre of
+    a patch. So patches have the fields of view, lenses and times of the training cameras.
 
     Args:
         rays: P rays of training cameras, in the scene's frame.
@@ -30,7 +30,7 @@ def unseen_patches(rays: Rays, poses: Tensor, side: int, stride: float = 1.0) ->
         stride: distance of neighbouring rays of a patch, in pixels.
 
     Returns:
-        P side^2 rays, those of a patch one after the other, row by row.
+        P side^2 rays, patch by patch, row by row.
 
     Raises:
         ValueError: if the rays have no cameras or no pixel radii.
@@ -45,12 +45,12 @@ def unseen_patches(rays: Rays, poses: Tensor, side: int, stride: float = 1.0) ->
 def unseen_poses(poses: Tensor, near: Tensor) -> Tensor:
     """Return random poses, each between and around a given camera and the two that stand nearest to it.
 
-    The position is uniformly distributed over a triangle, `REACH` times that of the three cameras; the rotation is the
-    one closest to the mean of theirs with the same weights.
+    The position is uniformly distributed over a triangle, `REACH` times as large as the one of the three cameras. The
+    rotation is the closest to the mean of their rotations, with the same weights.
 
     Args:
         poses: (M, 3, 4) camera-to-scene of the cameras.
-        near: (P,) int64 number of a camera for each pose.
+        near: (P,) int64 index of a camera for each pose.
 
     Returns:
         (P, 3, 4) poses, of the type of `poses`.
@@ -60,7 +60,7 @@ def unseen_poses(poses: Tensor, near: Tensor) -> Tensor:
     apart = (centers[near][:, None] - centers).norm(dim=-1)
     apart[torch.arange(len(near)), near] = -1.0  # the camera itself, even if another stands at the same place
     chosen = poses[apart.topk(count, largest=False).indices].double()
-    # Exponential variates divided by their sum are uniform over the weights that add up to 1.
+    # Exponential variates divided by their sum are uniform over weights with sum 1.
     drawn = -torch.rand(len(near), count, dtype=torch.float64).clamp(min=1e-12).log()
     weights = REACH * drawn / drawn.sum(-1, keepdim=True) + (1 - REACH) / count
     mean = (weights[:, :, None, None] * chosen).sum(1)
@@ -68,12 +68,12 @@ def unseen_poses(poses: Tensor, near: Tensor) -> Tensor:
 
 
 def moved_rays(rays: Rays, before: Tensor, after: Tensor) -> Rays:
-    """Return rays that are carried along as their cameras move; they belong to no training camera any more.
+    """Return rays moved along with their cameras; they no longer belong to a training camera.
 
     Args:
         rays: P rays.
         before: (P, 3, 4) pose of each ray's camera.
-        after: (P, 3, 4) pose to which it moves.
+        after: (P, 3, 4) new pose of the camera.
     """
     turn = (after[:, :, None, :3] * before[:, None, :, :3]).sum(-1)  # without a product, which autocast would round
     origins = (turn * (rays.origins - before[:, :, 3])[:, None]).sum(-1) + after[:, :, 3]
@@ -81,10 +81,10 @@ def moved_rays(rays: Rays, before: Tensor, after: Tensor) -> Rays:
 
 
 def square_patches(rays: Rays, side: int, stride: float = 1.0) -> Rays:
-    """Return a square of side^2 rays around each of P rays with pixel radii, row by row, from the same origin.
+    """Return a square of side^2 rays around each of P rays, row by row, all from the same origin.
 
     Args:
-        rays: P rays, the middles of the squares.
+        rays: P rays with pixel radii, the centres of the squares.
         side: rays along an edge of a square.
         stride: distance of neighbouring rays, in pixels.
 

@@ -1,4 +1,4 @@
-"""The direction that is up in photographs that lie on their side, as a phone stores them that was held upright."""
+"""Up direction of photographs that lie on their side, as a phone held upright stores them."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import torch
 from torch import Tensor
 
 LEAST_TURN = 0.15
-"""Least second moment of the axes along columns in their plane, beyond that across it: of an arc of 80 degrees."""
+"""Minimum difference of second moments of the column axes, in their plane minus across it: that of an 80 degree arc."""
 CLEARER = 2.0
-"""How many times clearer the plane of the axes along columns must be than that of the axes along rows."""
+"""Minimum ratio of clarity of the plane of the column axes to that of the row axes."""
 LEAST_WIDTH = 0.25
-"""Least spread of the cameras' positions in their second direction, relative to that in their first."""
+"""Minimum spread of the camera positions along their second principal direction, relative to the first."""
 LOOKING_DOWN = 0.1
-"""Mean sine of the angle of looking down from which it says which side is up."""
+"""Minimum mean sine of the downward angle; below it, the viewing direction does not tell up from down."""
 
 
 def sideways_up(poses: Tensor) -> Tensor | None:
-    """Return what is up for photographs that lie on their side; None if they stand upright, or one cannot tell.
+    """Return the up direction of photographs that lie on their side; None if they stand upright or it is unclear.
 
-    Whoever walks around something turns about the vertical. The horizontal axis of the images then stays in one plane,
-    however high or low the camera looks: the axis along rows (x) if they stand upright, the one along columns (y) if
-    they lie on their side. It counts as known only if that plane is twice as clear as that of the other axis,
-    and if the cameras stand around something rather than in a line, along which to look up and down turns y alike.
+    A camera that moves around an object turns about the vertical axis. The horizontal image axis then stays in one
+    plane, however high or low the camera looks. That axis is the row axis (x) of upright images, and the column axis
+    (y) of images that lie on their side. The result is None unless the plane of y is twice as clear as that of x, and
+    the cameras stand around something. For cameras in a line, looking up and down turns y in a plane too.
 
-    Of the two directions across the plane that one is up by which the cameras look down. If they look neither up nor
-    down, it is the image's left: a phone's photographs are so when they are stored as its sensor lies.
+    Up is the normal of this plane for which the cameras look down. If they look neither up nor down, up is the left of
+    the image, as in a phone's photographs stored in sensor orientation.
 
     Args:
         poses: (M, 3 or 4, 4) camera-to-world, OpenGL axes, of images that were all held the same way.
 
     Returns:
-        (3,) float64 of length 1, in the frame of the poses; None as above.
+        (3,) float64 unit vector in the frame of the poses; None as above.
     """
     precise = poses[:, :3].double().cpu()
     if len(precise) < 3 or not bool(precise.isfinite().all()):
@@ -47,9 +47,9 @@ def sideways_up(poses: Tensor) -> Tensor | None:
 
 
 def _plane(axes: Tensor) -> tuple[Tensor, float]:
-    """Return the normal of the plane that directions (M, 3) are nearest to, and how clearly they lie in it, 0 to 1/2.
+    """Return the normal of the plane that best fits directions (M, 3), and how clearly they lie in it, 0 to 1/2.
 
-    The latter is the smaller of their second moments in the plane, less that across it.
+    The clarity is the smaller second moment in the plane minus the one across it.
     """
     moments, directions = torch.linalg.eigh(axes.T @ axes / len(axes))
     return directions[:, 0], float(moments[1] - moments[0])

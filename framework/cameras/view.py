@@ -20,11 +20,11 @@ class View:
     time: float | None = None
     """Time in [0, 1]; None for a static scene."""
     rays_per_pixel: Literal[1, 4, 9, 16] | None = None
-    """Number of rays that are averaged for each pixel; that of the method's settings if None."""
+    """Number of rays averaged per pixel; if None, the method's setting."""
     stride: int = 1
-    """Distance in pixels between the rows and columns that are rendered, the first of which is at `stride // 2`."""
+    """Distance in pixels between rendered rows and columns; the first is at `stride // 2`."""
     scene: int | None = None
-    """Number of the scene, where images show several; None for the only one, or the first."""
+    """Index of the scene if the images show several; None for the only one or the first."""
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:

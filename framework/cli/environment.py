@@ -1,4 +1,4 @@
-"""The environment that a report of an error needs: versions, processor, kernels, GPU, memory and extras."""
+"""Description of the environment for error reports: versions, processor, kernels, GPU, memory and extras."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from nerfloom.base.extras import EXTRAS, install_command
 PACKAGES = ("numpy", "tyro", "rich", "imageio", "pillow", "PyYAML", "pycolmap", "tensorboard", "jinja2", "triton")
 """Packages whose versions are listed beside torch's."""
 VARIABLES = ("NERFLOOM_", "OMP_", "KMP_", "GOMP_", "MKL_", "CUDA_VISIBLE_DEVICES", "PYTORCH_")
-"""Starts of the names of environment variables that change what runs."""
+"""Prefixes of environment variables that affect results."""
 
 
 def environment() -> str:
-    """Return a table of everything that a report needs, a line each. What cannot be found out is said on its line."""
+    """Return a table of the environment, one line per item; an item that cannot be determined says so."""
     rows: dict[str, Callable[[], str]] = {
         "nerfloom": _nerfloom,
         "Python": lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}",
@@ -37,11 +37,11 @@ def environment() -> str:
 
 
 def _said(value: Callable[[], str]) -> str:
-    """Return a row's text, or why there is none: a broken installation is what reports are about."""
+    """Return an item's text, or the reason why there is none: error reports often come from broken installations."""
     try:
         return value()
     except Exception as error:
-        return f"cannot be found out: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        return f"unknown: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
 def _nerfloom() -> str:
@@ -72,7 +72,7 @@ def _cpu() -> str:
     from nerfloom.training.machine import processor
 
     relevant = {feature for needs in NEEDS.values() for feature in needs}
-    sets = ", ".join(sorted(cpu_features() & relevant)) or "none of the instruction sets that kernels are built for"
+    sets = ", ".join(sorted(cpu_features() & relevant)) or "none of the kernels' instruction sets"
     return f"{processor()}, {num_cores()} of {os.cpu_count()} cores; {sets}"
 
 

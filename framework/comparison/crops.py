@@ -1,4 +1,4 @@
-"""Crops of the same view by every contender, beside the held-out image and with their error."""
+"""Crops of the same views by all contenders, beside the held-out images, with their errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CROP_SHARE = 4
 LEAST_CROP = 32
 """Minimum side of a crop, pixels, if the image is large enough."""
 IMAGE_SUFFIX = "_photograph.png"
-"""End of the file name of a held-out image; that of its render ends in .png only."""
+"""End of the file name of a held-out image; a render's file name ends in .png only."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Strip:
     whole: str
     crop: str
     error: str
-    """The crop's error, in black, red, yellow, white."""
+    """The crop's error as a heat map: black, red, yellow, white."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,13 @@ class View:
 
     name: str
     image: str
-    """The held-out image, with the crop framed."""
+    """The held-out image with the crop framed."""
     crop: str
     strips: tuple[Strip, ...]
 
 
 def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]:
-    """Return some views that all contenders have rendered, evenly spaced.
+    """Return views that all contenders have rendered, evenly spaced.
 
     Args:
         folders: each contender's label and folder of renders and held-out images.
@@ -68,7 +68,7 @@ def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]
     names = [
         {file.name.removesuffix(IMAGE_SUFFIX) for file in folder.glob("*" + IMAGE_SUFFIX)} for _, folder in folders
     ]
-    shared = sorted(set.intersection(*names) - {WORST}) if names else []  # each contender's worst is another view
+    shared = sorted(set.intersection(*names) - {WORST}) if names else []  # the worst view differs between contenders
     count = min(count, len(shared))
     chosen = [shared[index * len(shared) // count] for index in range(count)]
     return [view for view in (_view(name, folders) for name in chosen) if view is not None]

@@ -15,7 +15,7 @@ from typing import Any
 from nerfloom.comparison.plan import Conditions, Job
 
 SAME_TIME = 0.01
-"""Relative difference below which two times count as equal: runs end with the step in which their time is up."""
+"""Relative difference below which times count as equal: a run ends with the step in which its time is up."""
 Curve = tuple[tuple[float, float], ...]
 """Pairs (seconds of training, PSNR on the validation views), in order."""
 
@@ -28,17 +28,17 @@ class Measured:
         method: name of the method.
         seed: seed of the run.
         ssim: mean SSIM over all evaluated views.
-        ms_ssim: mean SSIM at five scales; None of small images.
+        ms_ssim: mean SSIM at five scales; None for small images.
         lpips: mean LPIPS over all evaluated views; None if it was not computed.
-        floaters: mean share, in per cent, of sparse points with something before them; None without sparse points.
-        steps: steps of training.
+        floaters: mean percentage of sparse points with matter in front of them; None without sparse points.
+        steps: number of training steps.
         parameters: number of parameters.
-        skipped_steps: steps dropped because of non-finite values.
+        skipped_steps: number of steps dropped because of non-finite values.
         curve: the learning curve.
         machine: description of the machine.
         folder: folder of the run.
-        lpips_note: how LPIPS was computed, or why not.
-        masks_note: what was measured of masked images; None if all pixels count.
+        lpips_note: how LPIPS was computed, or the reason for its absence.
+        masks_note: description of the metrics of masked images; None if all pixels count.
     """
 
     label: str
@@ -66,11 +66,11 @@ class Measured:
     skipped_steps: int
     curve: Curve
     seconds_to: dict[int, float]
-    """Integer PSNR, dB -> seconds after which the curve reached it."""
+    """Integer PSNR, dB -> training time at which the curve reached it, seconds."""
     decisions: tuple[str, ...]
     """Decisions of the scene's profile."""
     skipped: tuple[str, ...]
-    """Work that the run skipped."""
+    """Work skipped by the run."""
     machine: dict[str, Any]
     command: str
     """The training command."""
@@ -84,7 +84,7 @@ class Measured:
 
 
 def measure(job: Job, conditions: Conditions) -> Measured | None:
-    """Return the measurements of a job, or None if it is not finished, or its images are not finite.
+    """Return the measurements of a job; None if it is not finished or its images are not finite.
 
     Args:
         job: the job.
@@ -99,7 +99,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
     points = read_json(job.folder / "learning_curve.json") or []
     full = [
         p for p in points if p.get("full", True) and p["psnr"] is not None
-    ]  # evaluations of a few images are not comparable
+    ]  # evaluations of other numbers of images are not comparable
     curve = tuple((float(p["seconds"]), float(p["psnr"])) for p in full)
     profile, skips = (
         read_json(job.folder / "scene_profile.json") or {},
@@ -135,7 +135,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
 
 
 def _user_flags(job: Job, conditions: Conditions) -> list[str]:
-    """Return the flags with which a user gets the same training, without those that name the comparison's folders."""
+    """Return the flags for the same training by a user, without those that name the comparison's folders."""
     flags = [*job.contender.flags, *conditions.data_flags, "--machine.seed", str(job.seed)]
     for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
         value = getattr(conditions, name)
@@ -152,9 +152,9 @@ def read_json(path: Path) -> Any:
 
 
 def whole_levels(curve: Curve) -> dict[int, float]:
-    """Return when a curve first reached each integer PSNR, interpolated linearly between its points.
+    """Return the time at which a curve first reached each integer PSNR, interpolated linearly between its points.
 
-    The level of the first point counts as reached there, as nothing was measured before.
+    The level of the first point counts as reached there, because nothing was measured earlier.
 
     Args:
         curve: the learning curve.
@@ -190,23 +190,23 @@ class Row:
     """Reasons of failures of its other runs."""
 
     def mean(self, name: str) -> float | None:
-        """Return the mean of the measurement `name` of `Measured`, or None if a run lacks it."""
+        """Return the mean of the measurement `name` of `Measured`; None if a run lacks it."""
         values = [getattr(run, name) for run in self.runs]
         return None if not values or None in values else fmean(values)
 
     def deviation(self, name: str) -> float | None:
-        """Return the standard deviation of the measurement `name`, or None for fewer than two runs."""
+        """Return the standard deviation of the measurement `name`; None for fewer than two runs."""
         values = [getattr(run, name) for run in self.runs]
         return None if len(values) < 2 or None in values else stdev(values)
 
     def seconds_to(self, level: int) -> float | None:
-        """Return the mean seconds to the PSNR `level`, or None if a run did not reach it or started above it."""
+        """Return the mean seconds to the PSNR `level`; None if a run did not reach it or started above it."""
         values = [run.seconds_to.get(level) for run in self.runs]
         reached = [value for value in values if value is not None]
         return fmean(reached) if reached and len(reached) == len(values) else None
 
     def seconds_before(self, level: int) -> float | None:
-        """Return the seconds of the first evaluation, the latest of the runs, if all had more than `level` there."""
+        """Return the latest time of a first evaluation, seconds, if all runs were above `level` there."""
         firsts = [min(run.seconds_to.items(), default=(-math.inf, 0.0)) for run in self.runs]
         return max((s for _, s in firsts), default=None) if all(level < first for first, _ in firsts) else None
 
@@ -225,10 +225,10 @@ def rows_of(labels: Sequence[str], runs: Sequence[Measured], failures: dict[str,
 
 
 def pareto(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return which points are on the Pareto front: no other has at most the cost and at least the quality.
+    """Return whether each point is on the Pareto front: no other point has at most its cost and at least its quality.
 
     Args:
-        points: pairs (cost, quality): lower cost is better, and costs within `SAME_TIME` are equal; higher quality is
+        points: pairs (cost, quality). Lower cost is better, and costs within `SAME_TIME` are equal; higher quality is
             better. Another point must be strictly better in one of the two.
     """
 

@@ -17,13 +17,13 @@ from nerfloom.registry import entry_of
 from nerfloom.training.run import write_json
 
 FIRST_SEED = 42
-"""Seed of the first run of each contender; the others follow it."""
+"""Seed of the first run of each contender; further runs have the following seeds."""
 CURVE_POINTS = 8
-"""Number of evaluations during a run, the points of its learning curve."""
+"""Number of evaluations during a run, for its learning curve."""
 LEAST_VIEWS = 25
-"""Minimum number of held-out views of a final evaluation whose number follows the budget."""
+"""Minimum number of views of a final evaluation if the number depends on the time budget."""
 PICTURES = 3
-"""Number of views of which pictures are written, those that a report shows."""
+"""Number of views with pictures, which a report shows."""
 
 
 def split_words(text: str, flag: str) -> tuple[str, ...]:
@@ -52,7 +52,7 @@ class Contender:
     """
 
     label: str
-    """The method's name and its flags, as the user wrote them."""
+    """The method's name and flags, as the user wrote them."""
     method: str
     flags: tuple[str, ...]
 
@@ -71,19 +71,19 @@ class Contender:
 
     @property
     def slug(self) -> str:
-        """Name of the contender's folder: readable, and different for different labels."""
+        """Name of the contender's folder: readable, and unique for each label."""
         readable = re.sub(r"[^a-z0-9]+", "-", self.label.lower()).strip("-")[:48]
         return readable if readable == self.label else f"{readable}-{zlib.crc32(self.label.encode()):08x}"
 
 
 def views_for(max_seconds: float | None) -> int | None:
-    """Return how many held-out views a final evaluation is over, if the user does not say: one a second of training.
+    """Return the default number of held-out views of a final evaluation: one per second of training.
 
-    So an evaluation takes no longer than the training whose result it is, which over all views it does after short
-    runs. Views are evenly spaced, and the same for all methods.
+    So an evaluation takes no longer than its training, as an evaluation of all views would after short runs. Views are
+    evenly spaced, and the same for all methods.
 
     Args:
-        max_seconds: seconds of training; None if it does not end by the clock.
+        max_seconds: seconds of training; None without a time limit.
 
     Returns:
         A number of views; None for all.
@@ -116,12 +116,12 @@ class Conditions:
     max_eval_images: int | None
     """Maximum number of views of the final evaluation; None for all."""
     lpips_weights: str | None = None
-    """Absolute path of the file of LPIPS's weights; None to look for the lpips package."""
+    """Absolute path of LPIPS's weights file; None to use the lpips package."""
 
     def __post_init__(self) -> None:
         if self.max_seconds is None and self.max_num_iterations is None and self.target_psnr is None:
             raise FlagError(
-                "set how long each method trains: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
+                "set the training budget: --max-seconds 120, --max-num-iterations 5000, or --target-psnr 30"
             )
         for name in ("max_seconds", "max_num_iterations", "target_psnr"):
             value = getattr(self, name)
@@ -131,7 +131,7 @@ class Conditions:
             raise FlagError("--curve-images must be at least 0, --max-eval-images at least 1")
 
     def budget(self) -> str:
-        """Return a description of how long each method trains."""
+        """Return a description of the training budget."""
         parts = [
             (self.max_seconds, f"{self.max_seconds:g} s of training" if self.max_seconds else ""),
             (self.max_num_iterations, f"{self.max_num_iterations} steps"),
@@ -161,7 +161,7 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """File of the output of the run's commands."""
+        """File for the output of the run's commands."""
         return self.runs / self.contender.slug / f"seed-{self.seed}.log"
 
     @property
@@ -180,7 +180,7 @@ class Job:
         return f"{self.contender.label}, seed {self.seed}"
 
     def train_command(self, conditions: Conditions) -> list[str]:
-        """Return the command that trains under `conditions`, or resumes training if the run has started."""
+        """Return the command that trains under `conditions`, or resumes a training that has started."""
         start = python_command("nerfloom.cli.train")
         if (self.folder / "config.yml").exists():
             return [*start, "--resume", str(self.folder)]
@@ -197,7 +197,7 @@ class Job:
         flags += ["--machine.device-type", c.device_type, "--machine.seed", str(self.seed)]
         flags += ["--output-dir", str(self.runs), "--experiment-name", self.contender.slug]
         flags += ["--timestamp", self.folder.name]
-        # A contender's own flags come last, so that they take precedence.
+        # A contender's own flags come last and so take precedence.
         return [*start, self.contender.method, *flags, *self.contender.flags, *c.data_flags]
 
     def eval_command(self, conditions: Conditions) -> list[str]:
@@ -231,7 +231,7 @@ class Plan:
     def __post_init__(self) -> None:
         labels = [contender.label for contender in self.contenders]
         if not labels:
-            raise FlagError("--methods is empty; list methods, as in --methods instant-ngp kplanes")
+            raise FlagError("--methods is empty; list methods, such as --methods instant-ngp kplanes")
         duplicates = sorted({label for label in labels if labels.count(label) > 1})
         if duplicates:
             raise FlagError(f"--methods has {', '.join(map(repr, duplicates))} twice; use --repeats for several runs")
@@ -239,23 +239,22 @@ class Plan:
             raise FlagError(f"--repeats is {self.repeats}; it must be at least 1")
 
     def jobs(self) -> list[Job]:
-        """Return all runs, seed by seed, so that every contender has a first result early."""
+        """Return all runs, seed by seed, so that every contender has an early result."""
         seeds = range(FIRST_SEED, FIRST_SEED + self.repeats)
         return [Job(contender, seed, self.folder / "runs") for seed in seeds for contender in self.contenders]
 
     def claim_folder(self) -> None:
-        """Write the conditions, so that a later call continues under the same ones.
+        """Write the conditions, so that a later call continues under the same conditions.
 
         Raises:
-            ConfigError: if the folder holds a comparison under other conditions, or cannot be written.
+            ConfigError: if the folder has a comparison under other conditions or cannot be written.
         """
         path, conditions = self.folder / "conditions.json", json.loads(json.dumps(asdict(self.conditions)))
         if path.exists():
             differing = _differences(_read(path), conditions)
             if differing:
                 raise ConfigError(
-                    f"{self.folder} holds a comparison under other conditions ({differing}); "
-                    "choose another --output-dir"
+                    f"{self.folder} has a comparison under other conditions ({differing}); choose another --output-dir"
                 )
             return
         try:

@@ -9,7 +9,7 @@ from typing import Any
 from nerfloom.comparison.measures import Row, pareto
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
-"""Okabe and Ito's colours, which colour-blind readers can distinguish."""
+"""Okabe and Ito's colours, distinguishable for colour-blind readers."""
 MISSING = "without plots: pip install matplotlib"
 """Message if matplotlib is not installed."""
 
@@ -29,10 +29,9 @@ def color_of(index: int) -> str:
 
 
 def time_against_error(rows: Sequence[Row]) -> str:
-    """Plot PSNR against seconds of training, and against seconds per rendered image, with the Pareto front in both.
+    """Plot PSNR against training seconds, and against rendering seconds per image, each with the Pareto front.
 
-    Curves are on the views evaluated during training; the final points, with a bar of one standard deviation, are on
-    all views.
+    Curves use the views evaluated during training; final points, with a bar of one standard deviation, use all views.
 
     Args:
         rows: results of the contenders.

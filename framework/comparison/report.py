@@ -40,7 +40,7 @@ class Column:
     best: Callable[[Sequence[float]], float] | None
     """`max` if higher is better, `min` if lower is better, or None."""
     same: float = 1e-9
-    """Relative difference below which two values are both the best."""
+    """Relative difference below which two values count as equally good."""
 
 
 COLUMNS = (
@@ -51,7 +51,7 @@ COLUMNS = (
     Column("floaters, %", "floaters", "{:.1f}".format, min),
     Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
     Column("steps", "steps", "{:,.0f}".format, None),
-    Column("training, rays/s", "rays_per_second", "{:,.0f}".format, None),  # of methods that draw images: pixels
+    Column("training, rays/s", "rays_per_second", "{:,.0f}".format, None),  # pixels for methods that render images
     Column("rendering, s/image", "render_seconds", "{:.2f}".format, min),
     Column("peak memory, GiB", "peak_memory_bytes", lambda value: f"{value / 2**30:.2f}", min),
     Column("parameters", "parameters", "{:,.0f}".format, min),
@@ -132,7 +132,7 @@ def _content(plan: Plan, rows: Sequence[Row], runs: Sequence[Measured]) -> dict[
 
 
 def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measured]) -> list[str]:
-    """Return the conditions shared by all runs as sentences.
+    """Return the conditions shared by all runs, as sentences.
 
     Args:
         conditions: the conditions.
@@ -164,13 +164,13 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
 
 
 def _of_all(conditions: Conditions) -> str:
-    """Return how the held-out views were chosen, if they may not be all that there are."""
+    """Return a note on the choice of held-out views, if it may exclude some."""
     most = conditions.max_eval_images
     return "" if most is None else f" (at most {most}, evenly spaced; --max-eval-images sets how many)"
 
 
 def measured(rows: Sequence[Row]) -> list[Column]:
-    """Return the columns that have a value for some contender; all of them if no contender has finished.
+    """Return the columns with a value for some contender; all of them if no contender has finished.
 
     Args:
         rows: results of the contenders.
@@ -179,7 +179,7 @@ def measured(rows: Sequence[Row]) -> list[Column]:
 
 
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the rows of the table of results: label, colour, whether on the Pareto front, and a cell for each column.
+    """Return the rows of the table of results: label, colour, Pareto flag, and a cell for each column.
 
     Args:
         rows: results of the contenders.
@@ -197,7 +197,7 @@ def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def console_table(rows: Sequence[Row]) -> Table:
-    """Return the table of results for a terminal, with a line for each measurement, as labels of methods are long.
+    """Return the table of results for a terminal, with a line for each measurement, because labels are long.
 
     Args:
         rows: results of the contenders.
@@ -222,14 +222,14 @@ def _cell(column: Column, row: Row, rows: Sequence[Row]) -> Cell:
 
 
 def _best(column: Column, value: float, others: Sequence[float]) -> bool:
-    """Return whether a value is the best of its column; if all are equal, none is."""
+    """Return whether a value is the best of its column; False if all are equal."""
     assert column.best is not None
     equal_to_best = [math.isclose(other, column.best(others), rel_tol=column.same) for other in others]
     return not all(equal_to_best) and math.isclose(value, column.best(others), rel_tol=column.same)
 
 
 def levels(rows: Sequence[Row]) -> list[int]:
-    """Return the integer PSNRs, dB, that a contender reached after its first evaluation, at most the highest sixteen.
+    """Return the integer PSNRs, dB, that contenders reached after their first evaluation; at most the highest sixteen.
 
     Args:
         rows: results of the contenders.
@@ -252,14 +252,14 @@ def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _when(row: Row, level: int) -> str:
-    """Return when a contender reached a PSNR, for people."""
+    """Return the time at which a contender reached a PSNR, as text."""
     if (time := row.seconds_to(level)) is not None:
         return f"{time:.1f}"
     return "–" if (before := row.seconds_before(level)) is None else f"< {before:.1f}"
 
 
 def machines(runs: Sequence[Measured]) -> list[str]:
-    """Return a line for each machine on which `runs` were made."""
+    """Return a description of each machine used for `runs`."""
     lines = []
     for run in runs:
         line = ", ".join(f"{name}: {value}" for name, value in run.machine.items() if value is not None)

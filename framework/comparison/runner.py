@@ -1,4 +1,4 @@
-"""Execution of a comparison's jobs, each in child processes, one after the other or one on each device."""
+"""Execution of a comparison's jobs in child processes, one after the other or one per device."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from nerfloom.training.signals import NUMBERS, Stopped, handled
 LOOK_EVERY = 0.5
 """Seconds between updates of the displayed last line of a run's output."""
 GRACE = 60.0
-"""Seconds that a run has to save before it is killed."""
+"""Seconds for a run to save before it is killed."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Failure:
 
 
 def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
-    """Train and evaluate every job that is not finished; a failure is reported, and the others continue.
+    """Train and evaluate every unfinished job; failures are reported, and the other jobs continue.
 
     Args:
         plan: the comparison.
@@ -81,10 +81,10 @@ def run_jobs(plan: Plan, jobs_at_once: int = 1) -> dict[Job, Failure]:
 
 @contextmanager
 def stoppable() -> Iterator[threading.Event]:
-    """Make Ctrl-C and SIGTERM set the event that it gives, so that running jobs can save; then raise `Stopped`.
+    """Yield an event that Ctrl-C and SIGTERM set, so that running jobs can save; then raise `Stopped`.
 
     Raises:
-        Stopped: at the end of the block, if there was such a signal.
+        Stopped: at the end of the block, if there was a signal.
     """
     stopped, signals = threading.Event(), list[int]()
 
@@ -118,7 +118,7 @@ def _devices(conditions: Conditions, jobs_at_once: int) -> Sequence[str | None]:
 
 
 def is_done(job: Job) -> bool:
-    """Return whether `job` has been trained to its end and evaluated, with images that are finite."""
+    """Return whether `job` is completely trained and evaluated, with finite images."""
     summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)
     if not isinstance(summary, dict) or summary.get("interrupted") is not False or not isinstance(evaluation, dict):
         return False
@@ -151,7 +151,7 @@ def run_job(job: Job, conditions: Conditions, device: str | None, stopped: threa
 
 
 def _run(command: list[str], job: Job, environment: dict[str, str], stopped: threading.Event) -> int:
-    """Run a command, with its output in the job's log and its last line on the terminal; return its exit status."""
+    """Run a command and return its exit status. Output goes to the job's log, and its last line to the terminal."""
     with job.log.open("ab") as log:
         log.write(("$ " + " ".join(command) + "\n").encode())
         log.flush()
@@ -181,7 +181,7 @@ def _end(process: subprocess.Popen[bytes]) -> int:
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of the file `log` that is not empty."""
+    """Return the last non-empty line of the file `log`."""
     with log.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - 4096, 0))

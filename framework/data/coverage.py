@@ -1,4 +1,4 @@
-"""Pixels without a ray: the polynomial of a lens may fold the image over within its corners."""
+"""Pixels without a ray: a lens polynomial may fold the image over before its corners."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from nerfloom.data.pixels.pixel_set import PixelSet
 BLOCK = 1 << 20
 """Number of pixels tested at once."""
 SURE = 0.99
-"""Fraction of the radius within which every position has a ray that is accepted without a test."""
+"""Positions within this fraction of the lens's radius have a ray for certain and are not tested."""
 
 
 @torch.no_grad()
 def unreachable_pixels(cameras: Cameras) -> Tensor:
-    """Return the pixels (K,) int64 whose centre has no ray, counted through all images.
+    """Return the pixels (K,) int64 whose centre has no ray, counted over all images.
 
-    The rays that cameras compute for them are finite but wrong. Only positions beyond the radius within which the lens
-    has every ray are tested, mostly none, and cameras with equal intrinsics once.
+    Rays computed for such pixels are finite but wrong. Only positions beyond the radius within which every position has
+    a ray are tested, usually none. Cameras with equal intrinsics are tested once.
 
     Args:
         cameras: cameras of any model.
@@ -44,7 +44,7 @@ def unreachable_pixels(cameras: Cameras) -> Tensor:
 
 
 def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> PixelSet | None:
-    """Return the pixels that have a ray, or None for all; report how many have none.
+    """Return the pixels that have a ray, or None for all; report the number of pixels without one.
 
     Args:
         cameras: cameras of any model.
@@ -68,7 +68,7 @@ def pixels_with_rays(cameras: Cameras, names: Sequence[str], split: str) -> Pixe
     say(
         f"split '{split}': the {cameras.model} lens has no ray for {len(unreachable)} of {total} pixels "
         f"({100 * len(unreachable) / total:.2g} %), on {int((counts > 0).sum())} of {len(cameras)} images, most on "
-        f"{names[worst]} ({int(counts[worst])}); they are not trained on"
+        f"{names[worst]} ({int(counts[worst])}); these pixels are skipped"
     )
     sets = []
     ends = torch.searchsorted(unreachable, cameras.offsets).tolist()

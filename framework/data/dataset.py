@@ -1,4 +1,4 @@
-"""Images with poses: the data set from which batches are drawn, and how it is made of what a data format reads."""
+"""Images with poses: the data set from which batches are drawn, and its construction from a parsed scene."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from nerfloom.data.sparse_depth import SparseDepth, sparse_depth
 from nerfloom.data.travel import Travel
 
 Masks = Literal["auto", "ignored", "empty"]
-"""Meaning of masked-out pixels: nothing is known about them, or nothing is there."""
+"""Meaning of masked-out pixels. ignored: unknown content. empty: background."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class Dataset:
     scale: float
     """Scene units per unit of the input."""
     drawn: PixelSet | None = None
-    """Pixels from which batches are drawn, counted through all images; None for all."""
+    """Pixels from which batches are drawn, counted over all images; None for all."""
     kept: PixelSet | None = None
     """Pixels that have a ray and are not masked out; None for all."""
     opaque: PixelSet | None = None
-    """Pixels that masks keep, if the masked-out ones are empty, with alpha 0; otherwise None."""
+    """Pixels that masks keep, if masked-out pixels are empty, with alpha 0; otherwise None."""
     light: Tensor | None = None
     """(M, 3, Q) `light.light_of` each image; None if unknown, or if images have an alpha channel."""
     depths: Tensor | None = None
@@ -78,13 +78,13 @@ class Dataset:
     sparse_depth: SparseDepth | None = None
     """Pixels in which images see sparse points, and their distances; None if there are none."""
     reductions: Tensor | None = None
-    """(M,) int64 factor by which each image is smaller than it could be, if images are used at several sizes."""
+    """(M,) int64 factor by which each image is reduced relative to full size, if images are used at several sizes."""
     scene_indices: Tensor | None = None
-    """(M,) int64 on the CPU, number of the scene that each image shows; None if all show the same."""
+    """(M,) int64 on the CPU, index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
-    """(M,) bool on the CPU, images that a method may render the others from, and is not judged by; None without."""
+    """(M,) bool on the CPU, source images, from which others may be rendered; they are not evaluated. None without."""
     travel: Travel | None = None
-    """How far matter may move, on the CPU, found from the images; None if that is unknown, or nothing asks for it."""
+    """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -96,9 +96,9 @@ class Dataset:
 
     @cached_property
     def image_weights(self) -> Tensor | None:
-        """(M,) weight of each image's pixels in a loss, if images are at several sizes: with mean 1 over all pixels.
+        """(M,) weight of each image's pixels in a loss, if images have several sizes; the mean over all pixels is 1.
 
-        A pixel of an image at 1/s of its size stands for s^2 pixels: Mip-NeRF (Barron et al. 2021), section 4.
+        A pixel of an image reduced by s stands for s^2 pixels: Mip-NeRF (Barron et al. 2021), section 4.
         """
         if self.reductions is None:
             return None
@@ -120,7 +120,7 @@ class Dataset:
         """Return the stored colours of pixels, on the device of batches.
 
         Args:
-            flat: (R,) numbers of the pixels, counted through all images, on any device.
+            flat: (R,) numbers of the pixels, counted over all images, on any device.
 
         Returns:
             (R, 3 or 4) uint8.
@@ -144,24 +144,24 @@ class Dataset:
         return pixels.view(height, width, -1)
 
     def view(self, index: int, stride: int = 1) -> View:
-        """Return the camera of image `index`, at its time and in its scene.
+        """Return the camera of image `index`, with its time and scene.
 
         Args:
-            index: which image.
-            stride: only every so many-th row and column of its pixels.
+            index: index of the image.
+            stride: distance between the rows and columns in use.
         """
         view = View.of(self.cameras, index, self.times, stride)
         return view if self.scene_indices is None else replace(view, scene=int(self.scene_indices[index]))
 
     def kept_of(self, index: int) -> Tensor | None:
-        """Return which pixels of image `index` are kept, (H, W) bool, or None if all pixels of the data set are."""
+        """Return the pixels of image `index` that are kept, (H, W) bool, or None if all pixels of the data set are."""
         if self.kept is None:
             return None
         start, end = self.cameras.offsets[index : index + 2].tolist()
         return self.kept.mask(start, end).view(int(self.cameras.heights[index]), -1)
 
     def drawing(self, pixels: PixelSet) -> Dataset:
-        """Return the data set with `drawn` restricted to some pixels, or unchanged if none of them is in `drawn`.
+        """Return the data set with `drawn` restricted to some pixels; unchanged if that would leave none.
 
         Args:
             pixels: pixels to draw from.
@@ -178,8 +178,7 @@ class Dataset:
 
         Args:
             device: the device of batches.
-            with_pixels: whether the pixels are moved there too, if they are in memory. If not, those that are drawn are
-                copied batch by batch.
+            with_pixels: whether to move pixels in memory as well. If not, drawn pixels are copied batch by batch.
         """
         with_pixels = with_pixels and self.mapped is None
         return replace(
@@ -197,7 +196,7 @@ class Dataset:
 
 
 def existing_files(paths: Sequence[Path], split: str) -> Tensor:
-    """Return the indices of files that exist, and report the number of missing ones and the first.
+    """Return the indices of existing files, and report the number of missing files and the first one.
 
     Args:
         paths: files.
@@ -231,12 +230,13 @@ def load_dataset(
         masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
 
     Raises:
-        DataError: if an image's size differs from its camera's, no image is readable, or rays have no length.
+        DataError: if an image's size differs from its camera's, no image is readable, or the scene's distances are
+            invalid.
     """
     if not 0 <= parsed.near < parsed.far < math.inf:
         raise DataError(
-            f"split '{split}': the scene is from {parsed.near} to {parsed.far} away from cameras; --near must be at "
-            "least 0 and less than --far, which must be finite"
+            f"split '{split}': near is {parsed.near} and far is {parsed.far}; --near must be at least 0 and less than "
+            "--far, which must be finite"
         )
     count = len(parsed.image_paths)
     reductions = 2 ** torch.arange(parsed.num_scales).repeat_interleave(count)  # all images at one size, then the next
@@ -259,8 +259,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     """Construct a data set from decoded images.
 
     Args:
-        parsed: the parsed scene of those images, with cameras for their decoded sizes. Depth images are read; of all
-            other files, which need not exist, only the names are used.
+        parsed: the parsed scene of these images, with cameras for their decoded sizes. Depth images are read; of all
+            other files only the names are used.
         decoded: the pixels (`decoding.decode` or `decoding.from_arrays`).
         split: name of the split in messages.
         masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
@@ -277,7 +277,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     if visible is not None:
         kept = visible if kept is None else PixelSet.shared([kept, visible], 2)
         if not len(kept):
-            raise DataError(f"split '{split}': masks keep only pixels for which the lens has no ray")
+            raise DataError(f"split '{split}': the masks keep only pixels without a ray through the lens")
     sparse = _sparse_depth(parsed, cameras, kept if opaque is None else opaque)
     scene = Scene(
         box=parsed.box,
@@ -291,7 +291,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         poses=parsed.poses,
         warped=isinstance(cameras, NdcCameras),
         has_depth=parsed.depth_paths is not None and decoded.mapped is None,
-        # `light` is None for an object that is cut out: each of its sides is lit differently.
+        # `light` is None for an object cut out by masks: each of its sides is lit differently.
         appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
         camera_to_worlds=cameras.camera_to_worlds,
         image_pixels=int(cameras.offsets[-1]) // len(cameras),
@@ -321,9 +321,9 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
 
 
 def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:
-    """Return whether masks cut an object out of its surroundings, rather than hide parts of the images.
+    """Return whether masks cut an object out of its surroundings, instead of hiding parts of the images.
 
-    They do if they remove more than half of all pixels, and not the same ones of every image, as for the rim of a lens.
+    This is the case if they remove more than half of all pixels, and not the same pixels of every image (a lens rim).
 
     Args:
         kept: pixels that the masks keep.
@@ -337,7 +337,7 @@ def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:
 
 
 def _sparse_depth(parsed: ParsedScene, cameras: Cameras, shown: PixelSet | None) -> SparseDepth | None:
-    """Return the pixels, of those `shown` (None for all), in which images see sparse points; None if there are none."""
+    """Return the pixels in `shown` (None for all) in which images see sparse points; None if there are none."""
     if parsed.sightings is None or isinstance(cameras, NdcCameras):
         return None
     found = sparse_depth(parsed.sightings, cameras)

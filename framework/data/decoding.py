@@ -1,6 +1,6 @@
-"""Decoding of image files, each directly to its final position in memory or in the cache's file.
+"""Decoding of image files, each directly to its final position in memory or in the cache file.
 
-Loading therefore takes memory for the pixels of the data set (none if they go to a file) and for the few images being
+So loading needs memory only for the pixels of the data set (none if they go to a file) and for the few images being
 decoded.
 """
 
@@ -28,7 +28,7 @@ from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.pixels.store import MemoryStore, PixelStore, drop_fourth, move
 
 WORKERS = min(os.cpu_count() or 1, 8)
-"""Images decoded at once; each takes several times the memory of its pixels meanwhile."""
+"""Number of images decoded at once; each temporarily takes several times the memory of its pixels."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Decoded:
 
 
 def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
-    """Decode images into memory or, if they exceed the limit, into a file, unless an earlier run has written it.
+    """Decode images into memory or, if they exceed the limit, into a cache file that later runs reuse.
 
     Unreadable images are skipped and reported.
 
@@ -97,17 +97,17 @@ def decode(files: ImageFiles, memory: PixelMemory) -> Decoded:
         )
         cached = _write(files, path, size, channels)
     else:
-        say(f"split '{files.split}': using the pixels that an earlier run decoded into {path}")
+        say(f"split '{files.split}': using decoded pixels of an earlier run in {path}")
     mapped = MappedPixels(path, int(cached["pixels"]), int(cached["channels"]), memory.limit)
     return _decoded(files, cached, mapped.pixels, mapped)
 
 
 def from_arrays(images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None = None) -> Decoded:
-    """Return images given as arrays in the form of decoded ones.
+    """Return images given as arrays in the form of decoded images.
 
     Args:
         images: M arrays (H, W, 3 or 4) uint8; the fourth channel is straight alpha.
-        masks: M arrays (H, W) bool, true for pixels to train on; None for all.
+        masks: M arrays (H, W) bool, True for pixels to train on; None for all.
 
     Raises:
         DataError: if an array has another type or shape, or the masks keep no pixel.
@@ -121,7 +121,7 @@ def from_arrays(images: Sequence[np.ndarray], masks: Sequence[np.ndarray] | None
     if masks is not None:
         kept = PixelSet.of_mask(torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks])))
         if not len(kept):
-            raise DataError("the masks keep no pixel; they must be true for pixels to train on")
+            raise DataError("the masks keep no pixel; True marks pixels to train on")
         kept = None if len(kept) == len(pixels) else kept
     optional_masks: Sequence[np.ndarray | None] = [None] * len(images) if masks is None else masks
     light = np.stack([light_of(image, mask) for image, mask in zip(images, optional_masks, strict=True)])
@@ -136,7 +136,7 @@ def _channels(image: np.ndarray, count: int) -> np.ndarray:
 
 
 def _write(files: ImageFiles, path: Path, size: int, channels: int) -> dict[str, np.ndarray]:
-    """Decode into a temporary file, and rename it when it is complete."""
+    """Decode into a temporary file and rename it when complete."""
     store = temporary_store(path, size)
     try:
         facts = _fill(files, store, channels)
@@ -157,11 +157,11 @@ class _Image:
     opaque: bool
     light: np.ndarray
     kept: PixelSet | None
-    """Pixels that its mask keeps, counted from its own first pixel."""
+    """Pixels that its mask keeps, counted within the image."""
 
 
 def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.ndarray]:
-    """Decode all images into a store, the readable ones without gaps; return the arrays that `pack` stores."""
+    """Decode all images into a store, readable ones without gaps; return the arrays for `pack`."""
     counts = [width * height for width, height in files.sizes]
     starts = [0, *accumulate(counts)]
 
@@ -198,7 +198,7 @@ def _fill(files: ImageFiles, store: PixelStore, channels: int) -> dict[str, np.n
 
 
 def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[str, np.ndarray]:
-    """Return the runs of pixels that the masks keep in all images; an empty dictionary if they keep all."""
+    """Return the runs of pixels that the masks keep in all images; empty if they keep all."""
     if not any(image.kept is not None for image in left.values()):
         return {}
     starts, lengths, first = [], [], 0
@@ -212,14 +212,14 @@ def _kept_runs(files: ImageFiles, left: dict[int, _Image], total: int) -> dict[s
     runs = {"kept_starts": torch.cat(starts).numpy(), "kept_lengths": torch.cat(lengths).numpy()}
     used = runs["kept_lengths"].sum()
     if used == 0:
-        raise DataError(f"the masks of split '{files.split}' keep no pixel; they must be white for pixels to train on")
+        raise DataError(f"the masks of split '{files.split}' keep no pixel; white marks pixels to train on")
     return runs if used < total else {}
 
 
 def _decode_one(
     files: ImageFiles, indices: list[int], store: PixelStore, starts: list[int], channels: int
 ) -> list[_Image | DataError]:
-    """Decode a file to the positions of its images in the store; return its error for each if it is unreadable."""
+    """Decode a file to the positions of its images in the store; return its error for each image if unreadable."""
     path = files.images[indices[0]]
     images: list[_Image | DataError] = []
     try:

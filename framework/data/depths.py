@@ -1,4 +1,4 @@
-"""Depth images: measured distances of the content of images."""
+"""Depth images: measured distances of image content."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ T = TypeVar("T")
 DEPTH_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".exr")
 """Suffixes of depth images, in lower case."""
 MOST_PIXELS = 64
-"""Maximum number of pixels of a depth image per pixel of its image; most have less than one."""
+"""Maximum number of depth pixels per image pixel; usually there is less than one."""
 
 
 def read_depth(path: Path, width: int, height: int) -> np.ndarray:
@@ -39,7 +39,7 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
         (H, W) float32.
 
     Raises:
-        DataError: if the file is missing, unreadable or not a single channel of a plausible size.
+        DataError: if the file is missing, unreadable, or not a single channel of plausible size.
     """
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
@@ -48,10 +48,10 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     shape = _or_unreadable(path, _exr_shape if is_exr else _shape) if stored is None else stored.shape
     if len(shape) != 2 or 0 in shape:
         raise DataError(f"the depth image {path} has shape {shape}; it must be (height, width)")
-    if shape[0] * shape[1] > MOST_PIXELS * width * height:  # before memory is allocated
+    if shape[0] * shape[1] > MOST_PIXELS * width * height:  # checked before memory is allocated
         raise DataError(
-            f"the depth image {path} has {shape[1]} x {shape[0]} pixels, and its image {width} x {height}; "
-            f"it may have {MOST_PIXELS} times as many pixels at most"
+            f"the depth image {path} has {shape[1]} x {shape[0]} pixels, its image {width} x {height}; "
+            f"the limit is {MOST_PIXELS} times as many pixels"
         )
     rows, columns = (
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
@@ -98,13 +98,13 @@ def read_depths(paths: Sequence[Path | None], cameras: Cameras, unit: float) -> 
 
     Returns:
         (P,) float16 depths along the cameras' axes, scene units, 0 where unknown. float16 has a relative precision of
-        1/2000, which is better than that of depth cameras.
+        1/2000, better than depth cameras.
     """
     parts = []
     for path, width, height in zip(paths, cameras.widths.tolist(), cameras.heights.tolist(), strict=True):
         depth = np.zeros((height, width), np.float32) if path is None else read_depth(path, width, height) * unit
         with np.errstate(over="ignore"):
-            depth = depth.astype(np.float16)  # depths beyond its range become infinite, and are treated as unknown
+            depth = depth.astype(np.float16)  # depths out of range become infinite, which counts as unknown
         parts.append(torch.from_numpy(np.where(np.isfinite(depth) & (depth > 0), depth, 0).reshape(-1)))
     return torch.cat(parts)
 

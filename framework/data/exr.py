@@ -1,6 +1,6 @@
-"""Depth in OpenEXR files (Kainz, Bogart and Stanczyk 2009): one channel of a file of scanlines, in plain Python.
+"""Depth in OpenEXR files (Kainz, Bogart and Stanczyk 2009): one channel of a scanline file, in plain Python.
 
-Read are channels of 16 and 32 bit floats and of 32 bit integers, without compression or with RLE, ZIPS or ZIP. Other
+Supported are channels of 16 and 32 bit floats and 32 bit integers, uncompressed or with RLE, ZIPS or ZIP. Other
 compressions and tiles are refused by name.
 """
 
@@ -17,17 +17,17 @@ from nerfloom.base.errors import DataError
 
 MAGIC = b"\x76\x2f\x31\x01"
 TILED_OR_SEVERAL = 0x200 | 0x800 | 0x1000
-"""Flags of files of tiles, of deep pixels or of several parts."""
+"""Flags of tiled, deep or multi-part files."""
 TYPES: dict[int, np.dtype] = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
-"""Number of a channel's type -> numpy's type."""
+"""Channel type number -> numpy type."""
 ROWS = {0: 1, 1: 1, 2: 1, 3: 16}
-"""Number of a compression that is read -> rows of a block: none, RLE, ZIPS and ZIP."""
+"""Supported compression number -> rows of a block: none, RLE, ZIPS and ZIP."""
 COMPRESSIONS = ("none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K")
-"""Names of compressions by their number."""
+"""Names of compressions, by number."""
 LIKELIEST = ("Z", "V", "DEPTH", "DISTANCE", "Y", "R")
-"""Names of the channel with depths, without the layer and in capitals, the likeliest first."""
+"""Names of a depth channel, without layer and in capitals, most likely first."""
 LONGEST_TEXT = 256
-"""Maximum number of bytes of a name in the header, with its end."""
+"""Maximum number of bytes of a name in the header, terminator included."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class ExrHeader:
     channels: tuple[tuple[str, np.dtype], ...]
     """Name and type of each channel, in the order of a row."""
     compression: int
-    """Number of the compression, a key of `ROWS`."""
+    """Compression number, a key of `ROWS`."""
     box: tuple[int, int, int, int]
     """First column, first row, last column and last row."""
     start: int
-    """Place of the table of blocks in the file, bytes."""
+    """Position of the block table in the file, bytes."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -57,37 +57,37 @@ def read_header(content: bytes) -> ExrHeader:
         content: the file.
 
     Raises:
-        DataError: if it is no such file, or of a kind that is not read.
+        DataError: if the content is not OpenEXR, or of an unsupported kind.
     """
     if content[:4] != MAGIC:
         raise DataError("its content is not OpenEXR")
     attributes, start = _attributes(content)
     (flags,) = struct.unpack_from("<I", content, 4)
     if flags & TILED_OR_SEVERAL:
-        raise DataError("it has tiles, deep pixels or several parts; save it as scanlines with one part")
+        raise DataError("tiles, deep pixels and several parts are not supported; save one part as scanlines")
     channels, compression = _channels(attributes["channels"]), attributes["compression"][0]
     if compression not in ROWS:
         name = COMPRESSIONS[compression] if compression < len(COMPRESSIONS) else str(compression)
-        raise DataError(f"its compression {name} is not read; save it with ZIP, or as .npy")
+        raise DataError(f"its compression {name} is not supported; save it with ZIP, or as .npy")
     left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     if left > right or top > bottom:
-        raise DataError("it has no pixel")
+        raise DataError("it has no pixels")
     return ExrHeader(channels, compression, (left, top, right, bottom), start)
 
 
 def depth_channel(header: ExrHeader) -> str:
-    """Return the name of the channel with depths: the only one, or that with a likely name.
+    """Return the name of the depth channel: the only channel, or one with a likely name.
 
     Args:
         header: the file's header.
 
     Raises:
-        DataError: if no channel is likely.
+        DataError: if there are several channels and none has a likely name.
     """
     names = [name for name, _ in header.channels]
     ranked = [name for likely in LIKELIEST for name in names if name.rpartition(".")[2].upper() == likely]
     if len(names) > 1 and not ranked:
-        raise DataError(f"none of its channels {', '.join(names)} is depth; name it Z, or save it alone")
+        raise DataError(f"none of its channels {', '.join(names)} looks like depth; name it Z, or save it alone")
     return names[0] if len(names) == 1 else ranked[0]
 
 
@@ -126,7 +126,7 @@ def read_channel(content: bytes, header: ExrHeader, name: str) -> np.ndarray:
 
 
 def _attributes(content: bytes) -> tuple[Mapping[str, bytes], int]:
-    """Return the header's attributes by name, and where it ends."""
+    """Return the header's attributes by name, and the position of its end."""
     found: dict[str, bytes] = {}
     place = 8
     try:
@@ -154,7 +154,7 @@ def _channels(attribute: bytes) -> tuple[tuple[str, np.dtype], ...]:
             number, _, *sampling = struct.unpack_from("<iIii", attribute, place)
             place += 16
             if number not in TYPES or sampling != [1, 1]:
-                raise DataError(f"its channel {name} has another type, or fewer pixels than the others")
+                raise DataError(f"its channel {name} has an unsupported type, or fewer pixels than the others")
             found.append((name, TYPES[number]))
     except (IndexError, struct.error) as error:
         raise DataError("its list of channels is damaged; copy it again") from error
@@ -162,7 +162,7 @@ def _channels(attribute: bytes) -> tuple[tuple[str, np.dtype], ...]:
 
 
 def _text(content: bytes, place: int) -> tuple[str, int]:
-    """Return the text at a place, up to a zero, and the place after it."""
+    """Return the text at a position, up to a zero, and the position after it."""
     end = content.find(b"\0", place, place + LONGEST_TEXT)
     if end < 0:
         raise DataError("its header is damaged; copy it again")
@@ -170,12 +170,12 @@ def _text(content: bytes, place: int) -> tuple[str, int]:
 
 
 def _unpacked(block: bytes, compression: int, size: int) -> bytes:
-    """Return the `size` bytes of a block: uncompressed ones are stored as they are where compression does not pay."""
+    """Return the `size` bytes of a block; blocks that compression does not shrink are stored uncompressed."""
     if compression == 0 or len(block) == size:
         data = block
     else:
         data = _rle(block, size) if compression == 1 else _inflated(block, size)
-        # Differences from the byte before, plus 128; then the bytes at even places before those at odd ones.
+        # Differences from the previous byte, plus 128; then bytes at even positions before those at odd ones.
         sums = np.frombuffer(data, np.uint8).astype(np.int64)
         sums[1:] -= 128
         parts = sums.cumsum().astype(np.uint8)
@@ -189,7 +189,7 @@ def _unpacked(block: bytes, compression: int, size: int) -> bytes:
 
 
 def _inflated(block: bytes, size: int) -> bytes:
-    """Return what zlib has packed, at most a byte more than expected."""
+    """Return the data inflated by zlib, at most one byte more than expected."""
     try:
         return zlib.decompressobj().decompress(block, size + 1)
     except zlib.error as error:
@@ -197,7 +197,7 @@ def _inflated(block: bytes, size: int) -> bytes:
 
 
 def _rle(block: bytes, size: int) -> bytes:
-    """Return what is packed as runs: n >= 0 and a byte to repeat n + 1 times, or n < 0 and -n bytes."""
+    """Decode runs: n >= 0 and a byte to repeat n + 1 times, or n < 0 and -n bytes."""
     data, place = bytearray(), 0
     while place < len(block) - 1 and len(data) <= size:
         length = int.from_bytes(block[place : place + 1], "little", signed=True)

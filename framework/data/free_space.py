@@ -1,7 +1,7 @@
-"""Free space before cameras: what lies nearer than all that an image is known to show, or than a second image can see.
+"""Free space before cameras: nearer than everything an image is known to show, or than a second image can see.
 
-Matter right before a camera is seen by that camera alone, so it can show whatever makes the camera's image right, and
-is in the way of every other view.
+Matter right before a camera is seen by that camera alone. It can take any appearance that fits the camera's image, and
+blocks every other view.
 """
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.sparse_depth import SparseDepth
 
 CLEAR_SHARE = 0.7
-"""Distance up to which space before a camera is taken to be empty, as a share of that of the nearest points it sees."""
+"""Space up to this fraction of the distance of a camera's nearest points counts as empty."""
 NEAREST = 0.02
-"""Share of a camera's points that may be nearer than "the nearest", as a few points are always wrong."""
+"""Fraction of a camera's points that may be nearer than its "nearest" points, since a few points are always wrong."""
 FEWEST_POINTS = 10
-"""Minimum number of points of a camera whose nearest mean something."""
+"""Minimum number of points of a camera for an estimate."""
 RAYS, STEPS = 8, 24
-"""Rays along each side of an image, and distances along a ray, that are asked whether another camera sees them."""
+"""Number of rays along each side of an image, and of distances along a ray, tested for visibility in other cameras."""
 MOST_CAMERAS = 64
-"""Maximum number of other cameras that are asked."""
+"""Maximum number of other cameras tested."""
 FARTHEST = 2.0
-"""Largest distance of space that is taken to be empty only because no other camera sees it, scene units."""
+"""Maximum distance of space that counts as empty because no other camera sees it, scene units."""
 ALONE = 0.1
-"""Maximum share of an image's rays of which another camera may see anything where it is said to see alone."""
+"""Maximum fraction of an image's rays that another camera may see where the image counts as alone."""
 
 
 @torch.no_grad()
 def clear_distances(cameras: Cameras, known: SparseDepth | None, near: float, far: float) -> Tensor:
-    """Return the distance (M,) from each camera before which its image shows nothing, as far as can be told.
+    """Return the distance (M,) from each camera up to which its image shows nothing, as far as is known.
 
     Args:
         cameras: M training cameras.
-        known: pixels of their images whose distance is known; None if there are none.
+        known: pixels of their images with known distance; None if there are none.
         near, far: ends of the scene's rays, scene units.
     """
     alone = distances_alone(cameras, near, min(far, FARTHEST))
@@ -43,11 +43,11 @@ def clear_distances(cameras: Cameras, known: SparseDepth | None, near: float, fa
 
 
 def before_points(cameras: Cameras, known: SparseDepth) -> Tensor:
-    """Return `CLEAR_SHARE` of the distance (M,) of the nearest points that each image shows; 0 where it shows too few.
+    """Return `CLEAR_SHARE` of the distance (M,) of the nearest points in each image; 0 for images with too few points.
 
     Args:
         cameras: M cameras.
-        known: pixels of their images whose distance is known.
+        known: pixels of their images with known distance.
     """
     images = torch.searchsorted(cameras.offsets, known.pixels, right=True) - 1
     counts = torch.bincount(images, minlength=len(cameras))
@@ -62,13 +62,13 @@ def before_points(cameras: Cameras, known: SparseDepth) -> Tensor:
 
 
 def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
-    """Return the distance (M,) from each camera up to which no other camera sees what it sees.
+    """Return the distance (M,) from each camera up to which no other camera sees the same space.
 
-    Of a single camera it is 0: it is alone everywhere, which says nothing of what is there.
+    For a single camera it is 0: no other camera sees anything, which says nothing about the space.
 
     Args:
         cameras: M cameras.
-        near, far: least and largest distance that is looked at, scene units.
+        near, far: minimum and maximum distance tested, scene units.
     """
     device = cameras.fx.device
     if len(cameras) == 1:

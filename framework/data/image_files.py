@@ -13,13 +13,13 @@ from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 from nerfloom.base.errors import DataError
 from nerfloom.data.suffixes import UNREAD_SUFFIXES
 
-# Pillow detects the format from the content, whatever the name, and would run Ghostscript, an interpreter, for EPS.
+# Pillow detects the format from the content, not from the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False
 
 LARGEST_FILE = 2**30
 """Maximum size of an image file, bytes."""
 BAND = 64
-"""Rows of a reduced image that are computed at once: float64 takes eight times the memory of the source pixels."""
+"""Number of rows of a reduced image computed at once: float64 takes eight times the memory of the source pixels."""
 
 
 def image_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -29,7 +29,7 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
         paths: image files.
 
     Raises:
-        DataError: if none is readable.
+        DataError: if no file is readable.
     """
     reason = ""
     for path in paths:
@@ -37,14 +37,14 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
             height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]  # the first frame of an animation
             if width and height:
                 return width, height
-            reason = reason or f"{path} has no pixel"
+            reason = reason or f"{path} has no pixels"
         except Exception as error:  # any type, as in `read_image`
             reason = reason or str(unreadable(path, error))
-    raise DataError(reason or "there is no image to read a size from")
+    raise DataError(reason or "there are no images")
 
 
 class Content(io.BytesIO):
-    """The whole content of an image file. From an open file, Pillow would read as many bytes as a chunk claims to have.
+    """The whole content of an image file. With an open file, Pillow would allocate the bytes that a chunk claims.
 
     Args:
         path: the file.
@@ -56,7 +56,7 @@ class Content(io.BytesIO):
 
     def __init__(self, path: Path) -> None:
         if (size := path.stat().st_size) > LARGEST_FILE:
-            raise DataError(f"{path} has {size / 1e9:.1f} GB; images may have 1 GB at most")
+            raise DataError(f"{path} has {size / 1e9:.1f} GB; the limit for images is 1 GB")
         super().__init__(path.read_bytes())
         self.path = path
 
@@ -65,7 +65,7 @@ class Content(io.BytesIO):
 
 
 def read_image(path: Path, factor: int = 1) -> np.ndarray:
-    """Read an 8-bit image as (H, W, 4) uint8 with straight alpha; of an animation, the first frame.
+    """Read an 8-bit image as (H, W, 4) uint8 with straight alpha; an animation's first frame.
 
     Args:
         path: the file.
@@ -100,18 +100,18 @@ def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
 
     Args:
         image: (H, W, 4) uint8 with straight alpha.
-        factor: number of pixels along the side of a block that becomes one pixel.
+        factor: side of a block of pixels that becomes one pixel.
 
     Returns:
         (H // factor, W // factor, 4) uint8.
 
     Raises:
-        DataError: if no pixel is left.
+        DataError: if no pixels remain.
     """
     height, width = image.shape[0] // factor, image.shape[1] // factor
     if height == 0 or width == 0:
         size = f"{image.shape[1]}x{image.shape[0]}"
-        raise DataError(f"an image of {size} pixels has none left at --downscale-factor {factor}")
+        raise DataError(f"an image of {size} pixels has none left at --downscale-factor {factor}; use a smaller factor")
     out = np.empty((height, width, 4), np.uint8)
     for top in range(0, height, BAND):
         band = image[top * factor : min(top + BAND, height) * factor, : width * factor]
@@ -132,7 +132,7 @@ def may_be_transparent(path: Path) -> bool:
 
 
 def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
-    """Return the error for an unreadable image, in words that say what to do; decoders' own messages are not for users.
+    """Return the error for an unreadable image, with advice instead of the decoder's message.
 
     Args:
         path: the file.
@@ -156,9 +156,9 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
     elif unidentified and path.suffix.lower() == ".avif" and not features.check("avif"):
         reason = "AVIF needs Pillow 11.3 or later, built with it: pip install --upgrade pillow"
     elif unidentified and path.suffix.lower() in UNREAD_SUFFIXES:
-        reason = f"{path.suffix} is not read; convert it to PNG or JPEG"
+        reason = f"{path.suffix} files are not supported; convert it to PNG or JPEG"
     elif unidentified:
-        reason = "its content is no image, or its beginning is damaged; copy it again"
+        reason = "it is not an image, or its beginning is damaged; copy it again"
     elif isinstance(error, Image.DecompressionBombError):
         reason = "it has too many pixels; reduce it"
     else:

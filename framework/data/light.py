@@ -1,8 +1,7 @@
 """Differences in light, exposure and white balance between the images of a scene.
 
-Images of different content differ in colour even in the same light. If the light changes, however, dark and bright
-parts change together. An image is therefore described by quantiles, and the part of their change that all quantiles
-share is attributed to the light.
+Images of different content differ in colour even in the same light. But if the light changes, dark and bright parts
+change together. So an image is described by quantiles, and a change common to all quantiles is attributed to the light.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ import torch
 from torch import Tensor
 
 GRID = 4096
-"""Maximum number of pixels of an image that are used."""
+"""Maximum number of pixels of an image used."""
 QUANTILES = (10, 25, 50, 75, 90)
 """Quantiles, per cent."""
 FEWEST = 64
-"""Minimum number of usable pixels; an image with fewer is left out."""
+"""Minimum number of usable pixels; images with fewer are ignored."""
 APPEARANCE_STOPS = 0.13
-"""Spread in stops from which on the light is said to vary. Of seven captures, five in steady light were at 0.02 to
-0.09; one with dimmed lamps was at 0.20, and one gathered from many cameras and days at 0.29."""
+"""Minimum spread in stops for varying light. Of seven captures, five in steady light had 0.02 to 0.09; one with dimmed
+lamps had 0.20, and one gathered from many cameras and days had 0.29."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -27,8 +26,8 @@ def light_of(image: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:
     """Return quantiles of an image's luminance and colour ratios.
 
     Args:
-        image: (H, W, 3 or 4) uint8; pixels that are not opaque are left out.
-        kept: (H, W) bool, the pixels to use; all if None.
+        image: (H, W, 3 or 4) uint8; pixels that are not opaque are ignored.
+        kept: (H, W) bool, pixels to use; None for all.
 
     Returns:
         (3, Q) float32, in stops: quantiles of log2 of luminance, red over green, and blue over green. NaN if too few
@@ -43,7 +42,7 @@ def light_of(image: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:
         return np.full((3, len(QUANTILES)), np.nan, np.float32)
     stored = pixels[usable, :3] / 255
     linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
-    # The offsets bound the influence of dark pixels: nine stops below white for luminance, and 0.01 for colours, which
+    # The offsets limit the influence of dark pixels: nine stops below white for luminance, and 0.01 for colours, which
     # are noise in the dark.
     light = np.log2(linear @ _LUMINANCE + 2**-9)
     red, blue = (np.log2((linear[:, c] + 0.01) / (linear[:, 1] + 0.01)) for c in (0, 2))
@@ -53,9 +52,9 @@ def light_of(image: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:
 def light_spread(light: Tensor) -> float:
     """Return the spread of the light between images, in stops.
 
-    For each image, the differences of its quantiles from their medians over all images count by the smallest of them if
-    all have the same sign, and as zero otherwise. The root mean square over the images is taken for luminance and both
-    colour ratios, and the largest of the three is returned.
+    For each image, the quantiles are compared with their medians over all images. If all differences have the same
+    sign, the smallest one counts; otherwise 0 does. The result is the largest, over luminance and both colour ratios,
+    of the root mean square over the images.
 
     Args:
         light: (M, 3, Q) `light_of` each of M images.

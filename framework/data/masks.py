@@ -18,17 +18,17 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     """Read the mask of an image.
 
     The mask may be larger or smaller than the image by an integer factor, apart from the remainder that is cut off when
-    images are reduced; each pixel then takes the nearest value.
+    images are reduced. Each pixel takes the nearest value.
 
     Args:
         path: the mask's file.
         width, height: size of the image, pixels.
 
     Returns:
-        (H, W) bool, true for pixels to train on.
+        (H, W) bool, True for pixels to train on.
 
     Raises:
-        DataError: if the file is missing, unreadable or of another size.
+        DataError: if the file is missing, unreadable or has another size.
     """
     if not path.is_file():
         raise DataError(f"the mask {path} does not exist")
@@ -37,7 +37,7 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     except Exception as error:  # as in `read_image`
         raise unreadable(path, error, "the mask") from error
     if not grey.size:
-        raise DataError(f"the mask {path} has no pixel")
+        raise DataError(f"the mask {path} has no pixels")
     used = grey >= THRESHOLD
     down, up = round(used.shape[1] / width), round(width / used.shape[1])
     if _is_multiple(used.shape, (height, width), down):
@@ -47,12 +47,12 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     else:
         raise DataError(
             f"the mask {path} is {used.shape[1]}x{used.shape[0]} pixels, but its image is {width}x{height}; "
-            "one must be an integer multiple of the other"
+            "one size must be an integer multiple of the other"
         )
     rows, columns = (np.minimum(index, size - 1) for index, size in zip(indices, used.shape, strict=True))
     return used[np.ix_(rows, columns)]
 
 
 def _is_multiple(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
-    """Return whether a size is `factor` times another, apart from a remainder."""
+    """Return whether a size is `factor` times another, up to a remainder."""
     return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))

@@ -1,8 +1,8 @@
-"""Names of files in a data set, and on the disk: one place that matches the two where they are written differently.
+"""Matching of a data set's file names with the files on the disk, where spellings may differ.
 
-A name is first looked for as it is written, then with other separators, in another encoding, in another case, with
-another ending, and, if no name at all was found so, in another folder. A file is taken only if no other file and no
-other name comes into question, and what was taken is said.
+A name is looked for as written, then with other separators, in another encoding, in another case, with another ending,
+and, if no name is found at all, in another folder. A match counts only if it is unique both ways. Differences are
+reported.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from nerfloom.base.console import say
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
 LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
-"""Endings that are tried, in this order, for a name without one."""
+"""Endings tried, in this order, for a name without one."""
 REDUCED = (1, 2, 4, 8)
-"""Factors of images that were reduced in advance; images reduced by 2 are in `images_2`."""
+"""Factors of images reduced in advance; `images_2` holds images reduced by 2."""
 MOST_FILES = 200_000
-"""Maximum number of files below a folder among which names are looked for."""
+"""Maximum number of files below a folder that are searched."""
 COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
-"""Beginnings of the names of folders with files that have the names of images, in lower case."""
+"""Beginnings of names of folders whose files accompany images under the same names, in lower case."""
 MOST_FOLDERS = 100
-"""Maximum number of folders that are looked into to find one image."""
+"""Maximum number of folders searched for one image."""
 MOST_NAMED = 3
-"""Maximum number of names that a message suggests."""
+"""Maximum number of names suggested in a message."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Files that are meant by names."""
+    """Files matched with names."""
 
     files: dict[str, str]
-    """Name as it is written -> path in the folder, with slashes; names that were not found are missing."""
+    """Name as written -> path in the folder, with slashes; names without a match are missing."""
     notes: tuple[str, ...]
-    """A sentence for each difference between names and the disk, with their number and an example."""
+    """A sentence for each kind of difference between names and files, with their number and an example."""
 
 
 def on_disk(
@@ -53,20 +53,20 @@ def on_disk(
     quiet: bool = False,
     shared: int = 1,
 ) -> tuple[Path, ...]:
-    """Return the files that names mean, and say where they are written differently on the disk.
+    """Return the files that match names, and report names that are spelled differently on the disk.
 
     Args:
-        folder: the folder that the names are relative to.
-        names: M names, as a data set has them.
-        what: what the files are, as a plural, in messages.
+        folder: folder that the names are relative to.
+        names: M names from a data set.
+        what: kind of the files, as a plural, for messages.
         endings: endings of such files, in lower case.
-        quiet: whether nothing is said.
-        shared: number of parts at the end of a path, the file's name and folders, that a file in another folder has in
-            common with a name at least. What only accompanies images has their names, and needs its own folder: 2.
+        quiet: whether to report nothing.
+        shared: minimum number of path parts, from the end, that a file in another folder has in common with a name. Use
+            2 for files that accompany images, because these have the images' names and differ by folder.
 
     Returns:
-        M paths; those of names that were not found are as the names are written. A file may exist in a folder of
-        reduced images alone: the path is then that at full size.
+        M paths; names without a match give paths as written. A file may exist only in a folder of reduced images; its
+        path is then the one at full size.
     """
     found = match_names(folder, names, endings, shared)
     for note in () if quiet else found.notes:
@@ -79,11 +79,11 @@ def on_disk(
 def match_names(
     folder: Path, names: Sequence[str], endings: Sequence[str] = IMAGE_SUFFIXES, shared: int = 1
 ) -> Matches:
-    """Return the files that names mean, and in how many names differ from the disk, but say nothing.
+    """Return the files that match names and notes on the differences, without reporting them.
 
     Args:
-        folder: the folder that the names are relative to.
-        names: M names, as a data set has them.
+        folder: folder that the names are relative to.
+        names: M names from a data set.
         endings: endings of such files, in lower case.
         shared: as in `on_disk`.
     """
@@ -107,17 +107,17 @@ def match_names(
 
 
 def spelled(name: str) -> str:
-    """Return `name` as it is compared: with slashes, without percent-encoding, composed (NFC), in lower case."""
+    """Return the normal form of `name` for comparisons: slashes, no percent-encoding, composed (NFC), lower case."""
     return _decoded(name).casefold()
 
 
 def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[str]:
-    """Return the paths of files below a folder, with slashes, sorted; of too many files none. Never raises.
+    """Return the sorted paths of files below a folder, with slashes; none if there are too many. Never raises.
 
-    A file in a folder of reduced images, such as images_2, counts as one in `images` too.
+    A file in a folder of reduced images, such as images_2, also counts as a file in `images`.
 
     Args:
-        folder: the folder; what is hidden is left out.
+        folder: the folder; hidden files are skipped.
         endings: endings of the files, in lower case.
     """
     found: set[str] = set()
@@ -134,12 +134,12 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
 
 
 def has_images(folder: Path) -> bool:
-    """Return whether there is an image in or below `folder`, as far as a quick look shows. Never raises."""
+    """Return whether a quick look finds an image in or below `folder`. Never raises."""
     return any(_is_image(name) for _, _, names in islice(os.walk(folder), MOST_FOLDERS) for name in names)
 
 
 def nearest_on_disk(path: Path) -> str:
-    """Return words for an error message about a `path` that does not exist: what resembles it and does."""
+    """Return words for an error message about a `path` that does not exist: similar names that do."""
     parent = path.parent
     while not parent.is_dir() and parent != parent.parent:
         path, parent = parent, parent.parent
@@ -155,7 +155,7 @@ def nearest_on_disk(path: Path) -> str:
 
 
 def _as_written(folder: Path, name: str) -> str | None:
-    """Return the name if the file exists, else the name with the first likely ending that makes a file."""
+    """Return the name if the file exists, otherwise the name with the first likely ending for which a file exists."""
     if (folder / name).is_file():
         return name
     if _is_image(name):
@@ -195,11 +195,11 @@ SPELLINGS: tuple[tuple[str, Callable[[str], str]], ...] = (
     ("in another case", spelled),
     ("with another ending", without_ending),
 )
-"""Differences between a name and the disk, the strictest first: words for it, and what is compared."""
+"""Kinds of differences between a name and the disk, strictest first: words for messages, and the compared form."""
 
 
 def _paired(names: Iterable[str], files: Iterable[str], key: Callable[[str], str]) -> dict[str, str]:
-    """Return name -> file where exactly one name and one file have the same key."""
+    """Return name -> file for keys that exactly one name and one file have."""
     groups: defaultdict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
     for name in names:
         groups[key(name)][0].append(name)
@@ -209,11 +209,11 @@ def _paired(names: Iterable[str], files: Iterable[str], key: Callable[[str], str
 
 
 def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str], least: int) -> dict[str, str]:
-    """Return name -> file where more than half of the names are found with one beginning exchanged for another.
+    """Return name -> file if replacing one beginning of paths by another finds more than half of the names.
 
-    The beginnings are those that leave the longest common end of path for the most names. Of several, the folder
-    called images is preferred; if that does not decide, nothing is found. Ends of fewer than `least` parts do not
-    count, nor do folders of what accompanies images, such as masks.
+    The beginnings that leave the longest common end for the most names are used. Among several, the folder called
+    images is preferred; without one, nothing is found. Ends of fewer than `least` parts do not count, nor do folders of
+    files that accompany images, such as masks.
     """
     keys = Counter(map(key, files))
     by_key = {known: file for file in files if keys[known := key(file)] == 1}
@@ -244,7 +244,7 @@ def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str]
 
 
 def _common_end(a: Sequence[str], b: Sequence[str]) -> int:
-    """Return the number of parts that two paths have in common at their end."""
+    """Return the number of parts that two paths have in common at the end."""
     return next(
         (n for n, (x, y) in enumerate(zip(reversed(a), reversed(b), strict=False)) if x != y), min(len(a), len(b))
     )
@@ -252,4 +252,4 @@ def _common_end(a: Sequence[str], b: Sequence[str]) -> int:
 
 def _note(pairs: dict[str, str], total: int, words: str) -> str:
     name, file = next(iter(pairs.items()))
-    return f"{len(pairs)} of {total} are on the disk {words}: {name} is taken to be {file}"
+    return f"{len(pairs)} of {total} found {words}: {name} as {file}"

@@ -1,7 +1,7 @@
-"""Offsets of files that are written about a local origin, since float32 is too coarse for their coordinates.
+"""Offsets of files whose coordinates are relative to a local origin, because float32 is too coarse for the input's.
 
-Beside such a file NAME is NAME.offset.json, with `offset`, three numbers: a position of the file plus the offset is the
-position in the frame of the input. A file without one has its coordinates in that frame.
+A file NAME of this kind has a file NAME.offset.json beside it, with `offset`, three numbers. A position in the file
+plus the offset is the position in the input's frame. A file without an offset is in the input's frame.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, shown
 
 SUFFIX = ".offset.json"
-"""What the name of a file's offset adds to that of the file."""
+"""Suffix of an offset file, appended to the name of its file."""
 
 
 def offset_file(file: Path) -> Path:
@@ -26,14 +26,14 @@ def offset_file(file: Path) -> Path:
 
 
 def write_offset(file: Path, origin: Tensor | None) -> str | None:
-    """Write the offset of a file, or remove that of an earlier file of the same name.
+    """Write the offset of a file, or remove the offset of an earlier file of the same name.
 
     Args:
         file: path of the file.
-        origin: (3,) local origin about which the file is written; None for the input's own.
+        origin: (3,) local origin of the file's coordinates; None for the input's origin.
 
     Returns:
-        A sentence that says where the file is; None if it is where the input is.
+        A sentence for the user about the offset; None without one.
 
     Raises:
         OSError: if the offset cannot be written or removed.
@@ -46,13 +46,13 @@ def write_offset(file: Path, origin: Tensor | None) -> str | None:
     write_atomically(beside, lambda stream: stream.write(text.encode()))
     place = ", ".join(f"{value:.10g}" for value in origin.tolist())
     return (
-        f"{file.name} holds float32, which is too coarse so far from the origin: its coordinates are counted from "
-        f"({place}), which {beside.name} says too; add it to get those of the input"
+        f"{file.name} is in float32, too coarse this far from the origin. So its coordinates are relative to "
+        f"({place}); add this offset, also in {beside.name}, to get the input's coordinates"
     )
 
 
 def read_offset(file: Path) -> Tensor:
-    """Return the offset (3,) float64 of a file: zeros if there is none beside it.
+    """Return the offset (3,) float64 of a file; zeros if it has no offset file.
 
     Args:
         file: path of the file.

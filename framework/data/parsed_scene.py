@@ -1,4 +1,4 @@
-"""A data format, and what it reads: images that are not decoded yet, with poses, and facts about their scene."""
+"""Data formats, and their result: images that are not decoded yet, with poses and properties of the scene."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class ParsedScene:
     downscale_factor: int = 1
     """Integer factor by which images are reduced when they are loaded."""
     num_scales: int = 1
-    """Number of sizes at which each image is used: the loaded one, and then 1/2, 1/4, ... of it."""
+    """Number of sizes at which each image is used: the loaded size, and then 1/2, 1/4, ... of it."""
     mask_paths: tuple[Path | None, ...] | None = None
     """M mask files, white for pixels to train on and black for others; None for an image without mask."""
     points: Tensor | None = None
     """(K, 3) sparse points on surfaces, scene coordinates."""
     sightings: Sightings | None = None
-    """Which of the images see which sparse points; None if that is not known."""
+    """Which images see which sparse points; None if unknown."""
     unbounded: bool = False
     """Whether there may be visible content outside `box`."""
     poses: PoseSource = "exact"
@@ -58,9 +58,9 @@ class ParsedScene:
     depth_unit: float = 0.001
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
     scene_indices: Tensor | None = None
-    """(M,) int64 number of the scene that each image shows; None if all show the same."""
+    """(M,) int64 index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
-    """(M,) bool, images that a method may render the others from, and is not judged by; None if there are none."""
+    """(M,) bool, source images, from which a method may render others; they are not evaluated. None without."""
 
     @property
     def placement(self) -> Placement:
@@ -86,12 +86,13 @@ class ParsedScene:
 class DataParser(ABC):
     """A data format. Subclasses are frozen dataclasses whose fields are the format's flags.
 
-    One that places cameras by all of them should have the flag `placement: Path | None`, dataparser_transforms.json of
-    a run whose placement it takes: a trained run gives its own if its images are not those of then.
+    A format that places a scene by all of its cameras should have the flag `placement: Path | None`: the
+    dataparser_transforms.json of a run whose placement to use. A trained run passes its own placement if its images
+    differ from those at training time.
     """
 
     interface: ClassVar[int] = 2
-    """Version of the plugin interface for which the format was written (`registry.INTERFACE`)."""
+    """Version of the plugin interface that the format supports (`registry.INTERFACE`)."""
 
     @classmethod
     @abstractmethod
@@ -107,5 +108,5 @@ class DataParser(ABC):
             split: the split to read.
 
         Raises:
-            DataError: with the file and what is wrong with it.
+            DataError: with the file and its problem.
         """

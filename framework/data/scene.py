@@ -35,7 +35,7 @@ class Scene:
     num_cameras: int
     """Number of training images."""
     has_alpha: bool
-    """Whether the images tell what is background."""
+    """Whether the images have an alpha channel that marks background."""
     moving: bool
     """Whether the images have times."""
     image_size: int
@@ -45,7 +45,7 @@ class Scene:
     poses: PoseSource = "exact"
     """Source of the cameras' poses."""
     warped: bool = False
-    """Whether rays are in normalised device coordinates, whose lengths and angles are not the scene's."""
+    """Whether rays are in normalised device coordinates, with other lengths and angles than the scene."""
     has_depth: bool = False
     """Whether the images come with depth images."""
     appearance_varies: bool = False
@@ -57,16 +57,16 @@ class Scene:
     num_sparse_depths: int = 0
     """Number of pixels of the images whose distance is known from a reconstruction's points."""
     num_times: int = 0
-    """Number of different times of the training images; 0 if they have none."""
+    """Number of distinct times of the training images; 0 if they have none."""
     num_scenes: int = 1
-    """Number of scenes that the training images show; more than one only for methods that learn from scenes."""
+    """Number of scenes in the training images; more than one only for methods that learn from several scenes."""
 
     @classmethod
     def of(cls, facts: Any) -> Scene:
-        """Construct a scene from `facts` read from a file, the fields' values by name.
+        """Construct a scene from `facts` read from a file: the fields' values by name.
 
         Raises:
-            ValueError: if the values cannot be those of a scene.
+            ValueError: if the values are not those of a scene.
         """
         scene = checked(cls, facts)
         box, poses, count = scene.box, scene.camera_to_worlds, scene.num_cameras

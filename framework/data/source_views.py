@@ -1,4 +1,4 @@
-"""Choice of the images from which a view is rendered: those of its scene, and of these the nearest in direction."""
+"""Choice of source images for rendering a view: images of the same scene that look in the most similar directions."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from nerfloom.data.dataset import Dataset
 
 
 def images_of(dataset: Dataset, scene: int | None) -> Tensor:
-    """Return the images of a scene that others may be rendered from, their indices (K,) int64 on the CPU.
+    """Return the indices (K,) int64, on the CPU, of a scene's source images, from which others may be rendered.
 
     Args:
         dataset: images of one scene or of several.
-        scene: number of the scene; None for the first.
+        scene: index of the scene; None for the first.
 
     Returns:
-        The source images of the scene, or all of its images where none is declared; none for an unknown scene. Images
-        whose pose is not finite are left out, since they would spoil all that is rendered from them.
+        The source images of the scene; all of its images if none is declared, and no images for an unknown scene.
+        Images whose pose is not finite are left out, because they would spoil everything rendered from them.
     """
     found = dataset.cameras.camera_to_worlds.isfinite().flatten(1).all(-1).cpu()
     if dataset.scene_indices is not None:
@@ -27,7 +27,7 @@ def images_of(dataset: Dataset, scene: int | None) -> Tensor:
 
 
 def other_images(dataset: Dataset, images: Tensor, pose: Tensor) -> Tensor:
-    """Return those of some images that were not taken with a pose, so that no view is rendered from itself.
+    """Return the images that were not taken with a given pose, so that no view is rendered from itself.
 
     Args:
         dataset: the images.
@@ -39,7 +39,7 @@ def other_images(dataset: Dataset, images: Tensor, pose: Tensor) -> Tensor:
 
 
 def nearest_in_direction(dataset: Dataset, images: Tensor, pose: Tensor, count: int) -> Tensor:
-    """Return the images whose cameras look most nearly in the direction of a camera, the nearest first.
+    """Return the images whose cameras look in the directions most similar to a camera's, most similar first.
 
     Args:
         dataset: the images.

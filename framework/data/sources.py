@@ -43,26 +43,26 @@ class Request:
     rays_per_pixel: int = 1
     """Number of rays through each pixel: 1, through its centre, or another square number."""
     points: bool = True
-    """Whether pixels with a sparse depth are drawn besides, where they are to be learned from."""
+    """Whether to draw some additional pixels with a sparse depth, if the source learns from them."""
 
 
 KEYPOINTS = 1 / 8
-"""Share of a batch's pixels that are drawn from those with a sparse depth, where they are to be learned from."""
+"""Fraction of a batch's pixels drawn from those with a sparse depth."""
 POINTS_UNTIL = 0.5
-"""Share of the budget after which they are not drawn any more: then colours alone decide where a surface is."""
+"""Fraction of the budget during which they are drawn; afterwards colours alone determine the surfaces."""
 
 
 class BatchSource(ABC):
-    """Base class of sources, which draw the training batches.
+    """Base class of sources, which draw training batches.
 
-    A batch depends only on torch's generator, which is seeded by (seed, step, number of the process) before each step,
-    and on what the source has learnt, so that a run that is resumed in another process draws the same batches.
+    A batch depends only on what the source has learnt and on torch's generator, which is seeded by (seed, step, process
+    number) before each step. So a run resumed in another process draws the same batches.
     """
 
     dataset: Dataset
-    """The images that are drawn from."""
+    """The images to draw from."""
     varies: str | None = "batches are made on the host"
-    """Why what is done to draw a batch differs from step to step (`StepKind`); None if it does not."""
+    """Why drawing a batch differs from step to step (`StepKind`); None if it does not."""
 
     @abstractmethod
     def draw(self, request: Request) -> Any:
@@ -70,7 +70,7 @@ class BatchSource(ABC):
 
     @abstractmethod
     def drawing_from(self, dataset: Dataset) -> BatchSource:
-        """Return a source of the same kind for a changed data set, with what this one has learnt.
+        """Return a source of the same kind for a changed data set, with this source's learnt state.
 
         Args:
             dataset: the same images, with a different selection of pixels to draw.
@@ -85,11 +85,11 @@ class BatchSource(ABC):
         """
 
     def state(self) -> Tensor | None:
-        """Return what has been learnt, for a checkpoint; None if the source learns nothing."""
+        """Return the learnt state for a checkpoint; None if the source learns nothing."""
         return None
 
     def restore(self, state: Tensor | None) -> None:  # noqa: B027, likewise
-        """Restore what has been learnt from a checkpoint.
+        """Restore the learnt state from a checkpoint.
 
         Args:
             state: the result of `BatchSource.state`; None if the checkpoint has none.
@@ -97,16 +97,16 @@ class BatchSource(ABC):
 
 
 class PixelSource(BatchSource):
-    """A source of pixels of all images, drawn uniformly or by their errors.
+    """Draws pixels of all images, uniformly or by their errors.
 
     Args:
-        dataset: the images. If they are in a file, pixels are read ahead of the steps that draw them.
+        dataset: the images. Pixels in a file are read ahead of the steps that use them.
         background: background of transparent pixels.
         seed: seed of the run.
         by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
-        keypoints: share of the pixels that are drawn from those with a sparse depth, if there are any.
-        clear: (M,) distances before which images show nothing; None if they are not to be learned from.
-        num_images: number of images of which the pixels of a step are; None for all.
+        keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
+        clear: (M,) distances up to which images show nothing; None if they are not used.
+        num_images: number of images from which the pixels of a step are drawn; None for all.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class PixelSource(BatchSource):
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
 
     def _look_up(self, step: int) -> LookUp | None:
-        """Return the function that looks up a step's colours ahead in a file; None from memory, or of few images."""
+        """Return the function that looks up a step's colours read ahead from a file; None for memory or few images."""
         if self.dataset.mapped is None or self.num_images is not None:
             return None
         self.stream = self.stream or PixelStream(self.dataset, self.seed)
@@ -166,13 +166,13 @@ class PixelSource(BatchSource):
 
 
 class ViewSource(BatchSource):
-    """A source of whole images, one per step, in an order that is drawn anew for each pass over them.
+    """Draws whole images, one per step, in a new random order for each pass.
 
     Several processes take turns in this order.
 
     Args:
         dataset: the images.
-        background: background of transparent pixels; if "random", one colour for the whole image.
+        background: background of transparent pixels; "random" is one colour for the whole image.
         seed: the seed of the run.
     """
 
@@ -180,9 +180,9 @@ class ViewSource(BatchSource):
         self.dataset, self.background, self.seed = dataset, background, seed
         self._order: tuple[int, list[int]] | None = None
         self._views: dict[int, View] = {}
-        """Views of images that have been drawn, whose sizes and lenses are read from the device once."""
+        """Views of images drawn so far; sizes and lenses are read from the device once."""
         self._sparse_ends: list[int] | None = None
-        """Where the sparse depths of each image begin, and where the last one's end."""
+        """Start of each image's sparse depths, and the end of the last image's."""
 
     def draw(self, request: Request) -> ViewBatch:
         dataset = self.dataset
@@ -218,7 +218,7 @@ class ViewSource(BatchSource):
         return distances.view(cameras.sizes[index][0], -1)
 
     def _index(self, step: int) -> int:
-        """Return the image of a training step, a function of seed, step and process alone."""
+        """Return the image of a training step; it depends only on seed, step and process."""
         several = processes()
         epoch, place = divmod(step * several.count + several.rank, len(self.dataset))
         if self._order is None or self._order[0] != epoch:

@@ -1,4 +1,4 @@
-"""Sparse depth: pixels whose distance is known from the points of a reconstruction (DS-NeRF, Deng et al. 2022)."""
+"""Sparse depth: pixels with a known distance, from the points of a reconstruction (DS-NeRF, Deng et al. 2022)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from nerfloom.data.tracks import Sightings
 
 @dataclass(frozen=True)
 class SparseDepth:
-    """K pixels in ascending order, each with its distance."""
+    """K pixels in ascending order, each with a distance."""
 
     pixels: Tensor
-    """(K,) int64 numbers of the pixels, counted through all images."""
+    """(K,) int64 numbers of the pixels, counted over all images."""
     distances: Tensor
     """(K,) distance along the ray of the pixel's centre, scene units."""
     deviations: Tensor
@@ -36,13 +36,13 @@ class SparseDepth:
 
 @torch.no_grad()
 def sparse_depth(sightings: Sightings, cameras: Cameras) -> SparseDepth:
-    """Return the pixels in which images see sparse points, by the points' projections, lens included.
+    """Return the pixels in which images see sparse points, from the points' projections, lens included.
 
-    A pixel in which several points are seen has the one that is known best. A point's distance along the ray of its
-    pixel's centre is that of the ray's position nearest to it.
+    If a pixel shows several points, the one with the best-known distance is used. A point's distance along the ray of
+    its pixel's centre is that of the nearest position on the ray.
 
     Args:
-        sightings: points as the cameras' images see them; those outside an image, or behind its camera, are left out.
+        sightings: points seen in the cameras' images; points outside an image or behind its camera are left out.
         cameras: M cameras, for the decoded images.
     """
     images = sightings.images

@@ -1,4 +1,4 @@
-"""Tracks of a reconstruction: which images see its sparse points, and how well their distances are known."""
+"""Tracks of a reconstruction: the images that see each sparse point, and the accuracy of its distances."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ import torch
 from torch import Tensor
 
 FEWEST = 2
-"""Minimum number of images that see a point, of those that may be learned from; one image knows no distance."""
+"""Minimum number of training images that see a point; one image alone determines no distance."""
 LARGEST_DEVIATION = 0.1
-"""Maximum standard deviation of a distance that is used, as a fraction of the distance."""
+"""Maximum standard deviation of a distance in use, as a fraction of the distance."""
 SHORTEST_TRACK = 3
-"""Minimum number of images that observe a point whose distances are used; two can agree on a wrong one."""
+"""Minimum number of images that observe a point in use; two can agree on a wrong one."""
 LARGEST_ERROR = 2.0
-"""Maximum mean reprojection error of a point whose distances are used, pixels."""
+"""Maximum mean reprojection error of a point in use, pixels."""
 DOUBTS = (
     "",
     "without a track",
     f"seen by fewer than {SHORTEST_TRACK} images",
     f"with a reprojection error above {LARGEST_ERROR:g} pixels",
 )
-"""Reasons for which the distances of a point are not used, in the order of `doubts_about`; none at first."""
+"""Reasons not to use a point's distances, as indexed by `doubts_about`; the first entry stands for no reason."""
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """O sparse points as M images see them, with repetitions: a point that three images see is here three times."""
+    """O sightings of sparse points in M images; a point that three images see appears three times."""
 
     images: Tensor
     """(O,) int64 image of each sighting."""
@@ -39,10 +39,10 @@ class Sightings:
         return len(self.images)
 
     def of_images(self, chosen: Tensor) -> Sightings:
-        """Return the sightings of some images, which are numbered anew.
+        """Return the sightings in some images, which are renumbered.
 
         Args:
-            chosen: (S,) int64 the images, without repetitions.
+            chosen: (S,) int64 images, without repetitions.
         """
         kept, images = _renumbered(self.images, chosen)
         return Sightings(images, self.points[kept], self.deviations[kept])
@@ -61,13 +61,13 @@ class Tracks:
     angles: Tensor
     """(O,) standard deviation of each sighting's direction, radians: the reprojection error over the focal length."""
     doubts: Tensor
-    """(K,) int64 index in `DOUBTS` of the reason for which a point's distances are not used; 0 if they are."""
+    """(K,) int64 index in `DOUBTS` of the reason not to use a point's distances; 0 to use them."""
 
     def of_images(self, chosen: Tensor) -> Tracks:
-        """Return all points, and the sightings in some images, which are numbered anew.
+        """Return all points, and the sightings in some images, which are renumbered.
 
         Args:
-            chosen: (S,) int64 the images, without repetitions.
+            chosen: (S,) int64 images, without repetitions.
         """
         kept, images = _renumbered(self.images, chosen)
         return replace(self, images=images, seen=self.seen[kept], angles=self.angles[kept])
@@ -82,10 +82,10 @@ class Tracks:
         return replace(self, images=self.images[kept], seen=self.seen[kept], angles=self.angles[kept])
 
     def at(self, points: Tensor) -> Tracks:
-        """Return the same sightings of points that were moved.
+        """Return the same sightings with moved points.
 
         Args:
-            points: (K, 3) the new positions. Those that are not finite are left out, and the others numbered anew.
+            points: (K, 3) new positions. Points that are not finite are left out, and the others renumbered.
         """
         finite = points.isfinite().all(-1)
         kept = finite[self.seen]
@@ -97,9 +97,9 @@ class Tracks:
         return self._counts() >= FEWEST
 
     def known_without(self, images: Tensor) -> Tensor:
-        """Return whether a point's position is known without some images, (K,) bool.
+        """Return whether the position of each point is known without some images, (K,) bool.
 
-        It is if these do not see it, or if at least `FEWEST` others do.
+        This holds if these images do not see the point, or if at least `FEWEST` others do.
 
         Args:
             images: (M,) bool, the images.
@@ -112,9 +112,9 @@ class Tracks:
         return torch.bincount(self.seen, minlength=len(self.points))
 
     def known_distances(self, centers: Tensor) -> Tensor:
-        """Return whether a sighting's distance is known well enough to learn from, (O,) bool.
+        """Return whether the distance of each sighting is accurate enough to learn from, (O,) bool.
 
-        It is if at least `FEWEST` images see the point, it is not doubted, and the distance's deviation is small.
+        This holds if at least `FEWEST` images see the point, it has no doubts, and the distance's deviation is small.
 
         Args:
             centers: (M, 3) positions of the cameras.
@@ -122,7 +122,7 @@ class Tracks:
         return self._known(distance_deviations(self, centers), centers)
 
     def sightings(self, centers: Tensor) -> Sightings:
-        """Return the sightings whose distance is known well enough (`known_distances`).
+        """Return the sightings with accurate distances (`known_distances`).
 
         Args:
             centers: (M, 3) positions of the cameras.
@@ -138,7 +138,7 @@ class Tracks:
 
 
 def doubts_about(lengths: Tensor, errors: Tensor) -> Tensor:
-    """Return for which reason in `DOUBTS` a point's distances are not used, (K,) int64; 0 if they are.
+    """Return the reason in `DOUBTS` not to use each point's distances, (K,) int64; 0 to use them.
 
     Args:
         lengths: (K,) number of images that observe each point.
@@ -151,13 +151,13 @@ def doubts_about(lengths: Tensor, errors: Tensor) -> Tensor:
 
 
 def distance_deviations(tracks: Tracks, centers: Tensor) -> Tensor:
-    """Return the standard deviation (O,) float64 of the distance at which each sighting's camera sees its point.
+    """Return the standard deviation (O,) float64 of the distance from each sighting's camera to its point.
 
-    A sighting in the unit direction d from the distance r, with an angular error of a, holds the point across its ray
+    A sighting in the unit direction d at distance r, with an angular error of a, constrains the point across its ray
     and not along it: its information is (1 - d d^T) / (r a)^2. The inverse of the sum over the track is the covariance
-    of the point (Hartley and Zisserman 2004, section 5.2), and its part along a ray the variance of the distance. So
-    what counts is the reprojection error, the number of images, and the angle between their rays. That a point is
-    somewhere at about its distance is taken for granted, which keeps a single sighting's covariance finite.
+    of the point (Hartley and Zisserman 2004, section 5.2). Its part along a ray is the variance of the distance. So the
+    result depends on the reprojection error, the number of images, and the angle between their rays. A weak prior that
+    the point is near its estimated distance keeps the covariance of a single sighting finite.
 
     Args:
         tracks: K points and O sightings.
@@ -177,7 +177,7 @@ def distance_deviations(tracks: Tracks, centers: Tensor) -> Tensor:
 
 
 def _renumbered(images: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which sightings are in `chosen` images, and the place of their images among these."""
+    """Return which sightings are in `chosen` images, and the indices of their images among these."""
     most = int(max(images.max() if len(images) else -1, chosen.max() if len(chosen) else -1)) + 1
     places = torch.full((most,), -1, dtype=torch.int64, device=images.device)
     places[chosen] = torch.arange(len(chosen), device=images.device)

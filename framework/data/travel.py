@@ -10,24 +10,24 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Travel:
-    """The distance that matter may have moved since time 0, as a function of the time.
+    """Distance that matter may have moved since time 0, as a function of time.
 
-    Between two times, no matter moves farther than their distances differ.
+    Between two times, matter moves at most by the difference of their distances.
     """
 
     times: Tensor
     """(K,) float64 increasing times, from 0 or less to 1 or more."""
     distances: Tensor
-    """(K,) float64 distances at these times, scene units, none smaller than the one before; linear in between."""
+    """(K,) float64 distances at these times, scene units, not decreasing; linear in between."""
 
     @classmethod
     def of(cls, times: Tensor, speeds: Tensor) -> Travel:
-        """Add up speeds.
+        """Integrate speeds over time.
 
         Args:
             times: (K,) increasing times in [0, 1].
-            speeds: (K,) speeds about these times, scene units for the time from 0 to 1. Between two times the larger
-                one counts, before the first time and after the last theirs.
+            speeds: (K,) speeds at these times, scene units per unit of time. Between two times the larger speed is
+                used; before the first and after the last time, theirs.
         """
         ends = times.new_tensor([0.0, 1.0])
         knots = torch.cat([ends[:1].minimum(times[:1]), times, ends[1:].maximum(times[-1:])]).double()
@@ -45,10 +45,10 @@ class Travel:
 
     @property
     def fastest(self) -> float:
-        """The greatest speed, scene units for the time from 0 to 1."""
+        """Maximum speed, scene units per unit of time."""
         spans = self.times.diff()
         return float((self.distances.diff()[spans > 0] / spans[spans > 0]).max())
 
     def in_a_slice(self, slices: int) -> float:
-        """Return the greatest distance in one of `slices` equal parts of the time from 0 to 1, scene units."""
+        """Return the maximum distance in one of `slices` equal parts of the time from 0 to 1, scene units."""
         return float(self.at(torch.linspace(0, 1, slices + 1)).diff().max())

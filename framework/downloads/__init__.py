@@ -1,1 +1,1 @@
-"""Downloads of public data sets: where they are, fetching, unpacking, and the folders that ns-train recognises."""
+"""Downloads of public data sets: addresses, fetching, unpacking, and the folders that ns-train recognises."""

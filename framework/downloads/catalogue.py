@@ -1,4 +1,4 @@
-"""The catalogue of public data sets: where each can be downloaded, how large it is, and under what licence."""
+"""Catalogue of public data sets: address, size and licence of each."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Source:
-    """A place from which an archive can be downloaded.
+    """A server from which an archive can be downloaded.
 
     Args:
         url: address of the file, http or https.
         sha256: SHA-256 of the file in hexadecimal; None if the source states none.
-        tried: date on which we last downloaded the file; empty if we never did.
+        tried: date of our last download of the file; empty if there was none.
     """
 
     url: str
@@ -26,9 +26,9 @@ class Archive:
 
     Args:
         name: name of the file.
-        scenes: names of the scenes' folders in it, at whatever depth. The folder of a single scene may have another.
-        sources: places that have it, in the order in which they are tried.
-        gigabytes: approximate size in units of 1e9 bytes; None if it is unknown until the server says it.
+        scenes: names of the scenes' folders in it, at any depth. The folder of a single scene may have another name.
+        sources: servers that have it, in the order of trying.
+        gigabytes: approximate size in units of 1e9 bytes; None if unknown before the download.
     """
 
     name: str
@@ -44,8 +44,8 @@ class Dataset:
     Args:
         title: name and authors.
         page: web page that describes it.
-        licence: what its authors say of its licence.
-        archives: the files to download, in which no two scenes have the same name.
+        licence: the authors' statement about its licence.
+        archives: the files to download; scene names are unique among them.
     """
 
     title: str
@@ -59,7 +59,7 @@ class Dataset:
         return tuple(scene for archive in self.archives for scene in archive.scenes)
 
 
-_NONE_STATED = "none stated by its authors; ask them before any use but research"
+_NONE_STATED = "none stated by its authors; ask them before any use other than research"
 _MIRROR = "https://github.com/yxlao/nerfmirror/releases/download/20220618"
 _HUB = "https://huggingface.co/datasets/YouLiXiya/nerf/resolve"
 _GOOGLE = "https://storage.googleapis.com/gresearch/refraw360"
@@ -185,7 +185,7 @@ DATASETS: dict[str, Dataset] = {
     "tanks-and-temples": Dataset(
         "two scenes each of Tanks and Temples and of Deep Blending, with COLMAP's poses (Kerbl et al. 2023)",
         "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting",
-        "that of each of the two data sets: https://www.tanksandtemples.org/license, and the page of Deep Blending",
+        "as for each of the two data sets: https://www.tanksandtemples.org/license, and the page of Deep Blending",
         (_TANKS_AND_TEMPLES,),
     ),
 }

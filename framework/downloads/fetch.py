@@ -1,4 +1,4 @@
-"""Fetching of a file over HTTP: resumed after a break, checked against the source's sum, whole or not at all."""
+"""Download of a file over HTTP: resumed after a break, compared with the source's sum, complete or not at all."""
 
 from __future__ import annotations
 
@@ -30,29 +30,29 @@ from nerfloom.downloads.catalogue import Source
 TIMEOUT = 30.0
 """Seconds without a byte after which a connection counts as broken."""
 PAUSES = (1.0, 2.0, 4.0, 8.0, 16.0)
-"""Seconds to wait before each further attempt. They start over whenever an attempt brought something."""
+"""Seconds to wait before each further attempt; the sequence starts over after an attempt that received data."""
 CHUNK = 1 << 20
-"""Number of bytes that are read at a time."""
+"""Number of bytes read at a time."""
 BUSY = (408, 425, 429, 500, 502, 503, 504)
-"""HTTP statuses of servers that may answer later."""
+"""HTTP statuses of servers that may respond later."""
 
 
 class SourceError(DataError):
-    """A source does not have the file, or not the right one; another source may."""
+    """A source lacks the file or has a wrong one; another source may have it."""
 
 
 class _Broken(Exception):
-    """The connection broke; another attempt may go on where it did."""
+    """The connection broke; another attempt may continue from there."""
 
 
 @dataclass(frozen=True)
 class _Answered:
-    """Facts that an earlier answer gave of the file, kept beside the part that is there.
+    """Properties of the file from an earlier response, stored beside the partial file.
 
     Args:
-        url: address that was asked.
-        validator: ETag or date of the file, by which the server knows whether it is still the same; empty if none.
-        md5: the file's MD5 in hexadecimal, which Google's storage states; empty if none.
+        url: requested address.
+        validator: ETag or date of the file, with which the server checks that it is unchanged; empty if none.
+        md5: the file's MD5 in hexadecimal, as stated by Google's storage; empty if none.
     """
 
     url: str
@@ -61,16 +61,16 @@ class _Answered:
 
 
 def fetch(source: Source, file: Path) -> None:
-    """Download `file`. What is there of it from an earlier call is kept where the server still has the same file.
+    """Download `file`, continuing an earlier partial download if the server still has the same file.
 
     Args:
         source: place to download from.
         file: file to write. Until it is complete and checked, it has the suffix .part.
 
     Raises:
-        SourceError: if the server has no such file, sends a web page, does not answer, or the file is not as the
-            source says. A wrong file is removed; of an incomplete one, what came is kept.
-        DataError: if there is no room on the disk.
+        SourceError: if the server lacks the file, sends a web page or does not respond, or if the file differs from the
+            source's description. A wrong file is removed; an incomplete one is kept.
+        DataError: if the disk is full.
     """
     part, note = (file.with_name(file.name + suffix) for suffix in (".part", ".part.json"))
     attempts = 0
@@ -83,7 +83,7 @@ def fetch(source: Source, file: Path) -> None:
             came = part.exists() and part.stat().st_size > before
             attempts = 0 if came else attempts + 1
             if attempts > len(PAUSES):
-                raise SourceError(f"{source.url}: {broken}; the same command goes on with what came") from broken
+                raise SourceError(f"{source.url}: {broken}; repeat the command to continue the download") from broken
             time.sleep(PAUSES[max(attempts - 1, 0)])
     _check(source, answered, part)
     os.replace(part, file)
@@ -91,7 +91,7 @@ def fetch(source: Source, file: Path) -> None:
 
 
 def digest(file: Path, algorithm: str) -> str:
-    """Return the sum of a file's content in hexadecimal.
+    """Return a checksum of a file in hexadecimal.
 
     Args:
         file: file to read.
@@ -106,10 +106,10 @@ def digest(file: Path, algorithm: str) -> str:
 
 
 def _transfer(source: Source, part: Path, note: Path) -> _Answered:
-    """Receive what is missing of a file, and return what the server said of it."""
+    """Receive the missing part of a file, and return the server's statements about it."""
     known = _read_note(note)
     have = part.stat().st_size if part.exists() else 0
-    # A part from another address is of another file, and a mixture of two versions must be noticed.
+    # A part from another address belongs to another file, and a mixture of two versions must be noticed.
     if known.url != source.url or not (known.validator or source.sha256):
         have = 0
     headers = {"User-Agent": f"nerfloom/{nerfloom.__version__}", "Accept-Encoding": "identity"}
@@ -140,7 +140,7 @@ def _transfer(source: Source, part: Path, note: Path) -> _Answered:
 
 
 def _receive(answer: http.client.HTTPResponse, opened: BinaryIO, start: int, total: int | None) -> None:
-    """Append an answer's body to an open file of `start` bytes, which has `total` in the end."""
+    """Append a response's body to an open file of `start` bytes; its complete size is `total`."""
     size = start
     with track_bytes("downloading", total, start) as advance:
         while True:
@@ -150,7 +150,7 @@ def _receive(answer: http.client.HTTPResponse, opened: BinaryIO, start: int, tot
                 break
             size += len(chunk)
             if total is not None and size > total:
-                raise _Broken(f"more than the {total} bytes that were announced came")
+                raise _Broken(f"the server sent more than the announced {total} bytes")
             _write(opened, chunk)
             advance(len(chunk))
     opened.flush()
@@ -165,13 +165,13 @@ def _write(opened: BinaryIO, chunk: bytes) -> None:
         opened.flush()
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise DataError(f"{opened.name}: the disk is full; make room, and the same command goes on") from error
+            raise DataError(f"{opened.name}: the disk is full; free some space and repeat the command") from error
         raise DataError(f"cannot write {opened.name}: {error.strerror}") from error
 
 
 @contextmanager
 def _network_errors() -> Iterator[None]:
-    """Turn the errors of a connection into `_Broken`; an HTTP status is no such error."""
+    """Convert connection errors to `_Broken`; an HTTP status is not a connection error."""
     try:
         yield
     except urllib.error.HTTPError:
@@ -185,18 +185,18 @@ def _network_errors() -> Iterator[None]:
 
 
 def _extent(status: int, headers: Message, have: int) -> tuple[int, int | None]:
-    """Return the byte at which an answer's body starts, and the size of the whole file, None if it is not said."""
+    """Return the byte at which a response's body starts, and the size of the whole file; None if unknown."""
     if status == 206:
         match = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", headers.get("Content-Range", ""))
         if match is not None and int(match[1]) == have:
             return have, None if match[2] == "*" else int(match[2])
-        raise _Broken("the server sent another part of the file than was asked for")
+        raise _Broken("the server sent another part of the file than requested")
     length = headers.get("Content-Length", "")
     return 0, int(length) if re.fullmatch(r"\d{1,18}", length) else None
 
 
 def _at_the_end(headers: Message, known: _Answered, part: Path, have: int) -> _Answered:
-    """Return what is known of a file all of whose bytes are there; drop them if the file has another size now."""
+    """Return what is known of a file that is completely received; raise `_Broken` if its size has changed."""
     if headers.get("Content-Range", "") == f"bytes */{have}":
         return known
     part.unlink()
@@ -209,7 +209,7 @@ def _validator(headers: Message) -> str:
 
 
 def _stated_md5(headers: Message) -> str:
-    """Return the MD5 that Google's storage states in base64, in hexadecimal; empty if there is none."""
+    """Return in hexadecimal the MD5 that Google's storage states in base64; empty if there is none."""
     for entry in ",".join(headers.get_all("x-goog-hash", [])).split(","):
         name, _, value = entry.strip().partition("=")
         if name == "md5":
@@ -222,18 +222,18 @@ def _stated_md5(headers: Message) -> str:
 
 def _refuse_page(source: Source, headers: Message) -> None:
     if headers.get_content_type() in ("text/html", "application/xhtml+xml"):
-        raise SourceError(f"{source.url}: the server sends a web page, not the file; it may ask for a login or a quota")
+        raise SourceError(f"{source.url}: the server sent a web page instead of the file; it may need a login")
 
 
 def _check_room(part: Path, start: int, total: int | None) -> None:
     free = shutil.disk_usage(part.parent).free
     if total is not None and total - start > free:
-        needed = f"{(total - start) / 1e9:.1f} GB are to come, and {free / 1e9:.1f} GB are free"
-        raise DataError(f"{part.parent}: the disk is too small: {needed}; make room, or name another --save-dir")
+        needed = f"{(total - start) / 1e9:.1f} GB are missing, {free / 1e9:.1f} GB are free"
+        raise DataError(f"{part.parent}: the disk is too small: {needed}; free some space or use another --save-dir")
 
 
 def _check(source: Source, answered: _Answered, part: Path) -> None:
-    """Compare a complete file with the sum that its source states, if it states one, and remove it if it differs."""
+    """Compare a complete file with the sum stated by its source, if any, and remove the file if they differ."""
     expected = [("sha256", source.sha256)] if source.sha256 else [("md5", answered.md5)] if answered.md5 else []
     for algorithm, value in expected:
         found = digest(part, algorithm)
@@ -241,11 +241,11 @@ def _check(source: Source, answered: _Answered, part: Path) -> None:
             part.unlink()
             raise SourceError(f"{source.url}: the file has the {algorithm} {found}, not {value}; it was removed")
     if not expected:
-        say(f"note: {source.url} states no checksum; the file was not compared with any")
+        say(f"note: {source.url} states no checksum; the file was not verified")
 
 
 def _read_note(note: Path) -> _Answered:
-    """Return what an earlier answer said; nothing if there was none."""
+    """Return the stored statements of an earlier response; empty ones if there are none."""
     try:
         content = json.loads(note.read_text(encoding="utf-8"))
         return _Answered(*(str(content[field]) for field in ("url", "validator", "md5")))

@@ -1,4 +1,4 @@
-"""Installation of a public data set: archives are fetched and unpacked, and scenes put where ns-train finds them."""
+"""Installation of a public data set: download and unpack archives, and move scenes to where ns-train finds them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from nerfloom.training.data_folder import find_data
 from nerfloom.training.lock import sole_user
 
 UNFINISHED = ".downloads"
-"""Folder, beside the data sets, of archives and of scenes that are not yet complete."""
+"""Folder beside the data sets for archives and for incomplete scenes."""
 IGNORED = ("__MACOSX", ".DS_Store")
-"""Names in zip files that macOS adds to them."""
+"""Names that macOS adds to zip files."""
 NOTES = ("readme", "license", "licence")
-"""Starts of the names of files about all scenes, which are put beside them."""
+"""Beginnings of names of files about all scenes, which are placed beside the scenes."""
 
 
 def install(
@@ -32,22 +32,22 @@ def install(
     archive: Path | None = None,
     keep_archives: bool = False,
 ) -> list[Path]:
-    """Download the scenes of a data set that are not there yet.
+    """Download the missing scenes of a data set.
 
     Args:
         name: name of the data set, and of its folder.
         dataset: the data set.
         save_dir: folder of the data sets, created if missing.
         scenes: names of the scenes; all if empty.
-        archive: an archive that is there already, downloaded by hand; None to download what is needed.
-        keep_archives: keep archives after they are unpacked.
+        archive: an archive downloaded by hand; None to download what is missing.
+        keep_archives: whether to keep archives after unpacking.
 
     Returns:
-        The scenes' folders, `save_dir / name / scene`, each of which a data format recognises.
+        The scenes' folders, `save_dir / name / scene`; a data format recognises each of them.
 
     Raises:
         ConfigError: if the data set has no such scene, or the folder cannot be written.
-        DataError: if an archive cannot be had, is unsafe or does not hold the scenes. Scenes that were complete stay.
+        DataError: if an archive is unavailable, unsafe or lacks the scenes. Complete scenes are kept.
     """
     chosen = _chosen(name, dataset, scenes)
     folder, unfinished = save_dir / name, save_dir / UNFINISHED
@@ -65,12 +65,12 @@ def install(
                 file.unlink()
     absent = [scene for scene in chosen if not (folder / scene).exists()]
     if absent:
-        raise DataError(f"{archive} does not hold {', '.join(absent)}; name what it holds by --scenes")
+        raise DataError(f"{archive} lacks {', '.join(absent)}; select scenes that it contains with --scenes")
     return [folder / scene for scene in chosen]
 
 
 def announce(name: str, dataset: Dataset, save_dir: Path, scenes: Sequence[str] = ()) -> None:
-    """Say what will be downloaded: its licence, its size, from where and whether the address was ever tried.
+    """Report the download: licence, size, address, and whether the address was ever tried.
 
     Args:
         name: name of the data set.
@@ -87,7 +87,7 @@ def announce(name: str, dataset: Dataset, save_dir: Path, scenes: Sequence[str] 
     for archive in dataset.archives:
         missing = [scene for scene in archive.scenes if scene in chosen and not (save_dir / name / scene).exists()]
         if missing:
-            hosts = ", else ".join(f"{_host(source)} ({_tried(source)})" for source in archive.sources)
+            hosts = ", otherwise ".join(f"{_host(source)} ({_tried(source)})" for source in archive.sources)
             say(f"to download: {archive.name}, {size_of(archive)}, from {hosts}, for {', '.join(missing)}")
 
 
@@ -115,13 +115,13 @@ def _make_writable(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot write {folder.parent}: {error.strerror}; name another --save-dir") from error
+        raise ConfigError(f"cannot write {folder.parent}: {error.strerror}; use another --save-dir") from error
     if not os.access(folder, os.W_OK):
-        raise ConfigError(f"cannot write {folder}; name another --save-dir")
+        raise ConfigError(f"cannot write {folder}; use another --save-dir")
 
 
 def _archives(dataset: Dataset, given: Path | None) -> tuple[Archive, ...]:
-    """Return the archives of a data set; of one that is given, only that of its name, or all if there is none."""
+    """Return the archives of a data set; for a given file only the archive with its name, or all if there is none."""
     if given is None:
         return dataset.archives
     if not given.is_file():
@@ -130,7 +130,7 @@ def _archives(dataset: Dataset, given: Path | None) -> tuple[Archive, ...]:
 
 
 def _fetch_from_any(archive: Archive, dataset: Dataset, file: Path) -> None:
-    """Fetch an archive from the first of its sources that has it."""
+    """Download an archive from the first source that has it."""
     problems = []
     for source in archive.sources:
         try:
@@ -139,14 +139,14 @@ def _fetch_from_any(archive: Archive, dataset: Dataset, file: Path) -> None:
         except SourceError as error:
             problems.append(str(error))
             if source is not archive.sources[-1]:
-                say(f"warning: {error}; the next source is tried")
-    by_hand = f"download {archive.name} in a browser, see {dataset.page}, and pass it by --archive FILE"
-    raise DataError(f"{'; '.join(problems)}. If it does not go away: {by_hand}")
+                say(f"warning: {error}; trying the next source")
+    by_hand = f"download {archive.name} in a browser, see {dataset.page}, and pass it with --archive FILE"
+    raise DataError(f"{'; '.join(problems)}. If this persists: {by_hand}")
 
 
 def _put_in_place(archive: Archive, file: Path, scenes: list[str], folder: Path, unpacked: Path) -> None:
     """Unpack some scenes of an archive, check that each is recognised, and rename them into `folder`."""
-    shutil.rmtree(unpacked, ignore_errors=True)  # of a process that was killed
+    shutil.rmtree(unpacked, ignore_errors=True)  # left by a killed process
     try:
         place = _placement(archive, scenes, names_of(file))
         unpack(file, unpacked, place)
@@ -156,7 +156,7 @@ def _put_in_place(archive: Archive, file: Path, scenes: list[str], folder: Path,
             try:
                 find_data(unpacked / scene)
             except DataError as error:
-                raise DataError(f"{file}: {scene} is in no known data format; the archive has changed") from error
+                raise DataError(f"{file}: the format of {scene} is unknown; the archive has changed") from error
         folder.mkdir(parents=True, exist_ok=True)
         for path in sorted(unpacked.iterdir()):
             if not (folder / path.name).exists():
@@ -166,12 +166,12 @@ def _put_in_place(archive: Archive, file: Path, scenes: list[str], folder: Path,
 
 
 def _placement(archive: Archive, scenes: Sequence[str], names: Sequence[tuple[str, ...]]) -> Place:
-    """Return where the files of an archive go: those below a scene's folder into a folder of its name.
+    """Return the target of each file of an archive: files below a scene's folder go into a folder named like the scene.
 
     Args:
         archive: the archive.
         scenes: the scenes to unpack.
-        names: paths of all its files, in parts.
+        names: paths of all its files, split into parts.
     """
     only = archive.scenes[0] if len(archive.scenes) == 1 else None
     # The folder of a single scene may have another name, or none.
@@ -185,7 +185,7 @@ def _placement(archive: Archive, scenes: Sequence[str], names: Sequence[tuple[st
         if renamed and only is not None:
             return (only, *parts[top:]) if only in scenes else None
         for index, part in enumerate(parts[:-1]):
-            if part in archive.scenes:  # the outermost: a scene may hold a folder of another one's name
+            if part in archive.scenes:  # the outermost match: a scene may contain a folder named like another scene
                 return parts[index:] if part in scenes else None
         is_note = len(parts) <= 2 and parts[-1].lower().startswith(NOTES)
         return parts[-1:] if is_note else None

@@ -1,4 +1,4 @@
-"""Unpacking of zip files from elsewhere: nothing outside the folder, no links, and no more than a disk should take."""
+"""Safe unpacking of zip files: nothing outside the folder, no links, and limited sizes."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from nerfloom.base.console import track_bytes
 from nerfloom.base.errors import DataError, shown
 
 MAX_FILES = 200_000
-"""Maximum number of entries of an archive. The largest of the catalogue has some ten thousand."""
+"""Maximum number of entries of an archive. The largest in the catalogue has about ten thousand."""
 MAX_EXPANSION = 20
-"""Maximum number of unpacked bytes for each byte of an archive. Images are compressed already; text may be a tenth."""
+"""Maximum number of unpacked bytes per byte of an archive. Images are compressed already; text may be a tenth."""
 ALLOWANCE = 1 << 20
-"""Bytes that any archive may unpack to, however small it is."""
+"""Number of bytes to which any archive may unpack, however small it is."""
 CHUNK = 1 << 20
-"""Number of bytes that are written at a time."""
+"""Number of bytes written at a time."""
 UNSAFE = re.compile(r'[\x00-\x1f\x7f<>:"|?*\\]|[. ]$')
-"""Characters that a name must not have, as some system reads them otherwise: separators, drives, streams, wildcards."""
+"""Characters that a name must not have, because some systems interpret them: separators, drives, streams, wildcards."""
 MAX_NAME = 255
-"""Maximum number of bytes of a file's or a folder's name."""
+"""Maximum length of a file's or folder's name, bytes."""
 
 Place = Callable[[tuple[str, ...]], tuple[str, ...] | None]
-"""Function from the parts of an entry's path to those of the path to write; None for an entry to leave out."""
+"""Function from the parts of an entry's path to those of the path to write; None to skip the entry."""
 
 
 def names_of(archive: Path) -> list[tuple[str, ...]]:
-    """Return the paths of all files in a zip file, in parts.
+    """Return the paths of all files in a zip file, split into parts.
 
     Args:
         archive: the zip file.
@@ -46,12 +46,12 @@ def names_of(archive: Path) -> list[tuple[str, ...]]:
 def unpack(archive: Path, folder: Path, place: Place) -> int:
     """Unpack a zip file, or a part of it.
 
-    Everything that the archive's directory says is checked before the first file is written.
+    Everything in the archive's directory is checked before the first file is written.
 
     Args:
         archive: the zip file.
-        folder: folder to write into, new.
-        place: where each entry goes in the folder.
+        folder: new folder to write into.
+        place: function that gives each entry's target in the folder.
 
     Returns:
         Number of files written.
@@ -68,8 +68,8 @@ def unpack(archive: Path, folder: Path, place: Place) -> int:
         total = sum(entry.file_size for entry, _ in chosen)
         folder.mkdir(parents=True)
         if total > (free := shutil.disk_usage(folder).free):
-            needed = f"{archive.name} takes {total / 1e9:.1f} GB unpacked, and {free / 1e9:.1f} GB are free"
-            raise DataError(f"{folder.parent}: the disk is too small: {needed}; make room, or name another --save-dir")
+            needed = f"{archive.name} needs {total / 1e9:.1f} GB unpacked, {free / 1e9:.1f} GB are free"
+            raise DataError(f"{folder.parent}: the disk is too small: {needed}; make room or use another --save-dir")
         with track_bytes(f"unpacking {archive.name}", total) as advance:
             for entry, target in chosen:
                 _write(opened, entry, folder.joinpath(*target), archive, advance)
@@ -82,14 +82,14 @@ def _opened(archive: Path) -> zipfile.ZipFile:
     except OSError as error:
         raise DataError(f"cannot read {archive}: {error.strerror or error}") from error
     except (zipfile.BadZipFile, NotImplementedError, ValueError) as error:
-        raise DataError(f"{archive} is no zip file, or damaged: {error}") from error
+        raise DataError(f"{archive} is damaged or not a zip file: {error}") from error
 
 
 def _files(opened: zipfile.ZipFile, archive: Path) -> list[zipfile.ZipInfo]:
-    """Return the entries that are files, after checking that there are no others but folders."""
+    """Return the entries that are files, after checking that all others are folders."""
     entries = opened.infolist()
     if len(entries) > MAX_FILES:
-        raise DataError(f"{archive} has {len(entries)} entries; at most {MAX_FILES} are unpacked")
+        raise DataError(f"{archive} has {len(entries)} entries; the limit is {MAX_FILES}")
     for entry in entries:
         kind = stat.S_IFMT(entry.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
@@ -100,7 +100,7 @@ def _files(opened: zipfile.ZipFile, archive: Path) -> list[zipfile.ZipInfo]:
 
 
 def _parts(entry: zipfile.ZipInfo, archive: Path) -> tuple[str, ...]:
-    """Return the parts of an entry's path; `orig_filename` is what stands in the file, before any repair of it."""
+    """Return the parts of an entry's path; `orig_filename` is the name as stored, before Python repairs it."""
     parts = tuple(entry.orig_filename.split("/"))
     for part in parts:
         if part in ("", ".", "..") or UNSAFE.search(part) or len(part.encode("utf-8", "replace")) > MAX_NAME:
@@ -111,14 +111,14 @@ def _parts(entry: zipfile.ZipInfo, archive: Path) -> tuple[str, ...]:
 def _check_sizes(entries: Sequence[zipfile.ZipInfo], archive: Path) -> None:
     size = archive.stat().st_size
     if sum(entry.compress_size for entry in entries) > size:
-        raise DataError(f"{archive}: its entries overlap, as those of no honest archive do; nothing was unpacked")
+        raise DataError(f"{archive}: its entries overlap, which is unsafe; nothing was unpacked")
     total = sum(entry.file_size for entry in entries)
     if total > MAX_EXPANSION * size + ALLOWANCE:
         raise DataError(f"{archive} of {size} bytes would unpack to {total}; nothing was unpacked")
 
 
 def _check_targets(targets: Sequence[tuple[str, ...]], archive: Path) -> None:
-    """Check that no two files have the same path, also where capitals do not count, and that none is a folder too."""
+    """Check that no two files have the same path, ignoring case, and that no file is also a folder."""
     folded = ["/".join(target).casefold() for target in targets]
     files = set(folded)
     folders = {name.rpartition("/")[0] for name in folded}
@@ -131,7 +131,7 @@ def _check_targets(targets: Sequence[tuple[str, ...]], archive: Path) -> None:
 def _write(
     opened: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, archive: Path, advance: Callable[[int], None]
 ) -> None:
-    """Write one entry. Reading ends at the size that the directory states, and its sum is compared at the end."""
+    """Write one entry. Reading stops at the size stated in the directory, and the checksum is compared at the end."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with opened.open(entry) as content, path.open("xb") as file:
@@ -139,8 +139,8 @@ def _write(
                 file.write(chunk)
                 advance(len(chunk))
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
-        raise DataError(f"{archive}: {shown(entry.filename)} is damaged: {error}; download it anew") from error
+        raise DataError(f"{archive}: {shown(entry.filename)} is damaged: {error}; download it again") from error
     except OSError as error:
         raise DataError(f"cannot write {path}: {error.strerror or error}; the archive {archive} is kept") from error
     if path.stat().st_size != entry.file_size:
-        raise DataError(f"{archive}: {shown(entry.filename)} is shorter than its directory says; download it anew")
+        raise DataError(f"{archive}: {shown(entry.filename)} is shorter than stated; download it again")

@@ -17,7 +17,7 @@ from nerfloom.kernels.table_memory import table
 
 HashGridT = TypeVar("HashGridT", bound="HashGrid")
 FIRST_LEVELS = 4
-"""Number of levels that are open at the start if they open one after the other, as in Neuralangelo (Li et al. 2023)."""
+"""Number of levels open at the start if levels open one after the other, as in Neuralangelo (Li et al. 2023)."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ class HashGrid(nn.Module):
         log2_table_size: maximum number of entries of one level, as a power of two.
         sparse: whether the optimiser updates only the entries that a step has used. The compiled kernels then keep the
             gradient of the table in `deferred` for the optimiser, and `table.grad` stays None.
-        opening: levels open one after the other (`Opening`) during this share of the training budget; 0: all are open.
+        opening: levels open one after the other (`Opening`) during this fraction of the training budget; 0: all are
+            open.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.

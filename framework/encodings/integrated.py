@@ -16,13 +16,13 @@ from nerfloom.kernels.encodings.integrated import integrated_encoding
 class IntegratedEncoding(nn.Module):
     """Expected sines and cosines of the Gaussians of points, in units of a box.
 
-    The middle of the box is at the origin, and its faces are at -1 and 1. Along the axes alone, a Gaussian that is long
-    in a direction between them looks like a ball; further directions tell them apart (mip-NeRF 360, section 2).
+    The box is centred at the origin, and its faces are at -1 and 1. Waves along the three axes alone cannot tell a
+    Gaussian that is long in a diagonal direction from a ball; further directions can (mip-NeRF 360, section 2).
 
     Args:
         box: (2, 3) corners of the box, scene units.
         num_frequencies: number L of frequencies.
-        deviation: standard deviation of points that are asked about without a size, scene units.
+        deviation: standard deviation assumed for points without a size, scene units.
         contracted: whether all of space is contracted into the ball of radius 2 around the box.
         directions: (K, 3) unit directions along which waves run; the three axes if None.
     """
@@ -64,9 +64,9 @@ class IntegratedEncoding(nn.Module):
 
 
 def icosahedron_directions() -> Tensor:
-    """Return the directions (21, 3) of mip-NeRF 360: corners and edge middles of an icosahedron, one of each antipodes.
+    """Return the directions (21, 3) of mip-NeRF 360: corners and edge middles of an icosahedron, one of each pair.
 
-    They are those of an icosahedron whose faces are each divided into four, appendix A of the paper.
+    The icosahedron's faces are each divided into four; of two opposite directions one is kept. Appendix A of the paper.
     """
     golden = (1 + 5**0.5) / 2
     pairs = [(1.0, golden), (1.0, -golden), (-1.0, golden), (-1.0, -golden)]
@@ -78,5 +78,5 @@ def icosahedron_directions() -> Tensor:
 
 
 def _is_first(direction: Tensor) -> bool:
-    """Return whether the first coordinate that is not 0 is positive, which holds for one of two antipodes."""
+    """Return whether the first coordinate that is not 0 is positive; this holds for one of two opposite directions."""
     return next(value > 0 for value in direction.tolist() if abs(value) > 1e-6)

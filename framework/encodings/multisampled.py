@@ -13,17 +13,17 @@ from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.multisampled_grid import LOOK_UP, multisampled_grid
 
 DECAYED = 8
-"""On a CPU, one in this many frustums decays in a step, at a random place, and as many times as much."""
+"""On a CPU, one in this many frustums decays in a step, this many times as strongly, from a random start."""
 
 
 class MultisampledHashGrid(HashGrid):
     """A multiresolution hash grid over [0, 1]^3 that is looked up at multisamples (`kernels.grids.multisamples`).
 
-    Decay: the paper adds the mean of squares of each level's entries to the loss, so that the few entries of coarse
-    levels decay as fast as the many of fine ones. Its gradient touches the whole table in each step. Here it is the
-    mean of squares of each level's features at the frustums of a step, whose gradient goes through the look-up's and
-    reaches the entries that the step uses. An entry that is never used stays at its first value of 1e-4 or less. On a
-    CPU every eighth frustum stands for all, so that others may be without a gradient, which look-ups skip.
+    Decay: the paper adds the mean square of each level's entries to the loss, so that the few entries of coarse levels
+    decay as fast as the many entries of fine ones. The gradient of that term touches the whole table in each step. Here
+    the term is the mean square of each level's features at the frustums of a step; its gradient reaches only entries
+    that the step uses. An entry that is never used stays at its initial value of 1e-4 or less. On a CPU every eighth
+    frustum stands for all, so that the others may have no gradient and look-ups can skip them.
 
     Args:
         num_levels: number L of levels.
@@ -32,7 +32,7 @@ class MultisampledHashGrid(HashGrid):
         max_resolution: cells along an axis at the last level.
         log2_table_size: maximum number of entries of one level, as a power of two.
         sparse: whether the optimiser updates only the entries that a step has used, as in `HashGrid`.
-        decay: weight of the mean of squares of each level's features, whose gradient is added in training mode.
+        decay: weight of the mean square of each level's features; its gradient is added in training mode.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.
@@ -61,7 +61,7 @@ class MultisampledHashGrid(HashGrid):
 
 
 class _Decayed(torch.autograd.Function):
-    """Values as they are, whose gradient is that of the loss and of half the sum of their squares times a rate."""
+    """Identity, whose gradient also includes that of half the sum of squares times a rate."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, rate: float) -> Tensor:
@@ -72,7 +72,7 @@ class _Decayed(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         (values,) = ctx.saved_tensors
-        if devices.runs_ahead(grad.device):  # a recorded step would take the same rows each time, and gains nothing
+        if devices.runs_ahead(grad.device):  # a captured step would take the same rows each time
             return torch.add(grad, values, alpha=ctx.rate), None
         first, total = int(torch.randint(DECAYED, ())), grad.clone()
         total[first::DECAYED].add_(values[first::DECAYED], alpha=DECAYED * ctx.rate)

@@ -1,9 +1,8 @@
-"""Levels of an encoding that open one after the other, from coarse to fine, while a model is trained.
+"""Levels of an encoding that open one after the other, from coarse to fine, during training.
 
 FreeNeRF (Yang et al. 2023), section 3.2, multiplies the frequencies of NeRF's encoding by factors that rise from 0 to 1
-one after the other, so that a few images are first explained by smooth shapes. Here this holds for every encoding with
-levels: the frequencies of NeRF, the levels of a hash grid, the scales of feature planes. Closed levels are not
-evaluated.
+one after the other, so that few images are first explained by smooth shapes. Here this works for every encoding with
+levels: NeRF's frequencies, hash grid levels, and scales of feature planes. Closed levels are not evaluated.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from torch.nn.functional import pad
 from nerfloom.base.device import HostValue
 
 STEPS_PER_LEVEL = 2**10
-"""Steps in which a level opens: each is a number that float32 holds exactly."""
+"""Number of steps in which a level opens; the factors are exact in float32."""
 
 
 def opened_levels(num_levels: int, first: float, progress: float) -> float:
@@ -27,7 +26,7 @@ def opened_levels(num_levels: int, first: float, progress: float) -> float:
     Args:
         num_levels: number L of levels.
         first: number of levels that are open at the start.
-        progress: fraction of the time in which they open, at least 0; from 1 on all are open.
+        progress: fraction of the opening time that has passed, at least 0; from 1 on all levels are open.
 
     Returns:
         min(first + L progress, L), at least 0.
@@ -38,12 +37,12 @@ def opened_levels(num_levels: int, first: float, progress: float) -> float:
 
 
 class Opening(nn.Module):
-    """The open levels of one encoding; it is part of a checkpoint, and complete where a checkpoint does not have it.
+    """The open levels of an encoding. They are saved in checkpoints; a checkpoint without them opens all levels.
 
     Args:
         num_levels: number of levels.
         first: number of levels that are open at the start.
-        until: share of the training budget after which all levels are open.
+        until: fraction of the training budget after which all levels are open.
     """
 
     opened: Tensor
@@ -55,7 +54,7 @@ class Opening(nn.Module):
         self._opened = HostValue()
 
     def advance(self, progress: float) -> None:
-        """Open the levels that are to be open at `progress`, the fraction of the training budget that is spent."""
+        """Open the levels for `progress`, the fraction of the training budget that is spent."""
         share = progress / self.until
         opened = round(opened_levels(self.num_levels, self.first, share) * STEPS_PER_LEVEL) / STEPS_PER_LEVEL
         if opened != self._opened.of(self.opened):
@@ -72,7 +71,7 @@ class Opening(nn.Module):
         return self._opened.of(self.opened) >= self.num_levels
 
     def completed(self, features: Tensor, width: int, last: int | None = None) -> Tensor:
-        """Return the features of all levels, from those of the open ones.
+        """Pad the features of the open levels to those of all levels.
 
         Args:
             features: (N, E) features, ending with those of the last open level.
@@ -80,7 +79,8 @@ class Opening(nn.Module):
             last: number of features of the last open level; `width` over the number of levels if None.
 
         Returns:
-            (N, width) features, those of the last open level times its factor, and those of closed levels 0.
+            (N, width) features. Those of the last open level are multiplied by its factor; those of closed levels are
+            0.
         """
         share = self._opened.of(self.opened) - (self.count - 1)
         if self.count and share < 1:

@@ -1,4 +1,4 @@
-"""Features of positions that are looked up in images: at the pixels that show the positions."""
+"""Pixel-aligned features: features of positions, looked up in images at the pixels that show the positions."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ MOST_LEVELS = 8
 
 @dataclass(frozen=True)
 class SourceViews:
-    """V images of a scene, as features of their pixels."""
+    """V images of a scene as feature maps."""
 
     features: tuple[Tensor, ...]
-    """V maps (C, h, w) over the whole image each, of any resolution."""
+    """V maps (C, h, w), each covering the whole image at any resolution."""
     cameras: Cameras
     """V cameras of the images."""
 
@@ -44,8 +44,8 @@ class SourceViews:
     def aligned(self, points: Tensor) -> Tensor:
         """Return the features at the pixels that show points, (V, N, C): PixelNeRF (Yu et al. 2021), section 4.1.
 
-        They are interpolated between pixel centres. Beyond the edges of an image they are those at its edge, and zero
-        where its camera cannot see: behind it, or out of its lens's reach.
+        Features are interpolated between pixel centres. Positions beyond an image's edge get the features at the edge;
+        positions that its camera cannot see (behind it, or outside the lens's reach) get zeros.
 
         Args:
             points: (N, 3) scene coordinates.
@@ -61,18 +61,18 @@ class SourceViews:
 
 
 class ImageEncoder(nn.Module):
-    """A small convolutional network, from images to a feature map: a pyramid, all of whose levels are concatenated.
+    """A small convolutional network from images to feature maps: a pyramid whose levels are concatenated.
 
-    Each level is half as fine as the one before. PixelNeRF (Yu et al. 2021), section 4.1, joins the levels of a ResNet
-    with ImageNet's weights; here there are two convolutions a level, learnt from the start. Levels are reduced by means
-    of 2 x 2 pixels, which leaves every feature in the middle of the pixels that it is of.
+    Each level has half the resolution of the one before. PixelNeRF (Yu et al. 2021), section 4.1, concatenates the
+    levels of a ResNet pretrained on ImageNet; here each level has two convolutions, trained from scratch. Levels are
+    reduced by means of 2 x 2 pixels, so that each feature stays centred on its pixels.
 
     Args:
         widths: number of features of each level, the finest first.
 
     Raises:
-        ConfigError: if there is no level or more than `MOST_LEVELS`, a level without features, or too little memory for
-            the weights.
+        ConfigError: if there are no levels or more than `MOST_LEVELS`, if a level has no features, or if the weights
+            need more memory than the machine has.
     """
 
     def __init__(self, widths: Sequence[int]) -> None:
@@ -81,7 +81,7 @@ class ImageEncoder(nn.Module):
             raise ConfigError(f"an image encoder has 1 to {MOST_LEVELS} levels of 1 feature or more each")
         require(72.0 * sum(width * max(widths) for width in widths), "an image encoder")
         self.num_features = sum(widths)
-        """C, features of a pixel."""
+        """Number C of features of a pixel."""
         inputs = (3, *widths[:-1])
         self.first = nn.ModuleList(nn.Conv2d(i, o, 3, padding=1) for i, o in zip(inputs, widths, strict=True))
         self.second = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for width in widths)
@@ -103,7 +103,7 @@ class ImageEncoder(nn.Module):
                 hidden = avg_pool2d(hidden, 2, ceil_mode=True, count_include_pad=False)
             hidden = relu(first(hidden))
             hidden = hidden + relu(second(hidden))
-            # By the exact factor, and then cut: a level of an image of odd size is wider than the image.
+            # Scaled by the exact factor, then cut: for an image of odd size, a level is wider than the image.
             finest = interpolate(hidden.float(), scale_factor=float(2**level), mode="bilinear", align_corners=False)
             levels.append(finest[..., :height, :width])
         return torch.cat(levels, dim=1)

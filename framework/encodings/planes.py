@@ -17,7 +17,7 @@ from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout, planes
 from nerfloom.kernels.table_memory import table
 
 BANDS = 16
-"""Number of bands into which `FeaturePlanes.bands` divides the rows of a factor."""
+"""`FeaturePlanes.bands` divides the rows of a factor into this many bands."""
 
 
 class FeaturePlanes(nn.Module):
@@ -28,9 +28,9 @@ class FeaturePlanes(nn.Module):
         features_per_group: number F of features of a group.
         axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
         sparse: whether the optimiser updates only the entries that a step has used, as for `HashGrid`.
-        resizable: whether `resample` may be called, so that a checkpoint may have other resolutions.
-        opening: groups that are scales open from coarse to fine (`Opening`) during this share of the training budget.
-            All are open if it is 0.
+        resizable: whether `resample` may be called; a checkpoint may then have other resolutions.
+        opening: groups are scales that open from coarse to fine (`Opening`) during this fraction of the training
+            budget; 0: all are open.
 
     Raises:
         ConfigError: if a number is out of range, or the table needs more memory than the machine has.
@@ -85,25 +85,25 @@ class FeaturePlanes(nn.Module):
         """Return a random band of consecutive rows of each of several factors, for regularisers.
 
         Reading all of a large table in every step would be slow. A band may extend beyond the factor, where it is cut
-        off, so that all rows are equally likely. A device that runs ahead of Python draws the places itself, and moves
-        such a band into the factor instead, so that its size is always the same.
+        off, so that all rows are equally likely. On a device that runs ahead of Python, the device draws the start of
+        the band and shifts it to lie inside the factor, so that its size is constant.
 
         Args:
             factors: group, and index in the group, of each factor.
-            whole: axes; factors along any of them are returned whole.
+            whole: axes; factors along any of them are returned in full.
 
         Returns:
-            (B, vertices along the first axis, F) values of each, where B is at most 1/16 of the rows, or 2.
+            (B, vertices along the first axis, F) values of each factor; B is at most 1/16 of the rows, or 2.
         """
         if devices.runs_ahead(self.table.device):
             return self._drawn_there(factors, whole)
         return plane_bands(self.table, self.layout, self._drawn(factors, whole), self.deferred)
 
     def variation(self, factors: Sequence[tuple[int, int]]) -> Tensor:
-        """Return the total variation of a random band of each of K factors: (K,) sums over both axes.
+        """Return the total variation of a random band of each of K factors: (K,), summed over both axes.
 
         Args:
-            factors: group, and index in the group, of each factor; the bands are as those of `bands`.
+            factors: group, and index in the group, of each factor; bands are drawn as in `bands`.
         """
         if devices.runs_ahead(self.table.device):
             return variation(self._drawn_there(factors, ()))
@@ -140,9 +140,9 @@ class FeaturePlanes(nn.Module):
         is reset if the size of the table changes.
 
         Args:
-            resolutions: vertices along each axis, per group, of the new factors.
-            lower: (D,) lower corner of the part of space to cover, in units of the present one.
-            upper: (D,) upper corner of the part of space to cover, in units of the present one.
+            resolutions: vertices along each axis of the new factors, per group.
+            lower: (D,) lower corner of the new region, relative to the present unit cube.
+            upper: (D,) upper corner of the new region, relative to the present unit cube.
         """
         before, old = self.layout, self.table.data
         self._relayout(torch.tensor(resolutions))

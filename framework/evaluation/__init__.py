@@ -1,1 +1,1 @@
-"""Evaluation of any method by one evaluator, and images and camera paths for people."""
+"""Evaluation of all methods by one evaluator, and images and camera paths for people."""

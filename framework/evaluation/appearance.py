@@ -1,7 +1,7 @@
 """Appearance of held-out images, fitted to their left halves by NeRF-W's protocol.
 
-Martin-Brualla et al., "NeRF in the Wild", CVPR 2021, section 5. A held-out image has no appearance vector. One is
-optimised on its left half with all other parameters fixed, and metrics are computed on its right half.
+Martin-Brualla et al., "NeRF in the Wild", CVPR 2021, section 5. A held-out image has no appearance vector. A vector is
+optimised on the image's left half with all other parameters fixed, and metrics are computed on the right half.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from nerfloom.losses.functions import mean_squared_error
 from nerfloom.renderable import HasAppearance, Renderable, RendersRays
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
-"""Steps of Adam, pixels per step, and learning rate, with which an appearance vector is fitted."""
+"""Steps of Adam, pixels per step, and learning rate for fitting an appearance vector."""
 CANDIDATES = 32
-"""Maximum number of training images' vectors among which the first vector is looked for."""
+"""Maximum number of training images' vectors tried as the initial vector."""
 
 
 def appearance_of(model: Renderable) -> Appearance | None:
@@ -36,7 +36,7 @@ def appearance_of(model: Renderable) -> Appearance | None:
 
 
 def right_half(image: Tensor) -> Tensor:
-    """Return the right half (H, W - W // 2, ...) of an image, on which metrics are computed.
+    """Return the right half (H, W - W // 2, ...) of an image, used for metrics.
 
     Args:
         image: (H, W, ...) image.
@@ -74,15 +74,15 @@ def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]
 def fit_appearance(
     model: Renderable, dataset: Dataset, pixels: Tensor, background: Tensor, start: Tensor | None = None
 ) -> Tensor | None:
-    """Fit the appearance vector with which the model's colours come closest to given pixels.
+    """Fit the appearance vector for which the model's colours are closest to given pixels.
 
     Args:
-        model: the model, whose parameters are not changed.
+        model: the model; its parameters are not changed.
         dataset: the images.
-        pixels: (P,) indices of the pixels, counted through all images; P may be 0.
+        pixels: (P,) indices of the pixels, counted over all images; P may be 0.
         background: (3,) colour behind transparent pixels.
-        start: (D,) initial vector; if None, for a model that casts rays, that of the training images' vectors and their
-            mean which shows the pixels best, and for others the mean.
+        start: (D,) initial vector. If None, a model that casts rays starts from the best of the training images'
+            vectors and their mean; other models start from the mean.
 
     Returns:
         (D,) vector; None if the model has no appearance vectors.
@@ -106,8 +106,8 @@ def fit_appearance(
 def _closest(model: Renderable, appearance: Appearance, dataset: Dataset, pixels: Tensor, background: Tensor) -> Tensor:
     """Return the vector (D,) with which some of the pixels are shown best: the mean, or one of the training images'.
 
-    What the mean shows is learnt besides (`Appearance`), so that vectors near it say little of the light of others, and
-    a descent from there may end where it is no better.
+    The network learns the mean vector separately (`Appearance`), so vectors near the mean say little about the light of
+    others, and a descent from there may end at a poor minimum.
     """
     mean = appearance.vectors.mean(0)
     if not len(pixels) or not isinstance(model, RendersRays):
@@ -128,7 +128,7 @@ def _some(rows: Tensor, most: int) -> Tensor:
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:
-    """Return the unmasked pixels (P,) of an image's left half, counted through all images."""
+    """Return the unmasked pixels (P,) of an image's left half, counted over all images."""
     width = int(dataset.cameras.widths[index])
     pixels = dataset.cameras.image_pixels(index).view(-1, width)[:, : width // 2]
     kept = dataset.kept_of(index)

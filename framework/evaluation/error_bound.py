@@ -1,4 +1,4 @@
-"""Faster rendering within an error bound: rays end where the rest cannot change a colour by more than the bound."""
+"""Faster rendering within an error bound: a ray ends where the rest can change a colour by at most the bound."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import StopsEarly
 
 MEASURED_VIEWS = 4
-"""Maximum number of views on which the error is measured."""
+"""Maximum number of views used to measure the error."""
 
 
 def parse_error(text: str) -> float:
-    """Return the error bound that `text`, such as 0.004 or 1/255, stands for.
+    """Return the error bound given as `text`, such as 0.004 or 1/255.
 
     Raises:
         ConfigError: if it is not a number in [0, 1).
@@ -28,7 +28,7 @@ def parse_error(text: str) -> float:
     except (ValueError, ZeroDivisionError):
         bound = -1.0
     if not 0 <= bound < 1:
-        raise FlagError(f"--max-error is '{text}'; it must be a number from 0 to below 1, such as 0.004 or 1/255")
+        raise FlagError(f"--max-error is '{text}'; it must be a number from 0 to less than 1, such as 0.004 or 1/255")
     return bound
 
 
@@ -45,7 +45,7 @@ def limited_error(model: Renderable, bound: float) -> Iterator[None]:
     """
     samplers = parts(model, StopsEarly)
     if not samplers:
-        raise ConfigError("--max-error: this run has no occupancy grid to stop its rays early; leave it out")
+        raise ConfigError("--max-error: this run has no occupancy grid to end its rays early; leave out the flag")
     before = [sampler.early_stop for sampler in samplers]
     try:
         for sampler in samplers:
@@ -65,7 +65,7 @@ def measured_error(model: Renderable, dataset: Dataset, bound: float) -> tuple[f
         bound: transmittance at which rays end.
 
     Returns:
-        The maximum difference of a colour channel to rendering without early stop, and the ratio of the two times.
+        The maximum difference of a colour channel from rendering without early stop, and the ratio of the two times.
     """
     background, worst, times = model.background, 0.0, [0.0, 0.0]
     chosen = spread(len(dataset), MEASURED_VIEWS)

@@ -34,14 +34,14 @@ from nerfloom.rendering.rendered import Picture
 T = TypeVar("T")
 
 BEFORE = 0.9
-"""Share of a sparse point's distance before which a view that sees the point should show nothing."""
+"""A view that sees a sparse point should show nothing up to this fraction of the point's distance."""
 FAR_BELOW, MOST_NAMED = 3.0, 3
-"""Distance from the mean PSNR, dB, from which a view is named, and the maximum number of views that are."""
+"""Views this far below the mean PSNR, dB, are named; and the maximum number of views named."""
 MASKED = (
-    "PSNR is of kept pixels, SSIM and MS-SSIM are of windows without ignored pixels, LPIPS is the mean of its map over "
-    "kept pixels, for which ignored pixels are copied from the true image"
+    "PSNR is over kept pixels, SSIM and MS-SSIM over windows without ignored pixels, LPIPS is the mean of its map over "
+    "kept pixels, with ignored pixels copied from the true image"
 )
-"""What is measured of images with ignored pixels."""
+"""Description of the metrics of images with ignored pixels."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,15 @@ class Measured:
     psnr: float
     """Peak signal-to-noise ratio, dB."""
     ssim: float | None
-    """Structural similarity; None if no window of SSIM lies inside what counts."""
+    """Structural similarity; None if no window of SSIM lies within the counted pixels."""
 
 
 def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
-    """Compute the PSNR of the kept pixels, and the SSIM over the windows that have no other pixels.
+    """Compute the PSNR of the kept pixels, and the SSIM over windows of kept pixels only.
 
     Args:
         rgb, target: (H, W, 3) rendered and true image in [0, 1].
-        kept: (H, W) bool, pixels that count; all if None.
+        kept: (H, W) bool, pixels that count; None for all.
     """
     judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
     return Measured(psnr(*judged), quick_ssim(rgb, target, kept) if min(rgb.shape[:2]) >= WINDOW else None)
@@ -83,7 +83,7 @@ def measure_view(model: Renderable, dataset: Dataset, index: int, background: Te
 
 
 def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
-    """Return the indices of the images of which masks keep some pixels, and that are not given to a method.
+    """Return the indices of the images to evaluate: not source images, and with some kept pixels.
 
     Args:
         dataset: the images.
@@ -109,11 +109,11 @@ def timed_view(model: Renderable, view: View, background: Tensor) -> tuple[Pictu
 
 
 def floaters(picture: Picture, dataset: Dataset, index: int) -> float | None:
-    """Return the share, in per cent, of the sparse points that a view sees with something before them.
+    """Return the percentage of a view's sparse points with matter in front of them.
 
-    These are the points that a reconstruction's tracks say the image sees, and whose pixel's median depth is less than
-    `BEFORE` of their distance: so half of the pixel's light is stopped in space that the image shows to be empty. This
-    is defined for every method that renders depth.
+    These are points that the image sees according to the reconstruction's tracks, and whose pixel has a median depth
+    below `BEFORE` of their distance. Half of such a pixel's light is stopped in space that the image shows to be empty.
+    This is defined for every method that renders depth.
 
     Args:
         picture: the rendered view.
@@ -121,7 +121,7 @@ def floaters(picture: Picture, dataset: Dataset, index: int) -> float | None:
         index: index of the view.
 
     Returns:
-        The share; None if the image sees no point whose distance is known well enough.
+        The percentage; None if the image sees no point with a well-known distance.
     """
     if dataset.sparse_depth is None:
         return None
@@ -140,33 +140,33 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image, the number of pixels that count
-    and that masks ignore, and its reduction if images have several sizes."""
+    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image; the numbers of counted and of
+    masked pixels; and the image's reduction if images have several sizes."""
     results: dict[str, Any]
-    """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images that each mean is
-    over; the numbers of pixels that count and that masks ignore; by_size, the statistics of images of each size."""
+    """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images in each mean; the
+    numbers of counted and of masked pixels; by_size, the statistics of images of each size."""
     lpips_note: str
-    """Network of LPIPS and source of its weights, or the reason why it is absent."""
+    """Network of LPIPS and source of its weights, or the reason for its absence."""
     eval_appearance: Literal["mean", "half"] | None = None
     """Source of the held-out images' appearance; None if the method has none."""
     pictures_note: str | None = None
-    """Reason why rendered images could not be written; None if there is none."""
+    """Reason why rendered images could not be written; None if there was no problem."""
 
     @property
     def warning(self) -> str | None:
-        """The warning that some rendered images are not finite; None if all are finite."""
+        """A warning about rendered images that are not finite; None if all are finite."""
         bad = [row["name"] for row in self.per_image if not math.isfinite(row["psnr"])]
         if not bad:
             return None
         return (
-            f"{len(bad)} of {len(self.per_image)} rendered images are not finite, first {bad[0]}: their metrics are "
-            "null, and so are the means; see whether a pose of the data or the checkpoint is, or evaluate an older "
+            f"{len(bad)} of {len(self.per_image)} rendered images are not finite, first {bad[0]}: their metrics and "
+            "the means are null; check the poses in the data and the checkpoint, or evaluate an older "
             "checkpoint (ns-eval --load-checkpoint)"
         )
 
     @property
     def masks_note(self) -> str | None:
-        """The text that says what is measured of masked images; None if all pixels count."""
+        """A description of the metrics of masked images; None if all pixels count."""
         if not self.results["num_ignored_pixels"]:
             return None
         images = self.results["num_images"]
@@ -176,7 +176,7 @@ class Evaluation:
 
     @property
     def far_below(self) -> str | None:
-        """The views whose PSNR is `FAR_BELOW` or more below the mean, worst first, as text; None if there is none."""
+        """The views `FAR_BELOW` or more below the mean PSNR, worst first, as text; None if there are none."""
         mean = self.results["psnr"]
         low = sorted((row for row in self.per_image if row["psnr"] <= mean - FAR_BELOW), key=lambda row: row["psnr"])
         if not low:
@@ -201,7 +201,7 @@ class Evaluation:
         return f"{quality}  {speed}  ({count if count == of else f'{count} of {of}'} images{masks})"
 
     def _mean(self, name: str) -> str:
-        """Return a mean as text, with the number of images that it is over if others have no such value."""
+        """Return a mean as text, with its number of images if some images lack the metric."""
         mean, images = self.results[name], self.results[f"{name}_images"]
         over = f" ({images} of {self.results['num_images']} images)" if images < self.results["num_images"] else ""
         return "absent" if mean is None else f"{mean:.4f}{over}"
@@ -241,22 +241,22 @@ def evaluate(
         title: text of the progress bar.
 
     Raises:
-        ConfigError: if the file of weights cannot be used.
-        DataError: if there is no image to evaluate.
+        ConfigError: if the file of weights is unusable.
+        DataError: if there are no images to evaluate.
     """
     appearance = appearance_of(model)
     half = appearance is not None and appearance.held_out == "half"
     views = views_to_judge(dataset, half)
     asked = [views[rank] for rank in spread(len(views), max_images)]
     if not asked:
-        raise DataError(f"there is no image to evaluate: masks leave nothing of the {len(dataset)} that there are")
+        raise DataError(f"there are no images to evaluate: masks cover all {len(dataset)} of them")
     if isinstance(model, RendersFromImages) and dataset.source_images is not None:
         model.show_images(dataset)
     lpips, lpips_note = load_lpips(lpips_weights, model.device)
     background = model.background
     judge = partial(_judge, model, dataset, background, half, round_to_uint8, lpips)
     if seconds is not None and runs_ahead(model.device):
-        judge(asked[0])  # compiles what rendering needs, which the other views do not wait for
+        judge(asked[0])  # compiles kernels, so that the other views need not wait
     first, cost = _timed(partial(judge, asked[0]), f"{title}: the first image")
     chosen = _in_time(asked, cost, seconds)
     shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
@@ -265,7 +265,7 @@ def evaluate(
     others = ((index, judge(index)) for index in track(order[1:], title, len(order), done=1, spent=cost))
     rows, rays = _collected(chain([(order[0], first)], others), files)
     spent = sum(row["seconds"] for row in rows)
-    speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None: no rays are cast
+    speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None if no rays are cast
     counts = {"num_images": len(rows), "num_images_in_split": len(views)}
     protocol = None if appearance is None else appearance.held_out
     results = {**statistics(rows), **speed, **counts}
@@ -273,7 +273,7 @@ def evaluate(
 
 
 def _collected(judged: Iterable[tuple[int, tuple[dict[str, Any], Judged]]], files: ViewFiles) -> tuple[list[Any], int]:
-    """Write the files of views as they are judged; return their rows in the order of the data, and the rays cast."""
+    """Write the files of views as they are evaluated; return their rows in the order of the data, and the rays cast."""
     found, rays = {}, 0
     for index, (row, images) in judged:
         found[index] = row
@@ -284,14 +284,14 @@ def _collected(judged: Iterable[tuple[int, tuple[dict[str, Any], Judged]]], file
 
 
 def _timed(work: Callable[[], T], title: str) -> tuple[T, float]:
-    """Return the result of some work, whose title is shown, and the seconds that it took."""
+    """Return the result of a function and its time in seconds, with its title shown meanwhile."""
     start = time.perf_counter()
     (result,) = track((work() for _ in range(1)), title, total=1)
     return result, time.perf_counter() - start
 
 
 def _in_time(views: list[int], cost: float, seconds: float | None) -> list[int]:
-    """Return as many of some views, evenly spaced, as take some time if each takes `cost` seconds; all if None."""
+    """Return as many views, evenly spaced, as fit into a time limit at `cost` seconds each; all without a limit."""
     chosen = views if seconds is None else [views[rank] for rank in spread(len(views), max(int(seconds / cost), 1))]
     if len(chosen) < len(views):
         say(f"evaluating {len(chosen)} of {len(views)} images, {time_text(cost)} each (all: --eval all, or ns-eval)")
@@ -307,7 +307,7 @@ def _judge(
     lpips: Lpips | None,
     index: int,
 ) -> tuple[dict[str, Any], Judged]:
-    """Return what is reported of a view, and its images."""
+    """Return the report on a view, and its images."""
     target = composite(dataset.image(index).float() / 255, background)
     with fitted_appearance(model, dataset, index, background) if half else nullcontext():
         picture, spent = timed_view(model, dataset.view(index), background)
@@ -327,7 +327,7 @@ def _judge(
 def _judged(
     rgb: Tensor, target: Tensor, kept: Tensor | None, half: bool
 ) -> tuple[tuple[Tensor, Tensor], Tensor | None]:
-    """Return the rendered and the true image as metrics compare them, and which pixels count (None for all)."""
+    """Return the rendered and the true image as compared by metrics, and the pixels that count (None for all)."""
     if half:
         rgb, target = right_half(rgb), right_half(target)
         kept = None if kept is None else right_half(kept)
@@ -349,7 +349,7 @@ def spread(total: int, limit: int | None) -> list[int]:
 
 
 def _row(dataset: Dataset, index: int, measured: Measured, seconds: float) -> dict[str, Any]:
-    """Return what is reported of an image."""
+    """Return the report on an image."""
     row: dict[str, Any] = {
         "name": dataset.names[index],
         "psnr": measured.psnr,

@@ -1,7 +1,7 @@
-"""Frames of a long render, kept on disk until its files are written, so that a stopped render goes on.
+"""Frames of a long render, kept on disk until its files are written, so that a stopped render can continue.
 
-They lie in FILE.frames/KEY/ beside the file or folder that is rendered. The key is a hash of everything that the frames
-depend on, so that frames of one command are never taken for those of another. What it was made of is in render.json.
+They are in FILE.frames/KEY/ beside the rendered file or folder. The key is a hash of everything that the frames depend
+on, so frames of one command are never used for another. render.json holds what was hashed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.evaluation.outputs import Arrays
 
 FACTS = "render.json"
-"""Name of the file that says what was rendered."""
+"""Name of the file that describes the render."""
 SUFFIX = ".frames"
-"""Added to the name of what is rendered, the name of the folder of its frames."""
+"""Suffix of the folder of frames, appended to the name of the rendered file."""
 PIECE = 2**24
-"""Bytes of a file that are read and hashed at a time."""
+"""Number of bytes of a file hashed at a time."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +38,16 @@ class Frames:
     """Frames on disk."""
 
     folder: Path
-    """Folder of these frames alone."""
+    """Folder of these frames only."""
     count: int
-    """Number of frames of the whole render."""
+    """Number of frames in the whole render."""
 
     def path(self, index: int) -> Path:
         """Return the path of frame `index`."""
         return self.folder / f"{index:06d}.npz"
 
     def read(self, index: int) -> Arrays | None:
-        """Return what is kept of frame `index`; None if it is missing or damaged."""
+        """Return the arrays of frame `index`; None if it is missing or damaged."""
         try:
             with np.load(self.path(index), allow_pickle=False) as content:
                 return {name: content[name] for name in content.files}
@@ -55,17 +55,17 @@ class Frames:
             return None
 
     def __iter__(self) -> Iterator[Arrays]:
-        """Yield what is kept of every frame, in order."""
+        """Yield the arrays of every frame, in order."""
         for index in range(self.count):
             if (kept := self.read(index)) is None:
                 raise ConfigError(f"{self.path(index)} is missing or damaged; start the same command again")
             yield kept
 
     def render(self, render: Callable[[int], Arrays]) -> None:
-        """Render the frames that are not there yet.
+        """Render the missing frames.
 
         Args:
-            render: function from a frame's index to what is kept of it.
+            render: function from a frame's index to its arrays.
 
         Raises:
             ConfigError: if a frame cannot be written.
@@ -73,7 +73,7 @@ class Frames:
         missing = [index for index in range(self.count) if self.read(index) is None]
         done = self.count - len(missing)
         if done:
-            say(f"{done} of {self.count} frames are there already, in {self.folder}; going on with the others")
+            say(f"{done} of {self.count} frames already exist in {self.folder}; rendering the others")
         try:
             for index in track(missing, "Rendering", total=len(missing)):
                 content = io.BytesIO()
@@ -82,24 +82,24 @@ class Frames:
                 write_file(self.path(index), content.getvalue())
                 done += 1
         except BaseException as error:
-            if not done:  # nothing to go on with
+            if not done:  # nothing to continue
                 self.remove()
             elif isinstance(error, KeyboardInterrupt):
-                say(f"{done} of {self.count} frames are in {self.folder}; the same command goes on with them")
+                say(f"{done} of {self.count} frames are in {self.folder}; repeat the command to continue")
             raise
 
     def remove(self) -> None:
-        """Remove the frames, and the folder beside the file unless it holds frames of another render."""
+        """Remove the frames, and the folder beside the file unless it has frames of another render."""
         shutil.rmtree(self.folder, ignore_errors=True)
         with suppress(OSError):
             self.folder.parent.rmdir()
 
 
 def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
-    """Return the frames for a file or folder, those of an earlier, stopped start of the same command included.
+    """Return the frames for a file or folder, including those of an earlier, stopped run of the same command.
 
     Args:
-        output: file or folder that is rendered.
+        output: rendered file or folder.
         count: number of frames.
         facts: plain data; everything that the frames depend on.
 
@@ -109,17 +109,17 @@ def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
     together = output.with_name(output.name + SUFFIX)
     folder = together / key_of(facts)
     if others := [path for path in sorted(together.glob("*")) if path != folder]:
-        say(f"{others[0]} holds frames of another render (its run, cameras or flags differ); it is left as it is")
+        say(f"{others[0]} has frames of another render (its run, cameras or flags differ); they are kept")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror or error}; name another place") from error
+        raise ConfigError(f"cannot write {folder}: {error.strerror or error}; use another path") from error
     write_file(folder / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
     return Frames(folder, count)
 
 
 def key_of(facts: dict[str, Any]) -> str:
-    """Return 16 hexadecimal digits that stand for plain data, `facts`."""
+    """Return a key of 16 hexadecimal digits for plain data `facts`."""
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -144,7 +144,7 @@ def hash_of_tensors(*tensors: Tensor | None) -> str:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write `content` to the file `path`, as a whole or not at all.
+    """Write `content` to the file `path` atomically.
 
     Raises:
         ConfigError: if it cannot be written.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 ERROR_AT_WHITE = 0.25
-"""Mean absolute error, of colours in [0, 1], from which on an error map is white."""
+"""Mean absolute error, of colours in [0, 1], that an error map shows as white."""
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
@@ -26,7 +26,7 @@ def heat(values: Tensor) -> Tensor:
 
 
 def error_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return an image (H, W, 3) uint8 of the absolute error, a mean over channels, in the colours of `heat`.
+    """Return an image (H, W, 3) uint8 of the absolute error, averaged over channels, in the colours of `heat`.
 
     Args:
         prediction, target: (H, W, 3) uint8 rendered and true image.

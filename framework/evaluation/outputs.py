@@ -1,4 +1,4 @@
-"""Outputs of a rendered view: what is kept of each frame of a video, and the pictures that are made of it."""
+"""Outputs of a rendered view: arrays kept for each frame of a video, and pictures made of them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from nerfloom.rendering.outputs import ACCUMULATION, FIXED, RGB, Output
 from nerfloom.rendering.rendered import Picture
 
 ERROR, PHOTOGRAPH = Output("error", "color"), Output("gt-rgb", "color", "photograph")
-"""Outputs that need the true image: the difference from it, and the image."""
+"""Outputs that need the true image: the difference from it, and the image itself."""
 OPAQUE = 128
-"""Opacity of 255 from which a pixel has a depth."""
+"""Minimum opacity, of 255, for a pixel to have a depth."""
 
 Arrays = Mapping[str, np.ndarray]
-"""What is kept of a frame, by name: uint8 (H, W) or (H, W, 3), shown as it is, or numbers (H, W) float32."""
+"""Arrays of a frame by name: uint8 (H, W) or (H, W, 3), shown unchanged, or float32 numbers (H, W)."""
 
 
 def chosen_outputs(model: Renderable, names: Sequence[str]) -> list[Output]:
@@ -34,14 +34,14 @@ def chosen_outputs(model: Renderable, names: Sequence[str]) -> list[Output]:
         names: names of the outputs.
 
     Raises:
-        ConfigError: if the model has no such output.
+        ConfigError: if the model has no output of that name.
     """
     known = {output.name: output for output in (*FIXED, *model.outputs, ERROR, PHOTOGRAPH)}
     for name in names:
         if name not in known:
             hint = "; nerfacto has them with --predict-normals True" if name == "normals" else ""
             raise ConfigError(
-                f"--rendered-output-names {name}: this run has no such output, but {', '.join(known)}{hint}"
+                f"--rendered-output-names {name}: this run has no such output; it has {', '.join(known)}{hint}"
             )
     return [known[name] for name in names]
 
@@ -54,7 +54,7 @@ def rendered_outputs(
     unit: float,
     truth: Tensor | None = None,
 ) -> Arrays:
-    """Render a view, as far as its outputs need it, and return what is kept of it.
+    """Render the parts of a view needed for some outputs, and return the arrays for these outputs.
 
     Args:
         model: the model in evaluation mode.
@@ -63,7 +63,7 @@ def rendered_outputs(
         outputs, unit, truth: as in `kept_outputs`.
 
     Raises:
-        ConfigError: as `kept_outputs` does.
+        ConfigError: see `kept_outputs`.
     """
     if all(output in (RGB, ERROR, PHOTOGRAPH) for output in outputs):
         return {output.name: _colors(output, model.render_rgb(view, background), truth) for output in outputs}
@@ -71,12 +71,12 @@ def rendered_outputs(
 
 
 def kept_outputs(picture: Picture, outputs: Sequence[Output], unit: float, truth: Tensor | None = None) -> Arrays:
-    """Return what is kept of a rendered view for its outputs.
+    """Return the arrays of a rendered view for some outputs.
 
     Args:
         picture: the rendered view.
-        outputs: what is shown of it.
-        unit: units of the input per scene unit, by which distances are multiplied.
+        outputs: outputs to show.
+        unit: units of the input per scene unit; distances are multiplied by it.
         truth: (H, W, 3) true image in [0, 1]; None if it is unknown.
 
     Raises:
@@ -92,7 +92,7 @@ def kept_outputs(picture: Picture, outputs: Sequence[Output], unit: float, truth
             factor = unit if output.kind == "distance" else 1.0
             kept[output.name] = (values * factor).float().cpu().numpy()
         else:
-            opacity = picture.accumulation[..., None]  # directions of nothing are not shown
+            opacity = picture.accumulation[..., None]  # directions fade where nothing is visible
             kept[output.name] = to_uint8(values * opacity + (1 - opacity) if output.kind == "direction" else values)
     if any(values.dtype == np.float32 for values in kept.values()):
         kept[ACCUMULATION.name] = to_uint8(picture.accumulation)
@@ -100,22 +100,21 @@ def kept_outputs(picture: Picture, outputs: Sequence[Output], unit: float, truth
 
 
 def _colors(output: Output, rgb: Tensor, truth: Tensor | None) -> np.ndarray:
-    """Return the picture (H, W, 3) or (H, W) uint8 of an output for which colours (H, W, 3) are enough."""
+    """Return the picture (H, W, 3) or (H, W) uint8 of an output that depends on colours (H, W, 3) only."""
     if output == RGB:
         return to_uint8(rgb)
     if truth is None:
-        raise ConfigError(f"--rendered-output-names {output.name}: only 'ns-render dataset' knows the true images")
+        raise ConfigError(f"--rendered-output-names {output.name}: only 'ns-render dataset' has true images")
     return to_uint8(heat((rgb.clamp(0, 1) - truth).abs().mean(-1) / ERROR_AT_WHITE) if output == ERROR else truth)
 
 
 def distance_range(frames: Iterable[Arrays], name: str) -> tuple[float, float]:
     """Return the range of distances for the colours of all frames, so that a colour means the same in each.
 
-    It holds the range from the 2nd to the 98th percentile of the opaque pixels of every frame; 0 and 1 if there are
-    none.
+    It covers the 2nd to the 98th percentile of the opaque pixels of every frame; 0 and 1 if there are none.
 
     Args:
-        frames: what is kept of the frames.
+        frames: arrays of the frames.
         name: name of the output, a distance or another number.
     """
     ends = [
@@ -127,10 +126,10 @@ def distance_range(frames: Iterable[Arrays], name: str) -> tuple[float, float]:
 
 
 def largest_distance(frames: Iterable[Arrays], name: str) -> float:
-    """Return the largest finite distance of an opaque pixel in all frames; 0 if there is none.
+    """Return the largest finite distance of opaque pixels in all frames; 0 if there are none.
 
     Args:
-        frames: what is kept of the frames.
+        frames: arrays of the frames.
         name: name of the output, a distance or another number.
     """
     return max((float(opaque_distance(kept, name).max(initial=0)) for kept in frames), default=0.0)
@@ -140,7 +139,7 @@ def opaque_distance(kept: Arrays, name: str) -> np.ndarray:
     """Return distances (H, W) float32; 0 where less than half of the light comes from a surface.
 
     Args:
-        kept: what is kept of the frame.
+        kept: arrays of the frame.
         name: name of the output, a distance or another number.
     """
     seen = (kept["accumulation"] >= OPAQUE) & np.isfinite(kept[name])
@@ -148,17 +147,17 @@ def opaque_distance(kept: Arrays, name: str) -> np.ndarray:
 
 
 def is_number(values: np.ndarray) -> bool:
-    """Return whether `values` are numbers, which are shown in the colours of a range."""
+    """Return whether `values` are numbers, which need a range of colours."""
     return values.dtype == np.float32
 
 
 def shown_output(kept: Arrays, name: str, ranges: Mapping[str, tuple[float, float]]) -> np.ndarray:
     """Return the picture (H, W, 3) uint8 of an output.
 
-    Numbers are in the colours of viridis, and fade to white where nothing is seen.
+    Numbers use the colour map viridis, and fade to white where nothing is visible.
 
     Args:
-        kept: what is kept of the frame.
+        kept: arrays of the frame.
         name: name of the output.
         ranges: numbers at the two ends of the colour map, by the output's name.
     """
@@ -172,5 +171,5 @@ def shown_output(kept: Arrays, name: str, ranges: Mapping[str, tuple[float, floa
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Return one picture (H, W', 3) of several `pictures` (H, W, 3) from left to right."""
+    """Join `pictures` (H, W, 3) from left to right into one picture (H, W', 3)."""
     return np.concatenate(list(pictures), axis=1)

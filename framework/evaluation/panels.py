@@ -41,7 +41,7 @@ def view_panels(prediction: Tensor, target: Tensor, picture: Picture) -> list[Pa
 
     Args:
         prediction, target: (H, W, 3) rendered and true image in [0, 1].
-        picture: what was rendered.
+        picture: the rendered view.
     """
     ramp = torch.linspace(0, 1, 256)
     error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
@@ -60,9 +60,9 @@ def view_panels(prediction: Tensor, target: Tensor, picture: Picture) -> list[Pa
 
 
 def as_colors(picture: Picture, output: Output) -> tuple[Tensor, tuple[str, str] | None]:
-    """Return an output of a picture as colours (H, W, 3), and the texts at the ends of its range, if it is a number.
+    """Return an output of a picture as colours (H, W, 3), and the labels of its range, if it is a number.
 
-    Numbers are shown where opacity is above one half, from their 2nd to their 98th percentile there.
+    Numbers are shown where opacity is above one half, over their 2nd to 98th percentile there.
 
     Args:
         picture: the rendered view.
@@ -82,7 +82,7 @@ def depth_range(depth: Tensor, solid: Tensor) -> tuple[float, float]:
 
     Args:
         depth: (H, W) distances, scene units.
-        solid: (H, W) bool, pixels that count; all count if none is set.
+        solid: (H, W) bool, pixels that count; if none is set, all count.
     """
     values = depth[solid] if bool(solid.any()) else depth.flatten()
     values = values[torch.isfinite(values)].double().sort().values
@@ -105,7 +105,7 @@ VIRIDIS = torch.tensor(
 
 
 def viridis(values: Tensor) -> Tensor:
-    """Map `values` (...) in [0, 1] to colours (..., 3), lighter for larger values; NaN is taken as 0."""
+    """Map `values` (...) in [0, 1] to colours (..., 3), lighter for larger values; NaN counts as 0."""
     colors = VIRIDIS.to(values)
     scaled = values.nan_to_num(0.0).clamp(0, 1) * (len(colors) - 1)
     low = scaled.floor().long().clamp(max=len(colors) - 2)
@@ -116,7 +116,7 @@ def composed(panels: Sequence[Panel]) -> Tensor:
     """Compose panels in a row, with labels above and colour bars below, as an image (H', W', 3) in [0, 1].
 
     Args:
-        panels: panels of equal size. Small ones are enlarged by a whole number, without interpolation.
+        panels: panels of equal size. Small panels are enlarged by a whole number, without interpolation.
     """
     height, width = panels[0].image.shape[:2]
     factor = max(-(-SMALLEST_WIDTH // width), 1)

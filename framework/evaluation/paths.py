@@ -21,25 +21,25 @@ JUMP = 5.0
 AROUND, ABOVE, OPENING = 1.0, math.radians(20), math.radians(50)
 """Of cameras around a scene: distance from its middle in edges of its box, elevation and field of view, radians."""
 FEWEST = 3
-"""Minimum number of cameras between two jumps; fewer are left out of an interpolated path."""
+"""Minimum number of cameras between two jumps; shorter stretches are left out of an interpolated path."""
 GAP = 60.0
-"""Angle without a camera, degrees, from which cameras are said not to go all around something."""
+"""Cameras stand all around a centre if no gap between them exceeds this angle, degrees."""
 NEARLY_ABOVE = 0.2
-"""Horizontal distance from a centre, relative to the mean, up to which a camera stands above or below it."""
+"""Cameras closer to the vertical axis than this, relative to the mean horizontal distance, count as above or below."""
 STOPS = 24
-"""Ratio of the number of cameras to the standard deviation, in cameras, of the weights of an interpolated path."""
+"""Number of cameras divided by the standard deviation, in cameras, of the weights of an interpolated path."""
 SAME_WAY = 0.7
-"""Length of the mean of unit viewing directions from which cameras are said to look the same way."""
+"""Cameras look the same way if the mean of their unit viewing directions is at least this long."""
 SMALL_RADIUS = 0.1
-"""Ratio of the radius of a spiral to the distance of what it looks at, for cameras that look different ways."""
+"""Ratio of a spiral's radius to its focus distance, for cameras that look different ways."""
 FOCUS_PIXELS = 64
-"""Number of pixels along the longer side of the image from which that distance is taken."""
+"""Number of pixels along the longer side of the image used to measure that distance."""
 
 
 def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
     """Return the camera-to-world pose (3, 4) of a camera at `position` (3,) that looks at `target` (3,).
 
-    The `up` direction (3,) is upwards in the image; if the camera looks along it, +y is used instead.
+    `up` (3,) is the upward direction in the image; if the camera looks along it, +y is used instead.
     """
     back = safe_normalize(position - target)
     right = torch.linalg.cross(up, back)
@@ -56,13 +56,14 @@ class Arc:
     middle: float
     """Angle of its middle from +x towards +y, radians."""
     width: float
-    """Its own angle, radians."""
+    """Angular width, radians."""
 
 
 def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
-    """Return the arc around a centre on which cameras stand; None if they stand all around it.
+    """Return the arc around a centre where cameras stand; None if they stand all around it.
 
-    They do if no two neighbours are more than `GAP` apart. Cameras almost above or below the centre do not count.
+    They stand all around if no gap between neighbours exceeds `GAP`. Cameras almost above or below the centre are
+    ignored.
 
     Args:
         cameras: M cameras.
@@ -83,15 +84,16 @@ def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
 
 
 def orbit(cameras: Cameras, center: Tensor, num_frames: int, arc: Arc | None = None) -> Cameras:
-    """Return cameras on a horizontal circle, looking at its centre, that end where they begin.
+    """Return cameras on a horizontal circle, looking at its centre; the path is closed.
 
-    Height and radius are the means of the given cameras', and intrinsics those of the first.
+    Height and radius are the means over the given cameras, and intrinsics are those of the first camera.
 
     Args:
         cameras: M cameras.
         center: (3,) centre, scene units.
         num_frames: number of cameras on the circle.
-        arc: part of the circle on which the cameras swing once there and back, slowly at its ends; None for all of it.
+        arc: part of the circle on which the cameras swing once back and forth, slowly at its ends; None for the whole
+            circle.
     """
     offsets = cameras.camera_to_worlds[:, :, 3] - center
     height, radius = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
@@ -123,11 +125,11 @@ def around(scene: Scene, count: int = 8) -> Cameras:
 
 
 def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
-    """Return cameras along a smooth path past given cameras, in their order, without the shaking of a hand.
+    """Return cameras along a smooth path past given cameras, in their order, without hand shake.
 
-    A pose is the mean of poses nearby in that order, weighted by a Gaussian; its rotation is the one closest to the
-    mean of the matrices. No mean is taken across a jump of the walk, as it could lie inside of what both sides look at:
-    the path jumps there too. Intrinsics are those of the first camera.
+    A pose is the mean of nearby poses in that order, weighted by a Gaussian; its rotation is the one closest to the
+    mean matrix. No mean is taken across a jump of the walk, because the mean could lie inside the subject: the path
+    jumps there too. Intrinsics are those of the first camera.
 
     Args:
         cameras: M cameras.
@@ -146,7 +148,7 @@ def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
 
 
 def stretches(cameras: Cameras) -> list[Tensor]:
-    """Return the indices of the cameras of each stretch of a walk between its jumps; too short ones are left out.
+    """Return the indices of the cameras in each stretch of a walk between jumps; short stretches are left out.
 
     Args:
         cameras: M cameras, in the order of the walk.
@@ -162,16 +164,16 @@ def stretches(cameras: Cameras) -> list[Tensor]:
 def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:
     """Return cameras on a spiral around the mean camera, looking at a point in front of it.
 
-    The path is LLFF's (Mildenhall et al. 2019): two turns in the mean camera's image plane, during which it moves once
-    back and forth, and ends where it starts. If the cameras do not look the same way, the first of them takes the place
-    of the mean camera. Intrinsics are those of the first camera.
+    The path is LLFF's (Mildenhall et al. 2019): two turns in the mean camera's image plane, while it moves once back
+    and forth, and ends where it starts. If the cameras do not look the same way, the first camera replaces the mean
+    camera. Intrinsics are those of the first camera.
 
     Args:
         cameras: M cameras.
         num_frames: number of cameras on the spiral.
-        focus: distance of the point from the mean camera, scene units.
-        radius: radius along each of its axes, scene units; if None, the 90th percentile of the cameras' distances from
-            the mean camera along each axis, or `SMALL_RADIUS` times `focus` if they do not look the same way.
+        focus: distance of the target point from the mean camera, scene units.
+        radius: radius along each of its axes, scene units. If None, it is the 90th percentile of the cameras' distances
+            from the mean camera along each axis, or `SMALL_RADIUS` times `focus` if they do not look the same way.
     """
     center = middle_pose(cameras)
     rotation, position = center[:, :3], center[:, 3]
@@ -212,14 +214,14 @@ def focus_distance(model: Renderable, camera: Cameras, background: Tensor) -> fl
     Args:
         model: the trained model.
         camera: one camera, on the model's device.
-        background: (3,) colour behind everything.
+        background: (3,) colour behind the scene.
     """
     stride = max(int(max(camera.widths[0], camera.heights[0])) // FOCUS_PIXELS, 1)
     picture = model.render_view(View.of(camera, 0, _first_time(model), stride), background)
     depths = picture.median_depth[picture.accumulation > 0.5]
     depth = float(depths.median()) if len(depths) else model.scene.near + 1.0
     if isinstance(camera, NdcCameras) and camera.ndc is not None:
-        # A point of depth d lies at z = 1 - 2 near / d of the box, on a ray that starts at z = -1.
+        # A point at depth d lies at z = 1 - 2 near / d in the box, on a ray that starts at z = -1.
         return 2 * camera.ndc.near / max(2 - depth, 1e-2)
     return depth
 

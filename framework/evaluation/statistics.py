@@ -8,25 +8,25 @@ from statistics import fmean, stdev
 from typing import Any
 
 Rows = Sequence[dict[str, Any]]
-"""What is reported of each image (`Evaluation.per_image`)."""
+"""Reports on images (`Evaluation.per_image`)."""
 
 
 def statistics(rows: Rows) -> dict[str, Any]:
-    """Return the statistics of all images and, as `by_size`, of the images of each size if there are several.
+    """Return the statistics of all images and, as `by_size`, those of each image size if there are several.
 
     Args:
-        rows: what is reported of each image.
+        rows: report on each image.
 
     Returns:
         For each metric its mean, standard deviation (`_std`) and, unless every image has it, number of images
-        (`_images`), with None for what is absent; and the numbers of pixels that count and that masks ignore.
+        (`_images`); None for absent values. Also the numbers of counted and of masked pixels.
     """
     pixels = {f"num_{name}": sum(row[name] for row in rows) for name in ("pixels", "ignored_pixels")}
     return {**_of_metrics(rows), **pixels, **_by_size(rows)}
 
 
 def _by_size(rows: Rows) -> dict[str, Any]:
-    """Return the statistics of the images of each size, "1", "1/2", ..., as `by_size`; nothing if all have one size."""
+    """Return the statistics of images of each size, "1", "1/2", ..., as `by_size`; empty if all have one size."""
     sizes = sorted({row["reduction"] for row in rows if "reduction" in row})
     names = {size: "1" if size == 1 else f"1/{size}" for size in sizes}
     found = {names[size]: _of_metrics([row for row in rows if row["reduction"] == size]) for size in sizes}
@@ -46,7 +46,7 @@ def _of_metrics(rows: Rows) -> dict[str, float | None]:
 
 
 def _deviation(values: list[float]) -> float:
-    """Return the standard deviation, NaN if a value is not finite, of which `stdev` fails with another error."""
+    """Return the standard deviation; NaN if a value is not finite, for which `stdev` would raise an error."""
     if not all(map(math.isfinite, values)):
         return math.nan
     return stdev(values) if len(values) > 1 else 0.0

@@ -1,4 +1,4 @@
-"""Suffixes of videos and animations, without numpy, so that a wrong one is refused at once."""
+"""Suffixes of videos and animations, without numpy, so that a wrong suffix is refused at once."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.extras import install_command
 
 VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
-"""Suffixes of files of several pictures."""
+"""Suffixes of files with several pictures."""
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse, before anything is rendered, a file that cannot be written.
+    """Refuse, before rendering, an output file that cannot be written.
 
     Args:
         path: file; a path without suffix is a folder.

@@ -16,7 +16,7 @@ from nerfloom.evaluation.frames import write_file
 from nerfloom.evaluation.video_suffixes import VIDEO
 
 QUALITY = 18
-"""Constant rate factor of H.264; 18 is said to be visually lossless."""
+"""Constant rate factor of H.264; 18 is considered visually lossless."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
 MOST = 65_535
@@ -49,16 +49,14 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 @contextmanager
 def _written(path: Path) -> Iterator[None]:
-    """Turn what the system or an encoder raises into an error of one line."""
+    """Convert errors of the system or an encoder to one-line errors."""
     try:
         yield
     except (OSError, RuntimeError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or "the encoder failed"
         if isinstance(error, BrokenPipeError):
             reason = "ffmpeg ended early; is the disk full?"
-        raise ConfigError(
-            f"cannot write {path}: {reason}; the frames are kept, start the same command again"
-        ) from error
+        raise ConfigError(f"cannot write {path}: {reason}; the frames are kept; repeat the command") from error
 
 
 def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
@@ -82,7 +80,7 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
-    """Return a picture with its last row and column repeated to an even size, which H.264 needs."""
+    """Repeat a picture's last row or column where its size is odd; H.264 needs even sizes."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -90,7 +88,7 @@ def _even(picture: np.ndarray) -> np.ndarray:
 def _write_animation(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     images = (Image.fromarray(picture) for picture in pictures)
     first = next(images)
-    # Pillow goes through the images of a PNG twice, so there they have to be in memory.
+    # Pillow iterates over the images of a PNG twice, so they must be in memory.
     others = list(images) if path.suffix.lower() == ".png" else images
     first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
 
@@ -109,10 +107,10 @@ def write_strip(path: Path, pictures: Iterable[np.ndarray]) -> None:
 
 
 def write_images(paths: Iterable[Path], pictures: Iterable[np.ndarray]) -> None:
-    """Write each picture to a file of its own; folders are created if missing.
+    """Write each picture to its own file; missing folders are created.
 
     Args:
-        paths: files to write; their suffix is the format: .png or .jpg.
+        paths: files to write, with the suffix .png or .jpg.
         pictures: (H, W, 3) uint8 pictures.
 
     Raises:
@@ -124,13 +122,12 @@ def write_images(paths: Iterable[Path], pictures: Iterable[np.ndarray]) -> None:
 
 
 def write_distances(paths: Iterable[Path], distances: Iterable[np.ndarray], unit: float) -> None:
-    """Write each map of distances to a file of its own; folders are created if missing.
+    """Write each distance map to its own file; missing folders are created.
 
     Args:
-        paths: files to write: .npy (float32), or .png (16 bits, distances in `unit`, the largest value for those
-            beyond).
+        paths: files to write: .npy (float32), or .png (16 bits, distances in `unit`, clipped at the largest value).
         distances: (H, W) float32 distances, 0 where unknown.
-        unit: distance that the value 1 of a PNG stands for.
+        unit: distance for the value 1 of a PNG.
 
     Raises:
         ConfigError: if a file cannot be written.

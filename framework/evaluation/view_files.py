@@ -1,4 +1,4 @@
-"""Image files of some evaluated views, and of the one with the lowest PSNR."""
+"""Image files of selected evaluated views, and of the view with the lowest PSNR."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from nerfloom.rendering.rendered import Picture
 WORST = "worst"
 """Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""
 LONGEST_STEM = 150
-"""Maximum number of bytes of an image's name in the names of the files written for it."""
+"""Maximum number of bytes of an image's name within names of written files."""
 
 
 class Judged(NamedTuple):
     """Images of an evaluated view."""
 
     rgb: Tensor
-    """(H, W, 3) rendered colours, as they are measured."""
+    """(H, W, 3) rendered colours as used for metrics."""
     target: Tensor
     """(H, W, 3) colours of the true image."""
     picture: Picture
-    """What was rendered."""
+    """The rendered picture."""
 
 
 class ViewFiles:
-    """Writer of the files of some evaluated views.
+    """Writer of the files of selected evaluated views.
 
     Args:
         folder: folder of the files; None to write none.
         names: names of all images.
-        views: indices of the views with files of their own.
-        with_worst: whether the files of the view with the lowest PSNR are written besides.
+        views: indices of the views whose files are written.
+        with_worst: whether to write the files of the view with the lowest PSNR as well.
     """
 
     def __init__(self, folder: Path | None, names: Sequence[str], views: Collection[int], with_worst: bool) -> None:
@@ -46,7 +46,7 @@ class ViewFiles:
         self._lowest = math.inf
         self._worst: Judged | None = None
         self.note: str | None = None
-        """Reason why files could not be written; None if there is none."""
+        """Reason why files could not be written; None if there was no problem."""
 
     def take(self, index: int, psnr: float, judged: Judged) -> None:
         """Write the files of a view, or remember it if it is the worst so far.
@@ -67,7 +67,7 @@ class ViewFiles:
             self._write(WORST, self._worst)
 
     def _write(self, stem: str, judged: Judged) -> None:
-        """Write the files of a view (render, photograph, comparison, further outputs), unless writing failed before."""
+        """Write the files of a view (render, photograph, comparison, further outputs), unless writing has failed."""
         if self._folder is None or self.note is not None:
             return
         rgb, target, picture = judged
@@ -76,10 +76,10 @@ class ViewFiles:
         try:
             for suffix, image in files.items():
                 write_image(self._folder / f"{stem}{suffix}.png", image)
-        except OSError as error:  # metrics do not need the files
+        except OSError as error:  # metrics are computed without the files
             self.note = f"cannot write pictures to {self._folder}: {error.strerror or error}"
 
 
 def _short_stem(name: str) -> str:
-    """Return an image's name without its extension, cut to LONGEST_STEM bytes."""
+    """Return an image's name without its extension, cut to `LONGEST_STEM` bytes."""
     return os.fsencode(Path(name).stem)[:LONGEST_STEM].decode("utf-8", "ignore")

@@ -1,4 +1,4 @@
-"""Points on the surfaces of a scene, found by a short run of a field: where Gaussians may start."""
+"""Points on the surfaces of a scene, found by short training of a field; Gaussians can start there."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerfloom.method import Method
 from nerfloom.training.trainer import Trainer
 
 PASSES = 16
-"""Maximum number of times that rays are drawn, of which some end on no surface."""
+"""Maximum number of times that rays are drawn, since some end on no surface."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class FoundSurfaces:
     colors: Tensor
     """(N, 3) colours in [0, 1]."""
     images: Tensor
-    """(N,) int64 which image shows the point."""
+    """(N,) int64 index of the image that shows the point."""
     pixels: Tensor
-    """(N,) int64 number of the pixel in that image, row by row."""
+    """(N,) int64 index of the pixel in that image, row by row."""
     distances: Tensor
     """(N,) distance from that image's camera, scene units."""
 
@@ -45,13 +45,13 @@ def found_surfaces(
         method: the method of the field, which casts rays: instant-ngp, or nerfacto where there may be something outside
             the scene's box, which instant-ngp does not see.
         dataset: the images.
-        config: settings of the run that asks; machine and background are taken from it.
+        config: settings of the calling run; machine and background are used.
         steps: maximum number of training steps of the field.
-        seconds: maximum time of its training, seconds; infinity for no maximum.
+        seconds: maximum training time of the field, seconds; infinity for no limit.
         count: maximum number of points.
 
     Returns:
-        The points; there are fewer than `count` where rays end on no surface, and possibly none.
+        The points; fewer than `count`, possibly none, if rays end on no surface.
     """
     # instant-ngp's settings and rates are those of its few seconds; nerfacto's are not (docs/notes/splatting.md).
     limit = None if dataset.scene.unbounded or seconds == math.inf else seconds

@@ -1,4 +1,4 @@
-"""Appearance vectors, for images of a scene that differ in light, exposure or camera: NeRF-W."""
+"""Appearance vectors (NeRF-W), for images of a scene that differ in light, exposure or camera."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch.nn import functional
 from nerfloom.base.optimised import Optimised
 
 AFFINE = 12
-"""Length of a vector that is an affine transform of colours."""
+"""Length of an appearance vector that holds an affine transform of colours."""
 
 
 class Appearance(nn.Module):
     """A learnt vector for each image, an input of the colour network: NeRF-W (Martin-Brualla et al. 2021), section 4.1.
 
-    In evaluation the mean vector is shown, which is no image's. A network that has never seen it may answer anything,
-    and does so the more, the further apart the vectors have moved. So in a share of the steps an image is shown with
-    the mean vector: then the network, or what else is shown so, learns what all images have in common there.
+    Evaluation uses the mean vector, which belongs to no image. A network that has never seen the mean vector may render
+    anything for it, and the error grows with the distance between the vectors. So in a fraction of the training steps
+    an image gets the mean vector: the network then learns what all images have in common.
 
     Args:
         size: number D of features of a vector.
@@ -49,15 +49,15 @@ class Appearance(nn.Module):
         """Return the vector of the image of each sample.
 
         Args:
-            camera_indices: (N,) image of each sample; None for evaluation, where all samples get the vector that
-                `shown` has set, or else the mean vector, without a gradient.
+            camera_indices: (N,) image of each sample; None for evaluation. In evaluation all samples get the vector set
+                by `shown`, or the mean vector, without a gradient.
             count: number N of samples.
 
         Returns:
             (N, D) vectors.
         """
         if camera_indices is not None:
-            # Not `vectors[camera_indices]`, whose gradient depends on the order in which threads add it up.
+            # Not `vectors[camera_indices]`: its gradient depends on the order in which threads add it up.
             return functional.embedding(camera_indices, self._own_or_mean())
         return (self.vectors.detach().mean(0) if self._shown is None else self._shown).expand(count, -1)
 
@@ -90,9 +90,9 @@ def affine_colors(rgb: Tensor, vector: Tensor) -> Tensor:
 
 
 def exposed(rgb: Tensor, opacity: Tensor, background: Tensor, vectors: Tensor) -> Tensor:
-    """Return the colours of rays as their images show them: `affine_colors` of the scene, but not of the background.
+    """Return the colours of rays as their images show them: `affine_colors` of the scene without the background.
 
-    The transform is applied to what was composited, which equals transforming the colour of each sample.
+    The transform is applied to the composited colour, which equals transforming the colour of each sample.
 
     Args:
         rgb: (R, 3) composited colours over the background.

@@ -18,16 +18,16 @@ from nerfloom.kernels.traced.colors import GridColor
 from nerfloom.kernels.traced.trace import GridDensity
 
 DensityFunction = Callable[[Points], tuple[Tensor, Tensor]]
-"""Function from N points to density (N,), 1/length, and features (N, F); samplers are called with it."""
+"""Function from N points to density (N,), 1/length, and features (N, F). Samplers take it as an argument."""
 
 
 class Field(nn.Module, ABC):
     """Base class of fields. Density and colour are two methods, so that a sampler can compute the density only."""
 
     footprint: ClassVar[Footprint] = "none"
-    """Kind of the points' size that `density` needs."""
+    """Size of points that `density` needs."""
     optimised: Optimised | None = None
-    """Optimiser settings of its parameters; those of the model if None."""
+    """Optimiser settings of its parameters; if None, the model's."""
     runs_on_kernels: bool = False
     """True if compiled kernels do most of its work; torch's own operations then use one CPU thread."""
 
@@ -81,10 +81,10 @@ class HasGridDensity(Protocol):
 
 @runtime_checkable
 class HasGridColor(HasGridDensity, Protocol):
-    """A field of such a density whose colour may be a small network too, so that it is shown and learnt in one call."""
+    """A field whose density and colour may be small networks on a hash grid, traced and learnt in one compiled call."""
 
     def grid_color(self) -> GridColor | None:
-        """Return the colour as `nerfloom.kernels.traced.colors` computes it; None for `Field.color`."""
+        """Return the colour for `nerfloom.kernels.traced.colors`; None to evaluate `Field.color` instead."""
 
 
 @runtime_checkable
@@ -98,7 +98,7 @@ class HasSignedDistance(Protocol):
 class MLP(nn.Sequential):
     """A fully connected network: linear layers with ReLU between them.
 
-    With up to 8 layers of up to 384 features it runs as one compiled kernel on the CPU.
+    With up to 8 layers of up to 384 features, it is one compiled kernel on the CPU.
 
     Args:
         widths: number of features of the input, of each hidden layer, and of the output.
@@ -111,7 +111,7 @@ class MLP(nn.Sequential):
 
     def __init__(self, *widths: int, bias: bool = True, activation: Activation = "none") -> None:
         if min(widths) < 1:
-            raise ConfigError(f"a network's layers have 1 feature or more, not {shown(min(widths))}")
+            raise ConfigError(f"each layer of a network needs 1 feature or more, not {shown(min(widths))}")
         require(4.0 * sum(inputs * outputs for inputs, outputs in pairwise(widths)), "a network")
         layers: list[nn.Module] = []
         for index, (inputs, outputs) in enumerate(pairwise(widths)):

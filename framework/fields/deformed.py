@@ -1,4 +1,4 @@
-"""A field of a moving scene: D-NeRF (Pumarola et al. 2021), section 3."""
+"""A field of a moving scene (D-NeRF, Pumarola et al. 2021, section 3)."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class DeformedField(Field):
     """A canonical field with a learnt displacement of every position and time.
 
     Args:
-        canonical: the field to which positions are displaced.
+        canonical: the field that is evaluated at displaced positions.
         width: features of a hidden layer of the displacement network (256 in the paper).
         depth: hidden layers of the displacement network (8 in the paper).
         position_frequencies: number L of frequencies of the encoded positions (10 in the paper).
         time_frequencies: number L of frequencies of the encoded times (4 in the paper).
-        contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
-            are made for; None to encode scene coordinates.
+        contracted: (2, 3) box; all of space is contracted around it into [-1, 1]^3, the range that suits the
+            frequencies. None to encode scene coordinates.
         fixed_start: whether the displacement is zero at time 0, so that the canonical field is the scene at that time
-            (equation 2). The network is smooth in time and cannot follow: it bends all other times towards what suits
-            them best, and the first image alone sees the canonical field as it is.
-        ambient: number K of further outputs of the network, which the canonical field reads, too (HyperNeRF, Park et
-            al. 2021, section 4): for what no displacement explains, such as a shadow that moves over a floor. 0 in the
+            (equation 2). The network is smooth in time and cannot follow this jump: it bends all other times towards
+            the best fit, and only the first image sees the undisplaced canonical field.
+        ambient: number K of further outputs of the network, inputs of the canonical field (HyperNeRF, Park et al. 2021,
+            section 4). They explain changes that no displacement can, such as a shadow moving over a floor. 0 in the
             paper.
     """
 
@@ -61,7 +61,7 @@ class DeformedField(Field):
         nn.init.zeros_(last.bias)
 
     def displacement(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """Return the displacement (N, 3) from positions at their times to those of the canonical field, scene units.
+        """Return the displacement (N, 3) from positions at given times to the canonical field, scene units.
 
         Args:
             positions: (N, 3) scene coordinates.
@@ -73,7 +73,7 @@ class DeformedField(Field):
         return self._deformation(positions, times)[0]
 
     def _deformation(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Return the displacement (N, 3), and the ambient coordinates (N, K), None without, of `positions`."""
+        """Return displacement (N, 3) and ambient coordinates (N, K) of `positions`; the latter may be None."""
         if self.contracted is not None:
             positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded = (

@@ -67,7 +67,7 @@ class BoxField(Field):
         return self.encoding(unit)
 
     def _grid_density(self, network: MLP) -> GridDensity | None:
-        """Return the density of `network` on the encoding; None if it is of another kind than the kernels know."""
+        """Return the density of `network` on the encoding; None if the kernels do not support it."""
         grid = self.encoding
         if type(grid) is not HashGrid or type(network) is not MLP:
             return None
@@ -78,7 +78,7 @@ class BoxField(Field):
         if grid.deferred is not None:
             grid.deferred.layout = grid.layout
         weights = _weights(network)
-        if weights[0].shape[1] != grid.num_features:  # it reads further coordinates
+        if weights[0].shape[1] != grid.num_features:  # the network has further inputs
             return None
         around = self.box if self.unbounded else None
         return GridDensity(self.scale, self.shift, grid.table, grid.layout, grid.deferred, weights, around)
@@ -105,7 +105,7 @@ class DensityField(BoxField):
         return self.head.density(features)[0], features
 
     def grid_density(self) -> GridDensity | None:
-        """Return the density as `proposal_weights` computes it; None of a subclass, whose density may be another."""
+        """Return the density for `proposal_weights`; None for subclasses, which may override the density."""
         return self._grid_density(self.head) if type(self) is DensityField else None
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
@@ -122,12 +122,12 @@ class EncodedField(BoxField):
         num_features: features that the density network passes to the colour network, the first being the log-density
             (16 in the paper).
         direction_levels: bands of the spherical harmonics of the viewing direction (4 in the paper); 0 for colours that
-            do not depend on it.
+            do not depend on the direction.
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
-        appearance: the images' appearance vectors, which the colour network reads; None for none.
-        opening: bands of the viewing direction open one after the other (`Opening`) during this share of the training
-            budget; 0: all are open.
-        ambient: number of coordinates beyond those of space (`Points.ambient`) that the density network reads.
+        appearance: the images' appearance vectors, an input of the colour network; None without.
+        opening: bands of the viewing direction open one after the other (`Opening`) during this fraction of the
+            training budget; 0: all are open.
+        ambient: number of further coordinates (`Points.ambient`) that the density network takes.
     """
 
     def __init__(
@@ -158,11 +158,11 @@ class EncodedField(BoxField):
         return self.density_head.density(encoded, points.ambient.to(encoded.dtype))
 
     def grid_density(self) -> GridDensity | None:
-        """Return the density as `trace` computes it; None of a subclass, whose density may be another."""
+        """Return the density for `trace`; None for subclasses, which may override the density."""
         return self._grid_density(self.density_head) if type(self) is EncodedField else None
 
     def grid_color(self) -> GridColor | None:
-        """Return the colour as `traced_colors` computes it; None of a subclass, whose colour may be another."""
+        """Return the colour for `traced_colors`; None for subclasses, which may override the colour."""
         head, opening = self.color_head, self.direction_opening
         if type(self) is not EncodedField or self.appearance is not None or type(head) is not MLP:
             return None

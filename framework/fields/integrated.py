@@ -14,11 +14,11 @@ from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.networks.mlp import MAX_WIDTH
 
 DENSITY_BIAS = -1.0
-"""Added to the density before softplus, which starts the scene half transparent (Mip-NeRF, supplement)."""
+"""Added to the density before softplus, so that the scene is half transparent at first (Mip-NeRF, supplement)."""
 WIDENING = 1e-3
-"""How far colours reach beyond 0 and 1, so that black and white need no infinite input (Mip-NeRF, supplement)."""
+"""Margin by which colours extend beyond 0 and 1, so that black and white are finite inputs (Mip-NeRF, supplement)."""
 BOTTLENECK, COLOR_WIDTH = 256, 128
-"""Maximum number of features that the colour sees beside the direction, and of its hidden layer."""
+"""Maximum number of features that the colour network takes beside the direction, and of its hidden layer."""
 
 
 class IntegratedDensity(Field):
@@ -48,13 +48,13 @@ class IntegratedDensity(Field):
 
 
 class IntegratedField(Field):
-    """A field of NeRF's shape on the integrated encoding: one network, asked about Gaussians of any size.
+    """A field like NeRF's on the integrated encoding: one network for Gaussians of any size.
 
     Args:
         encoding: encoding of points with their size.
         width: features of a hidden layer (256 in Mip-NeRF, 1024 in mip-NeRF 360).
         depth: hidden layers before density and features.
-        skip: number of hidden layers after which the encoding is an input again.
+        skip: number of hidden layers after which the encoding is concatenated again.
         direction_frequencies: number of frequencies of the encoded directions.
     """
 
@@ -78,7 +78,7 @@ class IntegratedField(Field):
         self.color_head = MLP(
             bottleneck + 3 + 6 * direction_frequencies, max(min(width // 2, COLOR_WIDTH), 1), 3, activation="sigmoid"
         )
-        # On larger networks torch's own products, on all threads, do the work.
+        # For larger networks torch's matrix products, on all threads, are faster.
         self.runs_on_kernels = width + encoded <= MAX_WIDTH
         _initialise(self)
 

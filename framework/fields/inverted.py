@@ -1,4 +1,4 @@
-"""A field of an encoding on the inverted sphere: what is outside of a sphere (NeRF++, Zhang et al. 2020)."""
+"""A field on the inverted sphere: the scene outside a sphere (NeRF++, Zhang et al. 2020)."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from nerfloom.fields.encoded import EncodedField
 class InvertedField(EncodedField):
     """A field whose positions are points (N, 4) of the inverted sphere: a direction of length 1, and 1/r.
 
-    A grid needs no fourth axis: the points are a shell of three dimensions. It is laid out as contraction does
-    (mip-NeRF 360, Barron et al. 2022, equation 10), at (2 - 1/r) times the direction, between the spheres of radius 1
-    and 2, so that what is far away has room.
+    The grid needs no fourth axis, because the points form a three-dimensional shell. They are mapped as by contraction
+    (mip-NeRF 360, Barron et al. 2022, equation 10), to (2 - 1/r) times the direction, between the spheres of radius 1
+    and 2, which leaves resolution for distant parts.
 
     Args:
         encoding: encoding of positions in [0, 1]^3.

@@ -1,4 +1,4 @@
-"""Fields that are looked up at several points of each conical frustum: Zip-NeRF (Barron et al. 2023), section 3."""
+"""Fields evaluated at several points of each conical frustum: Zip-NeRF (Barron et al. 2023), section 3."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class MultisampledField(EncodedField):
 
 
 def encode_frustums(field: BoxField, points: Points) -> Tensor:
-    """Return the features (N, E) of the frustums of points; points without one are taken to have no size.
+    """Return the features (N, E) of the frustums of points; points without a frustum count as having no size.
 
     The pattern of a frustum's points is turned by a hash of its ends in training mode, and fixed otherwise.
 

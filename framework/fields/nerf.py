@@ -1,4 +1,4 @@
-"""The field of NeRF (Mildenhall et al. 2020), appendix A, figure 7."""
+"""The NeRF field (Mildenhall et al. 2020), appendix A, figure 7."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from nerfloom.kernels.encodings.frequency import frequency_encoding
 
 
 class NeRFField(Field):
-    """A field of one large network, of positions and viewing directions in a frequency encoding.
+    """A field of one large network on frequency encodings of positions and viewing directions.
 
-    The defaults are those of the paper: 8 hidden layers of 256 features with a skip connection, and one of 128 for the
+    The defaults are the paper's: 8 hidden layers of 256 features with a skip connection, and one layer of 128 for the
     colour.
 
     Args:
         width: features of a hidden layer; the colour layer has half as many.
         depth: hidden layers before density and features.
-        skip: number of hidden layers after which the encoded position is an input again.
+        skip: number of hidden layers after which the encoded position is concatenated again.
         position_frequencies: number L of frequencies of the encoded positions (10 in the paper).
         direction_frequencies: number L of frequencies of the encoded directions (4 in the paper).
-        time_frequencies: number L of frequencies of the encoded times, which are a further input: T-NeRF (Pumarola et
-            al. 2021, section 4); None for a field that does not change with time.
-        contracted: (2, 3) box around which all of space is contracted into [-1, 1]^3, the range that the frequencies
-            are made for; None to encode scene coordinates.
-        opening: frequencies of positions and directions open one after the other (`Opening`) during this share of the
-            training budget; 0: all are open.
-        dims: numbers of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al. 2020).
+        time_frequencies: number L of frequencies of the encoded times, a further input: T-NeRF (Pumarola et al. 2021,
+            section 4); None for a static field.
+        contracted: (2, 3) box; all of space is contracted around it into [-1, 1]^3, the range that suits the
+            frequencies. None to encode scene coordinates.
+        opening: frequencies of positions and directions open one after the other (`Opening`) during this fraction of
+            the training budget; 0: all are open.
+        dims: number of coordinates of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al.
+            2020).
     """
 
     contracted: Tensor | None
@@ -65,7 +66,7 @@ class NeRFField(Field):
     def _initialise(self) -> None:
         """Set Glorot weights and zero biases, as in the authors' code.
 
-        The bias of the density is positive instead: a ReLU whose input is negative everywhere has no gradient, and the
+        The bias of the density is positive instead: a ReLU with negative input everywhere has no gradient, and the
         image would stay empty.
         """
         for layer in self.modules():
@@ -91,10 +92,10 @@ class NeRFField(Field):
 
 
 def opened_frequencies(x: Tensor, num_frequencies: int, opening: Opening | None) -> Tensor:
-    """Return the frequency encoding (N, D + 2 D L) of vectors, with only the open frequencies other than 0.
+    """Return the frequency encoding (N, D + 2 D L) of vectors; closed frequencies are 0.
 
     Args:
-        x: (N, D) vectors, which are always encoded themselves too.
+        x: (N, D) vectors; they are part of the encoding.
         num_frequencies: number L of frequencies.
         opening: the open frequencies; None if all are.
     """

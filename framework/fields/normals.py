@@ -1,4 +1,4 @@
-"""Surface normals: from the gradient of the density, and from a network that predicts smoother ones."""
+"""Surface normals from the gradient of the density, and from a network that predicts smoother normals."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def normal_penalties(
 ) -> dict[str, Tensor]:
     """Return the penalties of predicted normals per ray: Ref-NeRF, equations 10 and 11.
 
-    Unlike in the paper the density gets no gradient from them, because the kernels have first derivatives only.
+    Unlike in the paper, the penalties do not train the density, because the kernels have first derivatives only.
 
     Args:
         predicted: (N, 3) predicted unit normals.

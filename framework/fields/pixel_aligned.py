@@ -1,4 +1,4 @@
-"""The field of PixelNeRF (Yu et al. 2021): one network for all scenes, which looks at images of the scene it is in."""
+"""The field of PixelNeRF (Yu et al. 2021): one network for all scenes, conditioned on images of the scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerfloom.kernels.table_memory import require
 
 
 class ResidualBlock(nn.Module):
-    """Two layers whose output is added to their input, which is all of the output at first.
+    """Two layers whose output is added to their input; initially the identity.
 
     Args:
         width: number of features.
@@ -36,17 +36,17 @@ class ResidualBlock(nn.Module):
 class PixelAlignedField(Field):
     """A field of residual blocks, conditioned on the pixels that show a position: PixelNeRF, section 4.2.
 
-    For each source view the position in that camera's frame goes through the first blocks, each of which adds the
-    features of the pixel that shows it. The views' mean goes through the other blocks. So neither the order of the
-    views nor the scene's frame matters, and there may be as many views as there are. Unlike in the paper, density does
-    not depend on the direction: directions, in the cameras' frames too, join for the colour.
+    For each source view, the first blocks take the position in that camera's frame, and each adds the features of the
+    pixel that shows it. The mean over views passes through the remaining blocks. So the order of the views and the
+    frame of the scene do not matter, and the number of views is free. Unlike in the paper, density does not depend on
+    the direction: directions, also in the cameras' frames, are inputs of the colour only.
 
     Args:
         num_features: number C of features of a pixel.
-        unit: length, scene units, in which positions are encoded.
+        unit: length that encoded positions are divided by, scene units.
         width: features of a layer.
         before: residual blocks before the mean over views.
-        after: residual blocks after it.
+        after: residual blocks after the mean.
         position_frequencies: number of frequencies of encoded positions.
 
     Raises:
@@ -65,7 +65,7 @@ class PixelAlignedField(Field):
         super().__init__()
         self.unit, self.position_frequencies = unit, position_frequencies
         self.views: SourceViews | None = None
-        """Images of the scene that the field is asked about; whoever asks sets them."""
+        """Images of the scene; the caller sets them before evaluation."""
         require(8.0 * (before + after) * width**2, "a network")
         self.lift = nn.Linear(3 + 6 * position_frequencies, width)
         self.conditions = nn.ModuleList(nn.Linear(num_features, width) for _ in range(before))
@@ -95,7 +95,7 @@ class PixelAlignedField(Field):
 
     def _views(self) -> SourceViews:
         if self.views is None:
-            raise ValueError("this field looks at images of the scene: set its views first")
+            raise ValueError("this field needs images of the scene: set its views first")
         return self.views
 
 

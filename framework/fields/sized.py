@@ -1,4 +1,4 @@
-"""Fields on hash grids that know the size of points: levels finer than a point count less."""
+"""Fields on hash grids that account for the size of points: levels finer than a point get less weight."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from nerfloom.kernels.grids.multisamples import ball_deviations, frustum_balls, 
 class SizedGrid(BoxField):
     """A field on a hash grid whose features are weighted by the size of points.
 
-    Zip-NeRF (Barron et al. 2023), section 3.1. Unlike there, a frustum is looked up at its mean alone, and its size is
-    that of the ball with the same volume. It is made like the class of fields that it is mixed with; its encoding is a
-    `MultisampledHashGrid`.
+    Zip-NeRF (Barron et al. 2023), section 3.1. Unlike there, a frustum is looked up at its mean only, and its size is
+    that of the ball with the same volume. This is a mixin, constructed like the field class beside it; the encoding is
+    a `MultisampledHashGrid`.
     """
 
     footprint: ClassVar[Footprint] = "frustum"
@@ -36,8 +36,8 @@ class SizedGrid(BoxField):
         """Return positions and standard deviations (N, 4) in units of the encoding.
 
         Args:
-            points: N points with frustums, or with Gaussians, as exports ask about; others get half a cell of the
-                finest level. The encoding has no axis of time.
+            points: N points with frustums, or with Gaussians (exports); other points get half a cell of the finest
+                level. The encoding has no time axis.
         """
         if points.frustums is not None:
             return frustum_balls(points.frustums, self.box, self.unbounded)
@@ -51,7 +51,7 @@ class SizedGrid(BoxField):
 
 
 class SizedDensity(SizedGrid, DensityField):
-    """A field of density without colour, for proposals, on a hash grid that knows the size of points."""
+    """A field of density without colour, for proposals, on a hash grid that accounts for the size of points."""
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         features = self.encode_points(points)
@@ -59,7 +59,7 @@ class SizedDensity(SizedGrid, DensityField):
 
 
 class SizedField(SizedGrid, EncodedField):
-    """A field of density and colour on a hash grid that knows the size of points."""
+    """A field of density and colour on a hash grid that accounts for the size of points."""
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         return self.density_head.density(self.encode_points(points))

@@ -25,14 +25,13 @@ CP = (((0,), (1,), (2,)),)
 """One group: a line along each axis (equation 3)."""
 DENSITY_SHIFT, DENSITY_SCALE = -5.0, 25.0
 """Density is DENSITY_SCALE * softplus(sum of components + DENSITY_SHIFT), small at first (section 4.4). The authors'
-code has -10, from which thin things do not rise in a minute: their rays pass little that could become dense, and
-gradients are as small as the density."""
+code has -10. With that, thin structures do not appear within a minute: the gradient is as small as the density."""
 
 
 class TensorField(Field):
     """A field whose density is a sum of components (section 4.3).
 
-    Colour has components of its own, which a linear basis and a small network turn into RGB.
+    Colour has its own components; a linear basis and a small network turn them into RGB.
 
     Args:
         box: (2, 3) minimum and maximum corner of the encoded region, scene units.
@@ -44,7 +43,7 @@ class TensorField(Field):
 
     box: Tensor
     density_shift: Tensor
-    """() `DENSITY_SHIFT`, or the one of the checkpoint that was loaded."""
+    """() `DENSITY_SHIFT`, or the value of the loaded checkpoint."""
     runs_on_kernels = True
 
     def __init__(
@@ -75,7 +74,7 @@ class TensorField(Field):
         return softplus(components.float().sum(-1) + shift) * DENSITY_SCALE * inside
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        # Checkpoints from before it was a buffer were trained with the authors' shift.
+        # Checkpoints without this buffer were trained with the authors' shift.
         state_dict.setdefault(f"{prefix}density_shift", torch.tensor(-10.0))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 

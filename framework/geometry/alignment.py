@@ -57,7 +57,7 @@ def align_cameras(estimated: Tensor, given: Tensor) -> tuple[float, Tensor, Tens
         given: (M, 3, 4) camera-to-world matrices to be matched, in the same order.
 
     Returns:
-        As `align`. The scale is 1 if all centres coincide.
+        Same as `align`. The scale is 1 if all centres coincide.
     """
     source, target = estimated.double(), given.double()
     u, _, vh = torch.linalg.svd((target[:, :, :3] @ source[:, :, :3].transpose(1, 2)).mean(0))

@@ -66,9 +66,9 @@ def box_around_cells(inside: Tensor, box: Tensor, margin: int = 0) -> Tensor | N
     """Return the smallest box (2, 3) that holds some cells of a grid; None if there are none.
 
     Args:
-        inside: (n, n, n) bool which cells along x, y and z.
+        inside: (n, n, n) bool, True for these cells, indexed by x, y and z.
         box: (2, 3) minimum and maximum corner of the grid.
-        margin: cells that are added on each side.
+        margin: number of cells added on each side.
     """
     cells = inside.nonzero()
     if len(cells) == 0:

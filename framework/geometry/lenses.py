@@ -207,7 +207,7 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
 
 
 def iterations_needed(u: Tensor, v: Tensor, lenses: Distortion) -> int:
-    """Return after how many iterations `undistort` has found all positions that it ever finds, and one more.
+    """Return the number of iterations after which `undistort` finds no further positions, plus one.
 
     Args:
         u, v: (R,) distorted coordinates.

@@ -1,9 +1,9 @@
 """Multisamples: a few points in a conical frustum that stand for all of it (Zip-NeRF, Barron et al. 2023, section 2).
 
-Six points lie on a helix around the axis of the cone. Their mean and their variance along the axis are exactly those of
-the frustum, whatever the rotation of the pattern, and so is the sum of their variances across it. Their covariance is
-the frustum's in the mean over all rotations. The last point of a frustum that is much longer than it is far away lies
-beyond its end, by at most 3.4 % of its length.
+Six points lie on a helix around the axis of the cone. Their mean, their variance along the axis and the sum of their
+variances across it equal the frustum's exactly, however the pattern is rotated. Their covariance equals the frustum's
+on average over all rotations. If a frustum is much longer than its distance, its last point lies beyond its end, by at
+most 3.4 % of its length.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ THIRDS_OF_PI = (0, 2, 4, 3, 5, 1)
 NUM_MULTISAMPLES = len(THIRDS_OF_PI)
 """Number of points in a frustum."""
 STD_SCALE = 0.5
-"""Standard deviation of a point, in units of the distance from the axis at which it lies (`sigma` in the paper)."""
+"""Standard deviation of a point, relative to its distance from the axis (`sigma` in the paper)."""
 
 SCATTER = 0x9E3779B1 - 2**32
 """Factor of the bits of a float that are hashed: 2^32 over the golden ratio (Knuth 1973, section 6.4), as an int32."""
@@ -38,7 +38,7 @@ class Pattern(NamedTuple):
 
 
 def hashed_pattern(frustums: Frustums) -> Pattern:
-    """Return rotations that look random, half of them mirrored; for training.
+    """Return pseudo-random rotations for training; half of the patterns are mirrored.
 
     They are a hash of both ends of a frustum, which are random themselves, so that those of the same frustum are the
     same again: what a march has evaluated in waves need not be evaluated another time (`kernels.result_cache`).
@@ -54,10 +54,10 @@ def hashed_pattern(frustums: Frustums) -> Pattern:
 
 
 def fixed_pattern(frustums: Frustums) -> Pattern:
-    """Return the pattern of evaluation: of each second frustum on a ray it is mirrored and turned by 30 degrees.
+    """Return the pattern for evaluation: every second frustum on a ray is mirrored and rotated by 30 degrees.
 
     Args:
-        frustums: N frustums; without ranks, none is mirrored or turned.
+        frustums: N frustums; without ranks, no frustum is mirrored or rotated.
     """
     if frustums.ranks is None:
         return Pattern(torch.zeros_like(frustums.radii), torch.ones_like(frustums.radii))
@@ -96,5 +96,5 @@ def multisamples(frustums: Frustums, pattern: Pattern) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=8)
 def _angles(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return the angles (6,) of the points; they are kept, since bringing them to a device means to wait for it."""
+    """Return the angles (6,) of the points; cached, because a copy to the device waits for it."""
     return torch.tensor(THIRDS_OF_PI, dtype=dtype, device=device) * (math.pi / 3)

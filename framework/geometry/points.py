@@ -11,8 +11,8 @@ from torch import Tensor
 from nerfloom.geometry.rays import Rays, Samples
 
 Footprint = Literal["none", "radius", "gaussian", "frustum"]
-"""Kind of a point's size that a field needs: none, radius of the pixel's cone, mean and covariance of the cone's
-interval, or that interval itself."""
+"""Size of points that a field needs: none; the radius of the pixel's cone; mean and covariance of the cone's interval;
+or that interval itself."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Points:
     frustums: Frustums | None = None
     """The cones' intervals; None if not computed."""
     ambient: Tensor | None = None
-    """(N, K) coordinates beyond those of space, on which density and colour depend; None without."""
+    """(N, K) further coordinates beside space, inputs of density and colour; None without."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -73,7 +73,7 @@ class Points:
         return frames(self.axes) * torch.cat([deviations, deviations[:, 1:]], dim=-1)[:, None]
 
     def sized(self, deviation: float) -> Points:
-        """Return points with Gaussians; points without get balls, as fields are also asked at mere positions.
+        """Return points with Gaussians; points without Gaussians become balls.
 
         Args:
             deviation: standard deviation of the balls, scene units.

@@ -119,7 +119,7 @@ class Samples:
     longest: int | None = None
     """Upper bound of the number of samples on a ray, if the sampler knows one."""
     filled: Tensor | None = None
-    """() int64 number of samples that are not of length 0 for want of others; None if all are."""
+    """() int64 number of samples in use; the others have length 0. None if all samples are in use."""
     sigma: Tensor | None = None
     """(N,) density, if the sampler evaluated it."""
     features: Tensor | None = None

@@ -6,9 +6,9 @@ the centre, d its unit direction and s = 1/r, the ray's point beyond m at distan
 
     (x', y', z') = s m + sqrt(1 - s^2 |m|^2) d
 
-The paper rotates the point at which the ray leaves the unit sphere by the angle asin |m| - asin (s |m|) instead, which
-is the same, but has no axis where the ray goes through the centre. Here nothing is divided, and s = 0 is the ray's
-direction itself.
+The paper instead rotates the point at which the ray leaves the unit sphere by the angle asin |m| - asin (s |m|). That
+is the same point, but the rotation has no axis if the ray passes through the centre. The formula here has no division,
+and at s = 0 it gives the direction of the ray.
 
 A sphere is a tensor (4,): its centre and its radius, scene units.
 """
@@ -62,18 +62,19 @@ def intersect_sphere(origins: Tensor, directions: Tensor, sphere: Tensor) -> tup
 
 
 class InvertedRays(Rays):
-    """The part of rays that is outside of a sphere and behind it, by u = 1 - 1/r in place of the distance along them.
+    """The parts of rays behind a sphere, parameterised by u = 1 - 1/r instead of the distance along the ray.
 
     `origins` are the points nearest to the centre, in units of the sphere's radius; `nears` and `fars` are values of u,
     0 on the sphere and 1 at infinity; `points` returns (N, 4) points (x', y', z', 1/r) of the inverted sphere.
 
-    A ray that enters the sphere is outside from where it leaves it; one that misses it, from where it is nearest to the
-    centre, since 1/r falls from there on. A part before that is left out: whoever is far outside sees through it.
+    If a ray enters the sphere, its part behind starts where the ray leaves it. If a ray misses the sphere, the part
+    starts where the ray is nearest to the centre, since 1/r falls from there on. Anything before that is not shown, so
+    a camera far outside the sphere sees through it.
     """
 
     @classmethod
     def of(cls, rays: Rays, sphere: Tensor) -> InvertedRays:
-        """Return the part of R rays that is behind a sphere; of length 0 where a ray ends before.
+        """Return the part of R rays that is behind a sphere; its length is 0 if the ray ends earlier.
 
         Args:
             rays: the rays, between their near and their far ends.
@@ -100,14 +101,14 @@ class InvertedRays(Rays):
         """
         nearest, inverse = self.origins.index_select(0, ray_indices), 1 - t
         square = 1 - inverse.square() * nearest.square().sum(-1)
-        # Bounded, since a ray that misses the sphere starts where this is 0, and the root's gradient infinite.
+        # Clamped: for a ray that misses the sphere this is 0 at the start, where the root has an infinite gradient.
         along = square.clamp(min=torch.finfo(square.dtype).eps).sqrt()
         directions = self.directions.index_select(0, ray_indices)
         return torch.cat([inverse[:, None] * nearest + along[:, None] * directions, inverse[:, None]], dim=-1)
 
 
 def distances_behind(u: Tensor, rays: Rays, sphere: Tensor) -> Tensor:
-    """Return the distances (R,) along rays of what is outside of a sphere, scene units, at most their far ends.
+    """Return the distances (R,) along rays of points outside a sphere, scene units, at most the rays' far ends.
 
     Args:
         u: (R,) values of 1 - 1/r.

@@ -1,9 +1,9 @@
 """Adapter that runs Nerfloom's methods in nerfbaselines: its `Method` protocol, implemented by trainer and evaluator.
 
-The protocol is structural, so nothing of nerfbaselines is imported. nerfbaselines counts the steps,
-`max_num_iterations` in all. Overrides have the names of the method's flags with underscores (`max_num_iterations`,
-`machine.seed`), or those of `FrameFlags` with the prefix `frame.`. A checkpoint is the trainer's, and a file with the
-background of renders.
+The protocol is structural, so nothing is imported from nerfbaselines. nerfbaselines counts the steps,
+`max_num_iterations` in total. Overrides are named like the method's flags, with underscores (`max_num_iterations`,
+`machine.seed`), or like those of `FrameFlags`, with the prefix `frame.`. A checkpoint is the trainer's, plus a file
+with the background of renders.
 """
 
 from __future__ import annotations
@@ -45,8 +45,7 @@ from nerfloom.training.trainer import Trainer
 BACKGROUND_FILE = "pictures.json"
 """File of a checkpoint with the background of renders, which the trainer's checkpoint lacks."""
 FEATURES = ("color", "points3D_xyz")
-"""Features of data sets that are used; the points determine where rays start, and sets of rendered objects have
-none."""
+"""Data set features in use. The points determine where rays start; sets of rendered objects have none."""
 OUTPUTS = ("color", "depth", "accumulation")
 """Names of a render's arrays."""
 
@@ -58,7 +57,7 @@ class NerfloomMethod:
         checkpoint: a folder written by `save`.
         train_dataset: training images; not needed to render from a checkpoint.
         config_overrides: settings by name, on top of the method's or the checkpoint's. Text is parsed as a Python
-            literal, and words such as `auto` are kept.
+            literal; words such as `auto` are kept.
 
     Raises:
         ConfigError: for unknown settings, or if there are neither data nor a checkpoint.
@@ -152,7 +151,7 @@ class NerfloomMethod:
         if self._trainer is not None:
             self._trainer.folder = folder
             self._trainer.save()
-        elif self._checkpoint is not None:  # the same bytes, as nerfbaselines stores their hash
+        elif self._checkpoint is not None:  # the same bytes, because nerfbaselines stores their hash
             shutil.copytree(self._checkpoint / FOLDER, folder / FOLDER, dirs_exist_ok=True)
         write_json(folder / BACKGROUND_FILE, {"background": self._background.tolist()})
 
@@ -163,7 +162,7 @@ class NerfloomMethod:
 
         Args:
             camera: one of nerfbaselines' cameras, of any size and model.
-            options: `embedding` is the appearance; the mean of the training images' if None.
+            options: `embedding` is the appearance; if None, the mean of the training images'.
 
         Returns:
             color (H, W, 3) in [0, 1] over the data set's background, depth (H, W) along the ray in the data set's
@@ -176,16 +175,16 @@ class NerfloomMethod:
         return {name: values.cpu().numpy() for name, values in zip(OUTPUTS, found, strict=True)}
 
     def get_train_embedding(self, index: int) -> np.ndarray | None:
-        """(D,) the appearance of training photograph `index`; None of a method that learns none."""
+        """(D,) the appearance of training photograph `index`; None for methods without appearance."""
         appearance = appearance_of(self._model)
         return None if appearance is None else appearance.vectors[index].detach().cpu().numpy()
 
     def optimize_embedding(self, dataset: DatasetDict, *, embedding: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Optimise the appearance of an image that was not trained on.
+        """Optimise the appearance of an image that is not a training image.
 
         Args:
             dataset: one image, or the visible part of it.
-            embedding: (D,) initial value; the mean of the training images' if None.
+            embedding: (D,) initial value; if None, the mean of the training images'.
 
         Returns:
             `embedding` (D,).
@@ -202,7 +201,7 @@ class NerfloomMethod:
         return {"embedding": found.cpu().numpy()}
 
     def _vector(self, embedding: np.ndarray | None) -> Tensor | None:
-        """Return an embedding as a tensor; None for the mean of what was learnt."""
+        """Return an embedding as a tensor; None for the mean of the learnt embeddings."""
         return None if embedding is None else torch.from_numpy(np.array(embedding, np.float32)).to(self._model.device)
 
 
@@ -260,7 +259,7 @@ class Saved:
         """
         content = load_newest(folder / FOLDER)
         if content is None:
-            raise CheckpointError(f"{folder / FOLDER} holds no checkpoint")
+            raise CheckpointError(f"{folder / FOLDER} has no checkpoint")
         if content.get("method") != method:
             raise CheckpointError(f"{folder} is a checkpoint of {content.get('method')}, not of {method}")
         try:
@@ -278,9 +277,9 @@ class Saved:
 def _begin(
     method: str, config: TrainConfig, flags: FrameFlags, data: DatasetDict, saved: Saved | None
 ) -> tuple[Trainer, Frame, Tensor]:
-    """Return a trainer, new or restored from a checkpoint, the frame of its images, and the background of renders (3,).
+    """Return a trainer, new or restored, the frame of its images, and the background of renders (3,).
 
-    The decisions based on the data are reported for a new one.
+    For a new trainer, decisions based on the data are reported.
     """
     images = ArrayImages.of(data)
     frame = Frame.of(images, flags) if saved is None else saved.frame
@@ -298,7 +297,7 @@ def _begin(
 
 
 def _defaults(method: str, saved: Saved | None) -> TrainConfig:
-    """Return the settings before overrides. nerfbaselines' masks hide unwanted content; they mean no empty space."""
+    """Return the settings before overrides. nerfbaselines' masks hide unwanted content, never empty space."""
     default = load_method(method).config
     if saved is None:
         return replace(default, masks="ignored")

@@ -1,7 +1,7 @@
 """Conversion of nerfbaselines' data sets, which are in memory, and their placement in a scene.
 
-nerfbaselines' cameras have OpenCV's axes (x right, y down, z forward), those of the framework OpenGL's. Pixel centres
-are at 0.5 in both.
+nerfbaselines' cameras have OpenCV's axes (x right, y down, z forward), the framework's have OpenGL's. Pixel centres are
+at 0.5 in both.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from nerfloom.data.decoding import Decoded, from_arrays
 from nerfloom.data.masks import THRESHOLD
 
 DatasetDict = dict[str, Any]
-"""nerfbaselines' `Dataset`, of which `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata` are
-used."""
+"""nerfbaselines' `Dataset`. Its `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata` are used."""
 CAMERA_MODELS = ("pinhole", "opencv", "opencv_fisheye", "full_opencv")
 """nerfbaselines' camera models, in the order of its enumeration. COLMAP has all of them, with the same names."""
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -35,7 +34,7 @@ TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 FAR = 1000.0
 """Distance at which an unbounded scene ends, scene units."""
 BOUND_SHARE = 0.9
-"""Near distance as a fraction of the smallest depth stated by the data set: that is a percentile, and a few are
+"""Near distance as a fraction of the smallest depth stated by the data set. That depth is a percentile; a few are
 smaller."""
 
 
@@ -44,8 +43,8 @@ class FrameFlags:
     """Settings of the scene's region; nerfbaselines' overrides name them with the prefix `frame.`."""
 
     half_size: float | None = None
-    """Half the side of the box of an object cut out by alpha, in the data set's units. If not given: half the range
-    between the smallest and the largest depth stated by the data set."""
+    """Half the side of the box of an object cut out by alpha, in the data set's units. Default: half the range between
+    the smallest and the largest depth stated by the data set."""
 
 
 @dataclass(frozen=True)
@@ -53,19 +52,19 @@ class ArrayImages:
     """M images in the data set's own frame and units."""
 
     paths: tuple[Path, ...]
-    """M names of files, which need not exist."""
+    """M file names; the files need not exist."""
     cameras: Cameras
     """M cameras with float64 poses."""
     decoded: Decoded
     """The images' pixels."""
     bounds: tuple[float, float] | None
-    """Smallest and largest depth of the scene, if the data set states them."""
+    """Smallest and largest depth of the scene, if stated by the data set."""
     points: Tensor | None
     """(K, 3) float64 sparse points, or None."""
 
     @classmethod
     def of(cls, dataset: DatasetDict) -> ArrayImages:
-        """Convert nerfbaselines' dictionary `dataset`. Images and masks may be padded to more than their camera's size.
+        """Convert nerfbaselines' dictionary `dataset`. Images and masks may be padded beyond their camera's size.
 
         Raises:
             DataError: for linear colours, invalid arrays, or invalid cameras.
@@ -138,7 +137,7 @@ def _unpadded(image: Any, width: int, height: int, path: Path) -> np.ndarray:
 
 
 def _as_bool(mask: np.ndarray) -> np.ndarray:
-    """Convert a mask (H, W) or (H, W, 1) of any type to (H, W) bool, true for pixels to train on."""
+    """Convert a mask (H, W) or (H, W, 1) of any type to (H, W) bool, True for pixels to train on."""
     mask = mask.reshape(mask.shape[:2])
     return mask if mask.dtype == np.bool_ else mask >= (THRESHOLD if mask.dtype == np.uint8 else 0.5)
 
@@ -237,6 +236,6 @@ def dataset_of(images: ArrayImages, frame: Frame, masks: Masks) -> Dataset:
 
 
 def background_of(dataset: DatasetDict) -> Tensor:
-    """Return the background (3,) of the evaluation of `dataset`; black if it is not stated, as in nerfbaselines."""
+    """Return the background (3,) for evaluating `dataset`; black if it is not stated, as in nerfbaselines."""
     color = dataset["metadata"].get("background_color")
     return torch.zeros(3) if color is None else torch.tensor(np.asarray(color).tolist()) / 255

@@ -1,4 +1,4 @@
-"""Conversion of settings between nerfbaselines and configs: flat names with dots, and text from a command line."""
+"""Conversion of settings between nerfbaselines and configs: dotted flat names, and text from a command line."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def flattened(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def with_matching_background(config: TrainConfig, background: Tensor) -> TrainConfig:
-    """Return the config with a random background in training, if its fixed one differs from that of renders.
+    """Return the config, with a random training background if its fixed one differs from that of renders.
 
     Args:
         config: the config.

@@ -1,9 +1,8 @@
 """Specifications of Nerfloom's methods for nerfbaselines: plain data, registered with it if it is installed.
 
 nerfbaselines finds this file if Nerfloom is installed in the same environment (entry point group
-`nerfbaselines.specs`), by NERFBASELINES_REGISTER with the file's path, or by `nerfbaselines install --spec` with it.
-The file therefore imports neither Nerfloom nor PyTorch. Methods run in nerfbaselines' own environment (its `python`
-backend).
+`nerfbaselines.specs`), through NERFBASELINES_REGISTER with the file's path, or through `nerfbaselines install --spec`.
+So the file imports neither Nerfloom nor PyTorch. Methods run in nerfbaselines' own environment (its `python` backend).
 """
 
 from __future__ import annotations

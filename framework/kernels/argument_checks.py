@@ -1,4 +1,4 @@
-"""Checks of tensors that are passed by callers. Compiled kernels check indices themselves when they use them."""
+"""Checks of tensors passed by callers. Compiled kernels check indices themselves when they use them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def is_bad_here(scalar: Tensor) -> bool:
 def check_indices(indices: Tensor, count: int | Tensor, what: str) -> None:
     """Check that indices are in range.
 
-    Indices on other devices than the CPU are not checked: reading them would wait for the device, which reports indices
-    out of range itself.
+    Indices on devices other than the CPU are not checked: reading them would wait for the device, which itself reports
+    indices out of range.
 
     Args:
         indices: integers of any shape.
-        count: number of items that are indexed, possibly a tensor (), which is read only if there is a check.
+        count: number of indexed items, possibly a tensor (), which is read only if there is a check.
         what: name of the items, for the error.
 
     Raises:
@@ -45,11 +45,11 @@ def check_offsets(offsets: Tensor, count: int) -> None:
         count: number N of samples.
 
     Raises:
-        IndexError: if the offsets do not rise from 0 to `count`.
+        IndexError: if the offsets do not increase from 0 to `count`.
     """
     if offsets.device.type != "cpu":
         return
     if offsets.ndim != 1 or len(offsets) == 0 or int(offsets[0]) != 0 or int(offsets[-1]) != count:
-        raise IndexError(f"the rays' offsets must start at 0 and end at {count}, the number of samples")
+        raise IndexError(f"the rays' offsets must start at 0 and end at the number of samples, {count}")
     if bool((offsets[1:] < offsets[:-1]).any()):
         raise IndexError("the rays' offsets must not decrease: the samples of each ray follow those of the ray before")

@@ -1,7 +1,7 @@
 """Choice of the implementation of an operation, at each call, from one table.
 
-An operation has a reference in PyTorch, for any device, type and order of derivative, and implementations by backends
-for some of these. A new backend adds its implementations to the operations, whose callers do not change.
+An operation has a reference in PyTorch, for any device, type and order of derivative. Backends implement it for some of
+these. A new backend adds its implementations to the operations; their callers do not change.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Backend:
     """A way to run operations, such as compiled C++ code."""
 
     name: str
-    """Name under which it is listed."""
+    """Name in listings."""
     reads: Callable[[Tensor], bool]
-    """Returns whether it can read a tensor's memory. `tensor.device`, which takes a microsecond, should be avoided."""
+    """Returns whether it can read a tensor's memory. Avoid `tensor.device`, which takes a microsecond."""
     available: Callable[[], bool]
     """Returns whether it can be used on this machine."""
 
@@ -38,13 +38,14 @@ REFERENCE = Backend("reference", lambda tensor: True, lambda: True)
 TORCH = Backend("torch", lambda tensor: True, lambda: True)
 """Fast implementations by PyTorch itself, if they differ from the reference."""
 FEW_OPERATIONS = Backend("few operations", lambda tensor: not (tensor.is_cpu and native.available()), lambda: True)
-"""Implementations by PyTorch in few operations and without waiting for the device: for GPUs, and where there are no
-compiled kernels. Beside these the CPU takes the reference, so that runs on it stay the same to the bit."""
+"""Implementations in PyTorch with few operations and without waiting for the device: for GPUs, and for machines without
+compiled kernels. With compiled kernels the CPU takes the reference instead, so that its runs stay the same to the
+bit."""
 CPP = Backend("c++", attrgetter("is_cpu"), lambda: native.available())
 TRITON = Backend(
     "triton", attrgetter("is_cpu" if triton_backend.INTERPRETED else "is_cuda"), lambda: triton_backend.available()
 )
-"""Kernels for NVIDIA's and AMD's GPUs. PyTorch names both "cuda"."""
+"""Kernels for NVIDIA's and AMD's GPUs. PyTorch calls both "cuda"."""
 FLOAT32, INT64, BOOL = (frozenset({kind}) for kind in (torch.float32, torch.int64, torch.bool))
 
 
@@ -57,13 +58,13 @@ class Implementation(Generic[P, R]):
     run: Callable[P, R]
     """Computes the operation."""
     types: frozenset[torch.dtype] | None = None
-    """Supported types of the tensors that decide; None for all types."""
+    """Supported types of the deciding tensors; None for all types."""
     order: float = torch.inf
-    """Order of the highest derivative that it supports: 0 for none."""
+    """Highest supported order of derivatives; 0 for none."""
     differentiable: int | None = None
-    """Number of tensors, from the first, for which it supports derivatives; None for all."""
+    """Number of leading tensors with derivatives; None for all."""
     fits: Callable[P, bool] | None = None
-    """Further condition on the arguments; None if there is none."""
+    """Further condition on the arguments; None without."""
 
     def suits(self, tensors: Sequence[Tensor | None], *args: P.args, **kwargs: P.kwargs) -> bool:
         """Return whether it can be used for `tensors`, `args` and `kwargs`, which are as in `Operation`."""
@@ -83,8 +84,8 @@ class Operation(Generic[P, R]):
     """An operation: its reference and its other implementations.
 
     Args:
-        name: name under which it is listed.
-        reference: the readable form in PyTorch, which is used if no other implementation can be.
+        name: name in listings.
+        reference: the readable form in PyTorch, used if no other implementation fits.
     """
 
     def __init__(self, name: str, reference: Callable[P, R]) -> None:
@@ -106,15 +107,15 @@ class Operation(Generic[P, R]):
 
         Args:
             backend: the backend that runs it.
-            types: supported types of the tensors that decide; None for all types.
-            order: order of the highest derivative that it supports: 0 for none.
-            differentiable: number of tensors, from the first, for which it supports derivatives; None for all.
-            fits: further condition on the arguments; None if there is none.
+            types: supported types of the deciding tensors; None for all types.
+            order: highest supported order of derivatives; 0 for none.
+            differentiable: number of leading tensors with derivatives; None for all.
+            fits: further condition on the arguments; None without.
         """
 
         def add(run: Callable[P, R]) -> Callable[P, R]:
             self.implementations.append(Implementation(backend, run, types, order, differentiable, fits))
-            self.implementations.sort(key=lambda each: each.backend in (TORCH, FEW_OPERATIONS))  # others are preferred
+            self.implementations.sort(key=lambda each: each.backend in (TORCH, FEW_OPERATIONS))  # others come first
             return run
 
         return add
@@ -130,7 +131,7 @@ class Operation(Generic[P, R]):
         """Run the operation.
 
         Args:
-            tensors: those whose device, type and gradients decide which implementation runs; None is ignored.
+            tensors: tensors whose device, type and gradients determine the implementation; None is ignored.
             args: positional arguments of the operation.
             kwargs: keyword arguments of the operation.
         """
@@ -157,7 +158,7 @@ _thread = _Thread()
 
 @contextmanager
 def derivatives(order: int) -> Iterator[None]:
-    """Use only implementations with derivatives of a given order, within a `with` block, if gradients are needed.
+    """Within a `with` block, use only implementations with derivatives of a given order, if gradients are needed.
 
     The default is 1. A loss on the gradient of a field, such as an eikonal term, needs 2.
 

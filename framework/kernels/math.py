@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfloom.geometry.limits import at_least
 
 MAX_LOG_DENSITY = 15.0
-"""Maximum log-density; larger ones are clipped."""
+"""Maximum log-density; larger values are clamped."""
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -27,9 +27,9 @@ class _TruncatedExp(torch.autograd.Function):
 
 
 def truncated_exp(x: Tensor) -> Tensor:
-    """Return exp(min(x, 15)), whose gradient is the result itself, so that a density that is too high can decrease.
+    """Return exp(min(x, 15)). The gradient is the result itself, so that a density that is too high can decrease.
 
-    This is Instant-NGP's `trunc_exp`. In half precision exp would overflow for `x` above 11, so that types other than
+    This is Instant-NGP's `trunc_exp`. In half precision exp would overflow for `x` above 11, so types other than
     float64 are converted to float32.
     """
     return _TruncatedExp.apply(x.float() if x.dtype != torch.float64 else x)
@@ -55,7 +55,7 @@ class _SplitDensity(torch.autograd.Function):
 
 
 def split_density(features: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the density (N,), which is the `truncated_exp` of the first feature, and the `features` (N, F) themselves.
+    """Return the density (N,), the `truncated_exp` of the first feature, and the `features` (N, F) themselves.
 
     It equals slicing, but computes the sum of the two gradients in one pass.
     """
@@ -82,14 +82,14 @@ def scale_gradient(values: Tensor, factors: Tensor) -> Tensor:
 def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     """Return v / |v| along the last dimension; NaN if v is not finite.
 
-    v is divided by its largest component first, because in float32 the squares of components above 1.8e19 are infinite.
+    v is first divided by its largest component, because in float32 the squares of components above 1.8e19 are infinite.
 
     Args:
         v: (..., D) vectors.
         eps: length below which the result and its gradient are 0.
     """
     least = max(eps, torch.finfo(v.dtype).tiny)  # 1e-12 would be 0 in float16
-    scaled = v / v.detach().abs().amax(-1, keepdim=True).clamp(min=least)  # shorter than 1 where |v| < least
+    scaled = v / v.detach().abs().amax(-1, keepdim=True).clamp(min=least)  # shorter than 1 if |v| < least
     squared = (scaled * scaled).sum(-1, keepdim=True)
     return (scaled / at_least(squared, 1.0).sqrt()).masked_fill(squared < 1, 0)
 

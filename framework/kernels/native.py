@@ -41,7 +41,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "avx2": ("avx2", "fma"),
     "baseline": (),
 }
-"""CPU features that each variant needs, by its name, the fastest variant first."""
+"""CPU features required by each variant, by name, fastest variant first."""
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 TYPES: dict[str, Any] = {
     "p": ctypes.c_void_p,
@@ -51,7 +51,7 @@ TYPES: dict[str, Any] = {
     "d": ctypes.c_double,
 }
 spent: dict[str, float] | None = None
-"""Seconds spent in each kernel by name, recorded if this is a dictionary (`ns-bench profile-step`)."""
+"""Seconds spent in each kernel, by name; recorded if this is a dictionary (`ns-bench profile-step`)."""
 
 
 def variant() -> str:
@@ -98,11 +98,11 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
 
 
 def _opened(path: Path) -> ctypes.CDLL:
-    """Return the library at `path`, with the leave of the system to use what it needs.
+    """Return the library at `path`, after requesting the system's permission for the features it needs.
 
     Raises:
-        OSError: if it does not load, was built from other sources than those beside it, whose functions may take other
-            arguments, or the system does not give leave.
+        OSError: if it does not load, if it was built from other sources than those beside it (whose functions may take
+            other arguments), or if the system denies permission.
     """
     library = ctypes.CDLL(str(path))
     built_from = getattr(library, "built_from", None)
@@ -135,17 +135,17 @@ _FAILURES: dict[int, type[Exception]] = {1: MemoryError, 2: IndexError, 3: Value
 
 
 class Function:
-    """A C function of the library, which is looked up at its first call.
+    """A C function of the library, looked up at its first call.
 
-    A call raises MemoryError, IndexError, ValueError or RuntimeError according to the status that the C function
+    A call raises MemoryError, IndexError, ValueError or RuntimeError, depending on the status that the C function
     returns (kernels/runtime/status.h).
 
     Args:
         name: name of the C function.
         arguments: types of its arguments, one letter each: p pointer, q 64-bit integer, i int, f float, d double. A
             test compares them with the C++ sources.
-        result: type of the value that it writes through a last argument, which is not in `arguments`; a call returns
-            this value. Empty if there is none.
+        result: type of the value written through an additional last argument, which is not in `arguments`; a call
+            returns this value. Empty if there is none.
     """
 
     def __init__(self, name: str, arguments: str, result: str = "") -> None:
@@ -171,7 +171,7 @@ class Function:
         function = getattr(library, self.name)
         function.argtypes = [TYPES[letter] for letter in self.arguments] + [ctypes.c_void_p] * bool(self.result)
         function.restype = ctypes.c_int
-        self._bound = function  # only when it is complete: another thread may be calling
+        self._bound = function  # set only when complete: another thread may be calling
         return function
 
 
@@ -188,16 +188,16 @@ def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtyp
     Args:
         tensor: a contiguous tensor on the CPU.
         what: name of the tensor, for the error.
-        shape: the shape that it must have.
-        dtype: the type that it must have.
+        shape: the required shape.
+        dtype: the required type.
 
     Raises:
-        ValueError: if the tensor is not contiguous, not on the CPU, or of another shape or type.
+        ValueError: if the tensor is not contiguous, not on the CPU, or has another shape or type.
     """
     if not tensor.is_cpu:  # tensor.device takes fifteen times as long
-        raise ValueError(f"{what} is on {tensor.device}, not on the processor")
+        raise ValueError(f"{what} is on {tensor.device}, not on the CPU")
     if tensor.dtype is not dtype:
-        raise ValueError(f"{what} is of type {tensor.dtype}, not {dtype}")
+        raise ValueError(f"{what} has type {tensor.dtype}, not {dtype}")
     if tensor.shape != shape:
         raise ValueError(f"{what} has shape {tuple(tensor.shape)}, not {shape}")
     if not tensor.is_contiguous():
@@ -206,7 +206,7 @@ def pointer(tensor: Tensor, what: str, shape: tuple[int, ...], dtype: torch.dtyp
 
 
 def pointers(addresses: Sequence[int | None]) -> Any:
-    """Return a C array of `addresses`, where None is the null pointer; keep it alive during the call."""
+    """Return a C array of `addresses`, with null pointers for None; keep it alive during the call."""
     return (ctypes.c_void_p * len(addresses))(*addresses)
 
 
@@ -224,13 +224,13 @@ _threads: int | None = None
 
 
 def threads() -> int:
-    """Return the number of threads that a kernel may use: the number that torch was set to."""
+    """Return the number of threads that a kernel may use: the number set in torch."""
     return torch.get_num_threads() if _threads is None else _threads
 
 
 @contextmanager
 def torch_on_one_thread(wanted: bool = True) -> Iterator[None]:
-    """Run torch's own operations on one thread, within a `with` block, and compiled kernels on as many as before.
+    """Run torch's own operations on one thread, within a `with` block; compiled kernels keep their threads.
 
     Two pools of threads that wait for work in turn slow each other down. If kernels do most of the work, this costs
     more than torch's small operations gain from threads.

@@ -1,13 +1,13 @@
 """Cache of operations' results between a pass without gradient and a later one with gradient.
 
 A sampler that marches in waves needs densities before it knows which samples it keeps. `Waves` evaluates a function
-wave by wave and records the results of the compiled operations on a tape. It then evaluates the function again, with
-gradient, for the samples that are kept. There the operations take their rows from the tapes, so that only the backward
+wave by wave and records the results of compiled operations on a tape. It then evaluates the function again, with
+gradient, for the kept samples. This time the operations take their results from the tapes, so that only the backward
 pass is computed. The function itself needs no changes.
 
-A result is reused only if the same operation was called with the same parameters on the same rows, which is checked by
-value; everything else is computed again. A function that evaluates in chunks or sorts its positions is therefore
-computed correctly, but without the saving.
+A result is reused only if the same operation was called with the same parameters on the same rows, compared by value;
+everything else is recomputed. So a function that evaluates in chunks or sorts its positions is still computed
+correctly, without the saving.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ Key = tuple[Any, ...]
 
 
 class _Value(NamedTuple):
-    """A tensor and its version when it was recorded."""
+    """A tensor and its version when recorded."""
 
     tensor: Tensor
     version: int
 
     @classmethod
     def of(cls, tensor: Tensor) -> _Value:
-        # Shares memory and version, and holds no graph. Most have none: a detach each would be felt in a short step.
+        # Shares memory and version, and holds no graph. Most have none; a detach for each would slow down short steps.
         return cls(tensor.detach() if tensor.requires_grad else tensor, tensor._version)
 
     @property
@@ -45,7 +45,7 @@ class _Value(NamedTuple):
         return self.tensor._version == self.version
 
     def is_(self, other: Tensor) -> bool:
-        """Return whether `other` is the same memory, unmodified; memory that is held here cannot be reused."""
+        """Return whether `other` is the same unmodified memory; memory held here cannot be reused."""
         tensor = self.tensor
         return tensor.data_ptr() == other.data_ptr() and tensor.shape == other.shape and self.version == other._version
 
@@ -54,7 +54,7 @@ class _Call(NamedTuple):
     """A call of an operation on one wave."""
 
     key: Key
-    """Name and settings of the operation, shapes of its inputs, and the earlier calls of which they are results."""
+    """Name and settings of the operation, shapes of its inputs, and the earlier calls whose results they are."""
     parameters: tuple[_Value, ...]
     inputs: tuple[_Value, ...]
     """The inputs that are not results of earlier calls."""
@@ -71,7 +71,7 @@ class _Call(NamedTuple):
 
 
 class _Tape:
-    """The recorded calls on one wave of `count` samples; those that return one row per sample are recorded."""
+    """The recorded calls on one wave of `count` samples; only calls that return one row per sample are recorded."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -89,7 +89,7 @@ class _Tape:
 
 
 class _Replay:
-    """Rows of the results on the tapes, in `order`, which are returned call by call."""
+    """Rows, in `order`, of the results on the tapes, returned call by call."""
 
     def __init__(self, tapes: Sequence[_Tape], order: Tensor) -> None:
         recorded = [tape.calls for tape in tapes if tape.count]
@@ -100,7 +100,7 @@ class _Replay:
         self.results: list[_Value | None] = [None] * len(self.calls)
 
     def result(self, key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
-        """Return the rows of the next recorded call that this one repeats; compute them if there is none."""
+        """Return the rows of the next recorded call that matches this one; compute them if there is none."""
         if rows[0].shape[0] == self.order.shape[0] > 0:
             sources = _sources(rows, self.results)
             for number in range(self.next, len(self.calls)):
@@ -112,7 +112,7 @@ class _Replay:
         return compute()
 
     def _take(self, number: int, inputs: Sequence[Tensor]) -> Tensor | None:
-        """Return the rows of a recorded call's result, or None if its inputs were different."""
+        """Return the rows of a recorded call's result; None if its inputs were different."""
         waves = self.calls[number]
         columns = [[call.inputs[index].tensor for call in waves] for index in range(len(inputs))]
         out, *recorded = gather_rows([[call.result.tensor for call in waves], *columns], self.order)
@@ -123,19 +123,19 @@ class _Replay:
 
 
 class _Given:
-    """Results that are known by the name of the operation, each of which is taken once."""
+    """Known results by name of the operation; each is taken once."""
 
     def __init__(self, results: dict[str, Tensor]) -> None:
         self.results = results
 
     def result(self, key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
-        """Return the result of the operation, computed if it is not known."""
+        """Return the known result of the operation, or compute it."""
         found = self.results.pop(key[0][0], None)
         return compute() if found is None else found
 
 
 def _sources(rows: Sequence[Tensor], results: Sequence[_Value | None]) -> tuple[int | None, ...]:
-    """Return, for each input, the number of the call whose result it is, or None."""
+    """Return, for each input, the index of the call whose result it is, or None."""
     return tuple(
         next((number for number, value in enumerate(results) if value is not None and value.is_(row)), None)
         for row in rows
@@ -167,7 +167,7 @@ def _used(tape: _Tape | _Replay | _Given) -> Iterator[None]:
 
 @contextmanager
 def given(**results: Tensor) -> Iterator[None]:
-    """Let operations return results that another kernel has computed, within a `with` block.
+    """Make operations return results that another kernel has computed, within a `with` block.
 
     Args:
         results: result of the first call of each operation, by its name.
@@ -179,8 +179,8 @@ def given(**results: Tensor) -> Iterator[None]:
 def result(key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compute: Compute) -> Tensor:
     """Return the result of a compiled operation, computed or taken from a recorded call.
 
-    It must be called in `forward` of the operation's `torch.autograd.Function`, whose backward pass must not depend on
-    which of the two it is.
+    Call it in `forward` of the operation's `torch.autograd.Function`; the backward pass must not depend on whether the
+    result was computed or taken.
 
     Args:
         key: name of the operation, and all settings that its result depends on.
@@ -199,10 +199,10 @@ def result(key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compu
 
 
 class Waves:
-    """Evaluation of a differentiable function of samples in waves, of which some samples are kept in the end.
+    """Evaluation of a differentiable function of samples in waves; some of the samples are kept.
 
     If gradients are disabled, or if the function calls no compiled operation with parameters, each wave is evaluated as
-    usual, and the rows of its values that are kept are returned.
+    usual, and the kept rows of its values are returned.
     """
 
     def __init__(self) -> None:
@@ -218,7 +218,7 @@ class Waves:
             function: computes the values of the wave, each with N rows.
 
         Returns:
-            the values; their gradients must not be used.
+            The values; their gradients must not be used.
         """
         if self._values or not self._follows:
             self._values.append(function())
@@ -236,12 +236,12 @@ class Waves:
         """Return the values of some samples, with gradient.
 
         Args:
-            order: (M,) int64 indices of the samples, counted through all waves, each at most once.
+            order: (M,) int64 indices of the samples, counted over all waves, each at most once.
             function: computes the values of these samples, in this order, from the same inputs as in `evaluate`. It is
                 called only if results were recorded.
 
         Returns:
-            the values, each with M rows.
+            The values, each with M rows.
         """
         if not self._tapes:
             return tuple(take_rows(joined(column), order) for column in zip(*self._values, strict=True))

@@ -30,7 +30,7 @@ class _TakeRows(torch.autograd.Function):
 
 
 def take_rows(values: Tensor, rows: Tensor) -> Tensor:
-    """Return `values[rows]`, where no row is selected twice, so that the gradient is a copy instead of a sum.
+    """Return `values[rows]` without repeated rows, so that the gradient is a copy instead of a sum.
 
     Args:
         values: (N, ...) values.
@@ -41,11 +41,11 @@ def take_rows(values: Tensor, rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def gather_rows(columns: Sequence[Sequence[Tensor]], order: Tensor) -> list[Tensor]:
-    """Return rows of several tensors that are given in parts, without concatenating the parts first.
+    """Return rows of several tensors given in parts, without concatenating the parts first.
 
     Args:
         columns: the P parts (N_p, ...) of each tensor; the lengths N_p are the same for all tensors.
-        order: (M,) int64 indices of rows, counted through all parts.
+        order: (M,) int64 indices of rows, counted over all parts.
 
     Returns:
         (M, ...) rows of each tensor, without gradient.

@@ -1,4 +1,4 @@
-"""The C++ sources that a library of kernels was built from, as a number.
+"""Fingerprint of the C++ sources of a library of kernels.
 
 setup.py writes it into each library, and native.py compares it with that of the sources beside the library.
 """

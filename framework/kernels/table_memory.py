@@ -1,4 +1,4 @@
-"""Memory of large tables that are read at random."""
+"""Memory for large tables with random access."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def require(size: float, what: str) -> None:
     """Check that the machine has enough memory, before the system would end the process.
 
     Args:
-        size: number of bytes that are needed.
-        what: name of what needs them, such as "a table", for the error.
+        size: number of bytes needed.
+        what: name of what needs the memory, such as "a table", for the error.
 
     Raises:
         ConfigError: if the machine has less memory.
@@ -37,7 +37,7 @@ def require(size: float, what: str) -> None:
     available = machine_memory()
     if size > available:
         raise ConfigError(
-            f"these settings take {size / 2**30:,.1f} GiB for {what}; this machine has {available / 2**30:,.1f} GiB"
+            f"these settings need {size / 2**30:,.1f} GiB for {what}; this machine has {available / 2**30:,.1f} GiB"
         )
 
 
@@ -48,7 +48,7 @@ def table(*shape: int, like: Tensor | None = None) -> Tensor:
 
     Args:
         shape: shape of the result.
-        like: tensor whose device and type the result has; None for the defaults.
+        like: tensor that determines device and type; None for the defaults.
 
     Raises:
         ConfigError: if the machine has less memory.

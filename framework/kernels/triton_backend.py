@@ -4,7 +4,7 @@ They are in files NAME_triton.py beside their references. Triton comes with PyTo
 kernel when it first runs. These files are imported only then, so they cost a user of the CPU nothing.
 
 With `TRITON_INTERPRET=1` in the environment, Triton's interpreter runs the kernels on the CPU instead, for tests. There
-the C++ kernels come first, unless `NERFLOOM_KERNELS=triton` leaves them out. `NERFLOOM_KERNELS=reference` leaves out
+the C++ kernels take precedence, unless `NERFLOOM_KERNELS=triton` excludes them. `NERFLOOM_KERNELS=reference` excludes
 both.
 """
 
@@ -22,9 +22,9 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-"""True if Triton's interpreter runs the kernels, on the CPU. Triton reads the variable when it is imported."""
+"""True if Triton's interpreter runs the kernels on the CPU. Triton reads the variable when it is imported."""
 LEAST_CAPABILITY = (8, 0)
-"""Compute capability from which Triton supports NVIDIA's GPUs."""
+"""Minimum compute capability of NVIDIA's GPUs for Triton."""
 
 
 @functools.cache
@@ -32,7 +32,7 @@ def available() -> bool:
     """Return whether these kernels are used.
 
     Raises:
-        ConfigError: if NERFLOOM_KERNELS asks for them and they cannot run.
+        ConfigError: if NERFLOOM_KERNELS selects them and they cannot run.
     """
     asked = os.environ.get("NERFLOOM_KERNELS")
     if asked == "reference":
@@ -56,7 +56,7 @@ def _problem() -> str | None:
     if INTERPRETED:
         return None
     if not torch.cuda.is_available():
-        return "this machine has no GPU that this PyTorch can use; TRITON_INTERPRET=1 runs them on the processor"
+        return "this machine has no GPU usable by this PyTorch; TRITON_INTERPRET=1 runs the kernels on the CPU"
     capability = torch.cuda.get_device_capability()
     if torch.version.hip is None and capability < LEAST_CAPABILITY:
         return f"Triton needs a GPU of compute capability {'.'.join(map(str, LEAST_CAPABILITY))} or more, not " + (
@@ -66,7 +66,7 @@ def _problem() -> str | None:
 
 
 def later(file: str, name: str) -> Callable[..., Any]:
-    """Return a function that imports another and calls it.
+    """Return a function that imports another function and calls it.
 
     Args:
         file: name of a module in `nerfloom.kernels`, with that of its family.

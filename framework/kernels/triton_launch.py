@@ -1,8 +1,8 @@
-"""The start of kernels, and functions for them: optical depth, and an exponential that does not cancel.
+"""Launch of kernels, and shared functions: optical depth, and an exponential without cancellation.
 
-Sizes are passed as numbers, not as constants of the kernel, and Triton is told not to compile for special values of
-them: a kernel is compiled once, whatever the number of rays or samples. Constants are those of a method, such as the
-number of features, and the sizes of blocks.
+Sizes are passed as numbers, not as constants of the kernel, and Triton is told not to specialise on their values. So a
+kernel is compiled once, whatever the number of rays or samples. Constants are those of a method, such as the number of
+features, and block sizes.
 """
 
 # Triton gives the kernels' arguments their types.
@@ -22,7 +22,7 @@ MAX_FLOAT = tl.constexpr(3.4028234663852886e38)
 
 
 def launch(kernel: Any, programs: tuple[int, ...], first: Tensor, *arguments: Any, **constants: Any) -> None:
-    """Start a kernel on the device of its first argument; not at all if there is nothing to do.
+    """Launch a kernel on the device of its first argument; does nothing if there is no work.
 
     Args:
         kernel: the kernel.
@@ -38,7 +38,7 @@ def launch(kernel: Any, programs: tuple[int, ...], first: Tensor, *arguments: An
 
 
 def on_device(value: float | Tensor, like: Tensor) -> Tensor:
-    """Return a number that changes from step to step as a kernel reads it, () float32, without a wait for the device.
+    """Return a number that changes from step to step as kernels read it, () float32, without a wait for the device.
 
     Args:
         value: the number, or a tensor () that holds it.
@@ -61,7 +61,7 @@ def opacity_of(tau):
     Args:
         tau: optical depths.
     """
-    # Below 1/2 by the series, because subtracting from 1 would leave nothing of tau below 6e-8.
+    # Below 1/2 by the series, because subtracting from 1 would lose all of tau below 6e-8.
     series = 1 - tau * (1 / 9)
     series = 1 - tau * (1 / 8) * series
     series = 1 - tau * (1 / 7) * series
@@ -75,7 +75,7 @@ def opacity_of(tau):
 
 @triton.jit
 def optical_depth(sigma, delta):
-    """Return the optical depth of intervals, as `nerfloom.kernels.compositing.density.optical_depth`.
+    """Return the optical depth of intervals, as in `nerfloom.kernels.compositing.density.optical_depth`.
 
     Args:
         sigma: densities.
@@ -90,7 +90,7 @@ def optical_depth(sigma, delta):
 
 @triton.jit
 def depth_slope(sigma, delta):
-    """Return the derivative of the optical depth by the density: 0 where it is cut off, and in an endless interval.
+    """Return the derivative of the optical depth by the density: 0 if it is clamped, and for infinite intervals.
 
     Args:
         sigma: densities.

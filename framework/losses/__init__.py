@@ -1,1 +1,1 @@
-"""Objectives: the terms that a method lists, and the functions of tensors that they are made of."""
+"""Loss terms for a method's objective, and the functions of tensors that they use."""

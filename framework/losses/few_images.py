@@ -1,8 +1,8 @@
-"""Settings of ray methods that replace images where there are few, and the decision when to use them.
+"""Settings of ray methods for scenes with few images, and the decision when to use them.
 
-Three parts, each with a setting of its own: levels of the encoding open from coarse to fine (FreeNeRF, Yang et al.
-2023), views between the training cameras show smooth depth (RegNeRF, Niemeyer et al. 2022), and space right before
-cameras is kept empty (FreeNeRF).
+There are three regularisers, each with its own setting. Levels of the encoding open from coarse to fine (FreeNeRF, Yang
+et al. 2023), views between the training cameras should have smooth depth (RegNeRF, Niemeyer et al. 2022), and space
+right before cameras should be empty (FreeNeRF).
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.data.scene import Scene
 
 FEW, FEW_WITH_ALPHA = 12, 8
-"""Number of training images up to which there are few: of a capture, and of images whose alpha shows what is empty."""
+"""Maximum number of training images that counts as few: in captures, and in images whose alpha marks empty space."""
 OCCLUSION = 0.01
 """Weight of the optical depth near cameras, as in FreeNeRF's settings."""
 UNSEEN_START, UNSEEN_STEPS = 10.0, 512
-"""Factor of the weight of unseen views at the first step, and the number of steps in which it falls to 1."""
+"""Factor of the weight of unseen views at the first step, and the number of steps over which it falls to 1."""
 
 
 @dataclass(frozen=True)
 class FewImagesConfig(RayConfig):
-    """Settings of a method that is regularised where there are few images."""
+    """Settings of a method that is regularised if there are few images."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "open_levels_until": (0, 1),
@@ -36,47 +36,47 @@ class FewImagesConfig(RayConfig):
     }
     """Allowed ranges."""
     few_images: Auto[bool] = AUTO
-    """Whether there are few images, by which the settings below that are not given are chosen. If not given: up to 12
-    training images of a still scene, or 8 with an alpha channel."""
+    """Whether to use the defaults for few images in the settings below. auto: with up to 12 training images of a static
+    scene, or 8 with an alpha channel."""
     open_levels_until: Auto[float] = AUTO
-    """Share of the budget in which the levels of the encoding open, from coarse to fine; 0 if all are open at once. If
-    not given: 0.5 with few images for vanilla-nerf, else 0."""
+    """Fraction of the budget in which the levels of the encoding open, from coarse to fine; 0 opens all at once. auto:
+    0.5 with few images for vanilla-nerf, otherwise 0."""
     unseen_loss_mult: float = 0.0
-    """Weight of the roughness of depth in views between the training cameras, such as 0.1; 0 for no such views."""
+    """Weight of the roughness of depth in views between the training cameras, such as 0.1; 0 disables such views."""
     unseen_patches: int = 8
-    """Number of patches of 8 x 8 rays through such views in each step."""
+    """Number of patches of 8 x 8 rays in such views per step."""
     occlusion_loss_mult: Auto[float] = AUTO
-    """Weight of the optical depth right before cameras. If not given: 0.01 with few images without alpha."""
+    """Weight of the optical depth right before cameras. auto: 0.01 with few images without alpha, otherwise 0."""
     occlusion_range: float = 1.2
-    """Distance up to which that is, in units of the distance at which the scene starts."""
+    """Length of rays that should be empty, relative to the distance at which the scene starts."""
 
 
 ConfigT = TypeVar("ConfigT", bound=FewImagesConfig)
 
 
 def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) -> tuple[ConfigT, list[Decision]]:
-    """Decide which regularisers for few images are used.
+    """Decide which regularisers for few images to use.
 
     Args:
-        config: the method's settings; those left open are filled in.
+        config: the method's settings; open ones are filled in.
         scene: properties of the scene.
-        open_until: share of the budget in which the levels of the method's encoding open if there are few images.
+        open_until: fraction of the budget in which the method's encoding opens its levels if there are few images.
 
     Returns:
-        the settings, and the decisions that were made; none where there are many images.
+        The settings, and the decisions made; no decisions if there are many images.
 
     Raises:
-        ConfigError: if unseen views are asked for in normalised device coordinates.
+        ConfigError: if unseen views are selected with normalised device coordinates.
     """
     if config.unseen_loss_mult and scene.warped:
-        raise ConfigError("--unseen-loss-mult: unseen views have no rays in normalised device coordinates")
+        raise ConfigError("--unseen-loss-mult: unseen views do not work in normalised device coordinates")
     choices = (
         Choice("open_levels_until", open_until, "few images are explained by coarse shapes first"),
-        Choice("occlusion_loss_mult", OCCLUSION * (not scene.has_alpha), "nothing is right before a camera"),
+        Choice("occlusion_loss_mult", OCCLUSION * (not scene.has_alpha), "space right before a camera is empty"),
     )
     count, most = scene.num_cameras, FEW_WITH_ALPHA if scene.has_alpha else FEW
     few = count <= most and not scene.moving and any(choice.value for choice in choices)
-    reason = f"there are {count} training images, of which few contradict what fits them (else: --few-images False)"
+    reason = f"there are {count} training images, too few to rule out wrong geometry (else: --few-images False)"
     config, made = fill(config, Choice("few_images", few, reason, "regularisers for few images"))
     if not config.few_images:
         return fill(config, *(replace(choice, value=0.0) for choice in choices))[0], []
@@ -85,7 +85,7 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
 
 
 def unseen_weight(config: FewImagesConfig, step: int) -> float:
-    """Return the weight of unseen views in a step, which falls linearly at first, as in RegNeRF.
+    """Return the weight of unseen views in a step; it falls linearly at first, as in RegNeRF.
 
     Args:
         config: the settings, decided.

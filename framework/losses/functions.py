@@ -12,11 +12,11 @@ from nerfloom.kernels.compositing.density import distortion, ray_sum
 from nerfloom.kernels.histograms.spacing import to_disparity
 
 WIDTH = 3.0
-"""Standard deviations from a known distance within which a ray is to end."""
+"""A ray should end within this many standard deviations of a known distance."""
 WRONG = 0.01
-"""Share of a reconstruction's points that are taken to be wrong."""
+"""Assumed fraction of wrong points in a reconstruction."""
 SMALLEST_DEPTH, SMALLEST_OPACITY = 1e-6, 1e-6
-"""Depth and opacity below which inverse depths are not divided any further."""
+"""Minimum depth and opacity in divisions for inverse depths."""
 
 
 def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -36,13 +36,14 @@ def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | Non
 def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = None, scale: float = 1e-3) -> Tensor:
     """Return the mean () of weight * sqrt((prediction - target)^2 + scale^2) over all elements; 0 for empty input.
 
-    mip-NeRF 360 (Barron et al. 2022), section 5: a smooth absolute error, to which outliers count less than squared.
+    mip-NeRF 360 (Barron et al. 2022), section 5: a smooth absolute error, less sensitive to outliers than a squared
+    one.
 
     Args:
         prediction: (R, C) predicted values.
         target: (R, C) true values.
         weights: (R,) factor of each row; None for 1.
-        scale: difference below which the error is square rather than absolute.
+        scale: difference below which the error is quadratic rather than absolute.
     """
     if prediction.numel() == 0:
         return prediction.sum()
@@ -51,13 +52,13 @@ def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = Non
 
 
 def opacity_of_transparent(accumulation: Tensor, alpha: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the mean () over pixels of the rendered opacity where it is known to be 0; 0 for no pixels.
+    """Return the mean () over pixels of the rendered opacity where it should be 0; 0 for no pixels.
 
-    Unlike that of a squared error, its gradient does not fade with the opacity, so that thin fog goes too.
+    The gradient does not vanish with the opacity, as that of a squared error would, so thin fog is removed too.
 
     Args:
         accumulation: (P,) rendered opacity.
-        alpha: (P,) opacity of the images' pixels; only where it is 0, which leaves no doubt, pixels count.
+        alpha: (P,) opacity of the images' pixels; only pixels with exactly 0 count.
         weights: (P,) factor of each pixel; None for 1.
     """
     if accumulation.numel() == 0:
@@ -72,43 +73,43 @@ def normalised_distortion(weights: Tensor, samples: Samples, scale: float | None
     Args:
         weights: (N,) weights of the samples of R rays.
         samples: N samples, with their edges in normalised distance, as a `ProposalSampler` returns them.
-        scale: for samples without such edges, the distance up to which normalised distance is half of the distance in
-            this unit; it is disparity beyond (`to_disparity`).
+        scale: length unit for samples without such edges: normalised distance is half the distance up to this length,
+            and disparity beyond (`to_disparity`).
 
     Raises:
-        ValueError: if the samples have no such edges, and there is no scale.
+        ValueError: if the samples have no such edges and `scale` is None.
     """
     if samples.edges is not None:
         return distortion(weights, Samples.regular(samples.edges[:, :-1], samples.edges[:, 1:])).mean()
     if scale is None:
-        raise ValueError("these samples have no edges in normalised distance: the sampler is no ProposalSampler")
+        raise ValueError("these samples have no edges in normalised distance: use a ProposalSampler or give a scale")
     starts, ends = (to_disparity(t / scale) for t in (samples.t_starts, samples.t_ends))
     return distortion(weights, replace(samples, t_starts=starts, t_ends=ends)).mean()
 
 
 def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
-    """Return the relative error () of the depth of rays: the mean over rays of sum_i w_i min(|t_i - d| / d, 1).
+    """Return the mean relative depth error () of rays, each sum_i w_i min(|t_i - d| / d, 1).
 
     Unlike the error of the expected depth, it is small only if all weight is at the known depth.
 
     Args:
         weights: (N,) weights of the samples of R rays.
         samples: N samples.
-        known: (R,) known distances d along the rays, scene units; 0 if unknown, in which case the ray is left out.
+        known: (R,) known distances d along the rays, scene units; 0 if unknown, for rays without an error.
     """
     has_depth = known > 0
     depths = torch.where(has_depth, known, torch.ones_like(known))[samples.ray_indices]
-    # Without the bound, far samples, which are sparse where distances are in disparity, would dominate the mean.
+    # Without the bound, far samples, which are sparse when spaced in disparity, would dominate the mean.
     apart = ((samples.t - depths).abs() / depths).clamp(max=1)
-    # Not of `[has_depth]`, for whose size the device would be waited for.
+    # Not indexed by `[has_depth]`: its size would have to be read from the device.
     return (ray_sum(weights * apart, samples) * has_depth).sum() / has_depth.sum().clamp(min=1)
 
 
 def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
-    """Return the mean optical depth () before distances up to which rays should meet nothing; 0 without rays.
+    """Return the mean optical depth () up to distances before which rays should be empty; 0 without rays.
 
-    With B the light that is stopped before, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`. It is the optical
-    depth, but bounded, so that a wall that all images show stays.
+    With B the fraction of light stopped before that distance, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`.
+    This is the optical depth with an upper bound, so that a wall seen in all images remains.
 
     Args:
         weights: (N,) weights of the samples of R rays.
@@ -121,23 +122,23 @@ def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
 
 
 def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviations: Tensor) -> Tensor:
-    """Return the mean negative log-likelihood () of what rays show being at distances that points are known to have.
+    """Return the mean negative log-likelihood () of rays ending at known distances of points.
 
-    With B the light that is stopped before the point, and H the light that is stopped at it, a ray's term is
+    With B the light stopped before the point, and H the light stopped at it, a ray's term is
 
         -log((H + e (1 - B) + e^2) / (1 + e + e^2)),     e = `WRONG`
 
-    The first summand is DS-NeRF's (Deng et al. 2022): a ray ends at its point, so the term is the optical depth before
-    the point, whose gradient does not vanish behind dense fog, and what is missing at the point. The others are for
-    points that are wrong: in one of 1 / e the surface is somewhere behind, and the space before is still empty; in one
-    of 1 / e^2, nothing is known. "At the point" are all intervals that are within `WIDTH` standard deviations of it, in
-    whole, so that no sample is asked to be narrower than the sampler makes it (as in urban radiance fields, Rematas et
-    al. 2022, whose window shrinks by a schedule).
+    The first summand is DS-NeRF's (Deng et al. 2022): a ray ends at its point. Its term is the optical depth before the
+    point, with a gradient that does not vanish behind dense fog, plus the light missing at the point. The other
+    summands allow for wrong points: with probability e the surface is somewhere behind and the space before is still
+    empty; with probability e^2 nothing is known. "At the point" means all intervals that overlap `WIDTH` standard
+    deviations around it, counted in full, so that no sample has to be narrower than the sampler makes it (Rematas et
+    al. 2022, Urban Radiance Fields, shrink the window by a schedule instead).
 
     Args:
         weights: (N,) weights of the samples of R rays.
         samples: N samples.
-        known: (R,) known distances along the rays, scene units; 0 if unknown, in which case the ray is left out.
+        known: (R,) known distances along the rays, scene units; 0 if unknown, for rays without a term.
         deviations: (R,) their standard deviations.
     """
     has_point = known > 0
@@ -151,7 +152,7 @@ def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviat
 
 
 def mean_depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) -> Tensor:
-    """Return the relative error () of the mean distance of what pixels show, at most 1 each, where it is known.
+    """Return the mean relative error () of rendered distances of pixels, at most 1 each, where they are known.
 
     Args:
         distances: (H, W) sums of weight times distance.
@@ -166,14 +167,14 @@ def mean_depth_error(distances: Tensor, transmittance: Tensor, known: Tensor) ->
 
 
 def density_before(samples: Samples, distance: float) -> Tensor:
-    """Return the mean optical depth () of rays up to a distance from the camera: the loss of FreeNeRF, equation 6.
+    """Return the mean optical depth () of rays up to a distance from the camera: FreeNeRF, equation 6.
 
-    Yang et al. 2023 add up the densities of the first samples, whose intervals have equal lengths there. A camera sees
-    matter right before it alone, so that images do not contradict it where there are few.
+    Yang et al. 2023 add up the densities of the first samples, which have equal lengths there. Matter right before a
+    camera is seen by that camera alone, so few images do not contradict it.
 
     Args:
         samples: N samples of R rays, with density.
-        distance: length of ray, scene units, that should be empty.
+        distance: length of the ray, scene units, that should be empty.
 
     Raises:
         ValueError: if the samples have no density.
@@ -185,15 +186,15 @@ def density_before(samples: Samples, distance: float) -> Tensor:
 
 
 def depth_roughness(weights: Tensor, samples: Samples, side: int) -> Tensor:
-    """Return how rough the depth of square patches of rays is, after RegNeRF (Niemeyer et al. 2022), equation 8.
+    """Return the roughness of the depth of square patches of rays, after RegNeRF (Niemeyer et al. 2022), equation 8.
 
-    It is the mean squared difference between neighbours. That of RegNeRF is of the depth; here it is of the inverse
-    depth, which is linear in the image of a plane, relative to its mean in the patch. Neighbours count as far as both
-    are opaque.
+    It is the mean squared difference between neighbours. RegNeRF uses the depth. This function uses the inverse depth,
+    which is linear in the image of a plane, relative to its mean in the patch. Neighbours are weighted by the opacity
+    of both.
 
     Args:
         weights: (N,) weights of the samples.
-        samples: N samples of P side^2 rays, those of a patch one after the other, row by row.
+        samples: N samples of P side^2 rays, patch by patch, row by row.
         side: rays along an edge of a patch.
     """
     opacity = ray_sum(weights, samples)

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RenderedBatch:
-    """A batch, and what a model shows of it."""
+    """A batch and its rendering."""
 
     batch: PixelBatch
-    """P pixels with what is known of them."""
+    """P pixels with their known values."""
     rendered: Rendered
     """The rays of the pixels, `batch.rays_per_pixel` for each."""
     model: RayModel[Any]
-    """The model that learns."""
+    """The model in training."""
     step: int
     """Number of training steps done."""
 
@@ -56,24 +56,24 @@ class LossTerm(ABC):
         return float(getattr(config, self.weight)) if isinstance(self.weight, str) else self.weight
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
-        """Return whether the term says anything on a batch, before the batch is rendered; True by default.
+        """Return whether the term applies to a batch, before the batch is rendered; True by default.
 
         Args:
-            batch: pixels with what is known of them.
-            model: the model that learns.
+            batch: pixels with their known values.
+            model: the model in training.
         """
         return True
 
     @abstractmethod
     def __call__(self, shown: RenderedBatch) -> Tensor | dict[str, Tensor] | None:
-        """Return the value () of the term before its factor, or several by name; None if the rays do not say.
+        """Return the value () of the term before its factor, or several by name; None if it does not apply.
 
         Args:
-            shown: the batch as the model renders it, and the model.
+            shown: the batch, its rendering and the model.
         """
 
     def varies(self, config: Any) -> str | None:
-        """Return why a training step with this term cannot be recorded and repeated; None if it can.
+        """Return why a training step with this term cannot be captured and repeated; None if it can.
 
         Args:
             config: the method's settings, decided.

@@ -1,4 +1,4 @@
-"""Terms that methods share. Each says in one place what it is called, which setting weighs it, and what it needs."""
+"""Terms shared by methods. Each states its name, the setting that weighs it, and its inputs."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 PATCH = 8
 """Rays along the edge of a patch of an unseen view, as in RegNeRF (Niemeyer et al. 2022)."""
 PATCH_IMAGE = 500
-"""Longer side of an image, pixels, up to which neighbouring rays of a patch are a pixel apart. In a larger image they
-are as far apart in relation to it."""
+"""Rays of a patch are one pixel apart in images up to this longer side, pixels; in larger images their distance grows
+in proportion."""
 
 
 class ColorError(LossTerm):
@@ -54,13 +54,13 @@ class ColorError(LossTerm):
 
         Args:
             rgb: (P, 3) rendered colours.
-            shown: the batch as the model renders it, with the true colours and the weights of the pixels.
+            shown: the rendered batch, with true colours and pixel weights.
         """
         return mean_squared_error(rgb, shown.batch.rgb, shown.batch.weights)
 
 
 class CoarseColorError(ColorError):
-    """Error of the colours of a coarse level, where the sampler has one.
+    """Error of the colours of a coarse level, for samplers that have one.
 
     Args:
         weight: factor of the term, or the name of the setting that holds it.
@@ -78,7 +78,7 @@ class CoarseColorError(ColorError):
 
 
 COLOR_ERROR = ColorError()
-"""The term that compiled steps know. An objective of this term alone can be learnt from in one native call."""
+"""The term supported by compiled steps. An objective of this term alone can be trained in one native call."""
 
 
 class SamplerLoss(LossTerm):
@@ -103,8 +103,8 @@ class Distortion(LossTerm):
     """Spread of the weights along rays, in normalised distance: mip-NeRF 360 (Barron et al. 2022), equation 15.
 
     Args:
-        of_marched: whether samples that an occupancy grid chose have a distortion where space is contracted, in
-            disparity beyond half of the box's edge.
+        of_marched: whether samples of an occupancy grid have a distortion in contracted scenes, in disparity beyond
+            half the box's edge.
     """
 
     def __init__(self, of_marched: bool = True) -> None:
@@ -123,10 +123,10 @@ class Distortion(LossTerm):
 
 
 class DepthError(LossTerm):
-    """Error of distances that depth images or points of a reconstruction tell.
+    """Error of the distances in depth images or of a reconstruction's points.
 
     Args:
-        coarse: whether the coarse level is compared, where the sampler has one.
+        coarse: whether to compare the coarse level, for samplers that have one.
     """
 
     def __init__(self, coarse: bool = False) -> None:
@@ -167,7 +167,7 @@ class FreeSpace(LossTerm):
 
 
 KNOWN_DISTANCES = DepthError(), DepthError(coarse=True), FreeSpace()
-"""Terms of methods that learn from distances."""
+"""Terms of methods that learn from known distances."""
 
 
 class MatterNearCameras(LossTerm):
@@ -209,11 +209,11 @@ class UnseenRoughness(LossTerm):
 
 
 FEW_IMAGES = MatterNearCameras(), UnseenRoughness()
-"""Terms of methods with the settings `FewImagesConfig`."""
+"""Terms of methods whose settings include `FewImagesConfig`."""
 
 
 class TransparentOpacity(LossTerm):
-    """Opacity of pixels whose alpha says that they are empty at the time of their image."""
+    """Opacity of pixels whose alpha marks them as empty at the time of their image."""
 
     def __init__(self) -> None:
         super().__init__("empty", "empty_loss_mult")

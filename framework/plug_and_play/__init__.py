@@ -1,1 +1,1 @@
-"""Sampling, skipping and rendering as functions, for a radiance field and a training loop of one's own."""
+"""Sampling, skipping and rendering as functions, for a user's own radiance field and training loop."""

@@ -1,7 +1,7 @@
-"""Calls of user-defined functions of positions, with checks of the rays and of the tensors that they return.
+"""Calls of user-defined functions of positions, with checks of the rays and of the returned tensors.
 
-A function is called with the positions, followed by the times if the rays have times. Other inputs (camera indices,
-lengths of intervals) it can take from the samples in its enclosing scope.
+A function is called with positions, and with times if the rays have times. It can take other inputs (camera indices,
+interval lengths) from the samples in its enclosing scope.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ RgbFunction = Callable[..., tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Mappin
 """Function (positions (N, 3), unit directions (N, 3)[, times (N,)]) -> rgb (N, 3), sigma or alpha (N,)[, further
 properties by name, each (N, ...)]."""
 UNIT = 1e-3
-"""Maximum difference of the length of a direction from 1."""
+"""Maximum deviation of the length of a direction from 1."""
 
 
 class DensityOnly(Field):
-    """A field of density without colour, from a user-defined function, for samplers, which evaluate density only.
+    """A field of density without colour, from a user-defined function, for samplers, which need density only.
 
     Args:
         sigma_fn: a `SigmaFunction`; None for a field that is empty everywhere.
@@ -48,14 +48,14 @@ class DensityOnly(Field):
 
 
 def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
-    """Wrap a user-defined function in the form in which samplers call it, with empty features beside the density.
+    """Wrap a user-defined function for samplers, with empty features beside the density.
 
     Args:
         sigma_fn: a `SigmaFunction`.
 
     Returns:
-        a function whose density is float64 if that of `sigma_fn` is, and float32 otherwise. It raises ValueError if
-        `sigma_fn` returns another shape than (N,).
+        A function whose density is float64 if that of `sigma_fn` is, and float32 otherwise. It raises ValueError if
+        `sigma_fn` returns a shape other than (N,).
     """
 
     def density(points: Points) -> tuple[Tensor, Tensor]:
@@ -75,7 +75,7 @@ def evaluate(
     Args:
         function: an `RgbFunction`.
         what: name of the second value that it returns, for errors: "sigma" or "alpha".
-        rays: R rays. Gradients of the positions reach the rays, with t held fixed.
+        rays: R rays. Gradients of the positions flow to the rays, with t held fixed.
         samples: N samples along the rays.
 
     Returns:
@@ -97,17 +97,17 @@ def evaluate(
 
 
 def check_shape(values: Any, shape: tuple[int, ...], what: str) -> None:
-    """Check that a function has returned a tensor of the required shape.
+    """Check that a function returned a tensor of the required shape.
 
     A density of shape (N, 1) instead of (N,) would otherwise be broadcast to one value for each pair of samples.
 
     Args:
         values: the returned value.
         shape: the required shape.
-        what: name of the function and the value, for the error, such as "sigma_fn returned density".
+        what: name of the function and the value for the error, such as "sigma_fn returned density".
 
     Raises:
-        ValueError: if the value is no tensor, or has another shape.
+        ValueError: if the value is not a tensor or has another shape.
     """
     actual = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
     if actual != shape:
@@ -116,7 +116,7 @@ def check_shape(values: Any, shape: tuple[int, ...], what: str) -> None:
 
 
 def check_rays(rays: Rays) -> None:
-    """Check that the origins and directions of `rays` are (R, 3), and the directions of length 1.
+    """Check that the origins and directions of `rays` are (R, 3) and the directions have length 1.
 
     Lengths are checked on the CPU only, because on other devices the check would wait for the device.
 
@@ -126,7 +126,7 @@ def check_rays(rays: Rays) -> None:
     for name in ("origins", "directions"):
         shape = tuple(getattr(rays, name).shape)
         if len(shape) != 2 or shape[1] != 3 or shape[0] != len(rays):
-            raise ValueError(f"the rays' {name} have shape {shape}; they must be (R, 3), as of tensor.reshape(-1, 3)")
+            raise ValueError(f"the rays' {name} have shape {shape}; they must be (R, 3): use tensor.reshape(-1, 3)")
     if rays.directions.device.type != "cpu" or not len(rays):
         return
     lengths = torch.linalg.vector_norm(rays.directions.detach(), dim=-1)
@@ -134,7 +134,7 @@ def check_rays(rays: Rays) -> None:
     length = lengths[worst].item()
     if abs(length - 1) > UNIT:
         raise ValueError(
-            f"the direction of ray {worst} has length {length:.4g}; it must be 1, so that t is a distance: "
+            f"the direction of ray {worst} has length {length:.4g}; it must be 1, so that t is a distance: use "
             "torch.nn.functional.normalize(directions, dim=-1)"
         )
 

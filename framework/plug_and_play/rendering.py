@@ -43,7 +43,8 @@ def render(
 ) -> Rendering:
     """Evaluate a field at samples and composite its values: NeRF (Mildenhall et al. 2020), equation 3.
 
-    Gradients reach the parameters of the function, and the rays through positions and directions, with t held fixed.
+    Gradients flow to the parameters of the function, and to the rays through positions and directions, with t held
+    fixed.
 
     Args:
         rays: R rays.
@@ -56,7 +57,7 @@ def render(
             of sigma (NeuS, Wang et al. 2021).
 
     Raises:
-        ValueError: if neither or both functions are given, if the samples are of another number of rays, or if the
+        ValueError: if neither or both functions are given, if the samples belong to another number of rays, or if the
             function returns other shapes.
     """
     check_rays(rays)

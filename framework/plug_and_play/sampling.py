@@ -50,7 +50,7 @@ def sample_uniform(rays: Rays, count: int, *, jitter: bool = False) -> Samples:
 
 
 def sample_inverse_cdf(rays: Rays, samples: Samples, weights: Tensor, count: int, *, jitter: bool = False) -> Samples:
-    """Return samples with further ones that are drawn from their weights: NeRF, section 5.2.
+    """Return the samples and further samples drawn from their weights: NeRF, section 5.2.
 
     The intervals of the result end halfway between neighbouring samples, and cover the ray from near to far.
 
@@ -87,27 +87,28 @@ def sample_proposals(
     scale: float | None = None,
     power: float = 1.0,
 ) -> Samples:
-    """Return samples that are drawn from the weights of proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
+    """Return samples drawn from the weights of proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
 
     If gradients are enabled, the proposals' weights are attached to the result. To train the proposals, add
     `interlevel_loss(samples, weights)` to the loss, with the weights of the rendered samples.
 
     Args:
         rays: R rays with near and far ends; with a `scale`, far may be infinite. Samples have no gradient for rays.
-        sigma_fns: density of each level but the last: (positions (N, 3)) -> sigma (N,); if the rays have times, it is
-            called as (positions, times (N,)).
-        counts: intervals per ray of each level, followed by the number of samples per ray: one more than functions.
+        sigma_fns: density of each proposal level: (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma
+            (N,) if the rays have times.
+        counts: intervals per ray of each level, followed by the number of samples per ray: one count more than
+            functions.
         jitter: True for random positions (training), False for fixed ones.
-        scale: distance up to which samples are drawn linearly in distance, and beyond which linearly in disparity, for
-            an unbounded scene; None for linearly throughout.
-        power: exponent of the weights that are drawn from; increase it from 0 to 1 in the first training steps.
+        scale: for an unbounded scene, samples are spaced linearly in distance up to this distance, and linearly in
+            disparity beyond; None for linear spacing throughout.
+        power: exponent of the weights before drawing; increase it from 0 to 1 in the first training steps.
 
     Raises:
         ValueError: if the number of counts does not fit the functions, or a far end is infinite without a `scale`.
     """
     check_rays(rays)
     if len(counts) != len(sigma_fns) + 1:
-        raise ValueError(f"{len(counts)} counts for {len(sigma_fns)} proposals: one more is needed")
+        raise ValueError(f"{len(counts)} counts for {len(sigma_fns)} proposals: give one count more than proposals")
     if scale is None:
         _check_ends(rays)
     densities = [as_density(sigma_fn) for sigma_fn in sigma_fns]
@@ -116,6 +117,6 @@ def sample_proposals(
 
 
 def _check_ends(rays: Rays) -> None:
-    """Check that no far end is infinite, which is the default of `Rays`."""
+    """Check that every far end is finite; by default `Rays` have infinite far ends."""
     if bool(rays.fars.isinf().any()):
         raise ValueError("a ray has an infinite far end: give Rays its fars, or nerfloom.clip_to_box(rays, box)")

@@ -13,26 +13,25 @@ from nerfloom.plug_and_play.functions import DensityOnly, SigmaFunction, as_dens
 from nerfloom.samplers.occupancy import OccupancySampler
 
 FILL_STEPS = 1025
-"""Number of steps that `OccupancyGrid.fill` makes: those that visit all cells, and three times as many in which cells
-near occupied ones are evaluated."""
+"""Number of steps of `OccupancyGrid.fill`: enough to visit all cells, then three times as many to evaluate cells near
+occupied ones."""
 
 
 class OccupancyGrid(nn.Module):
     """The occupied cells of a box: Instant-NGP (Mueller et al. 2022), appendix E.2.
 
     The state is in buffers, without parameters: as a part of a model it is saved with the model and moves to its
-    device. A cell is occupied until its density has been evaluated.
+    device. A cell counts as occupied until its density has been evaluated.
 
     Args:
-        box: (2, 3) minimum and maximum corner, a tensor or two lists; the grid is on the device of the tensor.
+        box: (2, 3) minimum and maximum corner, a tensor or two lists; the grid is on the tensor's device.
         resolution: cells along each axis, at most 512.
         num_steps: steps along the diagonal of the box, which determine `step_size`.
-        alpha_threshold: a cell is occupied if the opacity of one step through it is at least this, or at least the mean
-            over the grid if that is less.
-        cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
-            steps throughout.
-        moving: whether the scene changes with time, so that its functions take times. A cell is then occupied if it is
-            at any time.
+        alpha_threshold: a cell is occupied if the opacity of one step through it reaches this threshold or the mean
+            over the grid, whichever is less.
+        cone: growth of the step per unit of distance, once this exceeds the even step; 0 for even steps throughout.
+        moving: whether the scene changes with time, so that its functions take times. A cell then counts as occupied if
+            it is so at any time.
 
     Raises:
         ConfigError: if there are too many cells, or no steps.
@@ -52,7 +51,7 @@ class OccupancyGrid(nn.Module):
         super().__init__()
         corners = torch.as_tensor(box, dtype=torch.float32)
         if corners.shape != (2, 3) or not bool((corners[1] > corners[0]).all()):
-            raise ValueError(f"a box is its smallest corner and its largest, with no side of 0: not {corners.tolist()}")
+            raise ValueError(f"a box is a minimum and a maximum corner, with positive sides, not {corners.tolist()}")
         self.marcher = OccupancySampler(
             corners.cpu(), resolution, num_steps, alpha_threshold=alpha_threshold, cone=cone, moving=moving
         ).to(corners.device)
@@ -80,8 +79,7 @@ class OccupancyGrid(nn.Module):
     def update(self, step: int, sigma_fn: SigmaFunction) -> None:
         """Evaluate the density in some cells and update `occupied`, every 8 steps at first and every 16 later.
 
-        It should be called before each training step. By step 256 every cell has been evaluated, and occupied cells
-        four times.
+        Call it before each training step. By step 256 every cell has been evaluated, and occupied cells four times.
 
         Args:
             step: number of the training step, from 0.
@@ -94,7 +92,7 @@ class OccupancyGrid(nn.Module):
         self.marcher.update(step, as_density(sigma_fn))
 
     def fill(self, sigma_fn: SigmaFunction) -> None:
-        """Evaluate the density in all cells, for a field that has already been trained.
+        """Evaluate the density in all cells, for a field that is already trained.
 
         Args:
             sigma_fn: density, as in `update`.
@@ -124,21 +122,21 @@ def sample(
 ) -> Samples:
     """Return samples of rays in occupied cells, up to an early stop.
 
-    Rays are marched in waves, from near to far, until their transmittance is below `early_stop`. The samples behind
-    could have changed a colour channel in [0, 1] by at most `early_stop`. There is no such bound for the error of cells
-    that the grid skips, because a cell is classified by the density at a few positions.
+    Rays are marched in waves, from near to far, until their transmittance is below `early_stop`. The dropped samples
+    change a colour channel in [0, 1] by at most `early_stop`. The error from cells that the grid skips has no such
+    bound, because a cell is classified by its density at a few positions.
 
     Args:
         rays: R rays; without near and far ends, those of the grid's box are used. Samples have no gradient for rays.
-        sigma_fn: density (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma (N,) for a moving scene;
-            called without gradient, and only to find where a ray ends. None for no early stop.
+        sigma_fn: density (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma (N,) for a moving scene.
+            It is called without gradient, only to find the end of each ray. None for no early stop.
         grid: the occupied cells.
-        early_stop: transmittance below which the rest of a ray is dropped; 0 for never. In training, 1e-2 gives results
-            as good as 1e-4, and is faster.
+        early_stop: transmittance below which the rest of a ray is dropped; 0 for never. In training, 1e-2 is as good as
+            1e-4 and faster.
         jitter: True to start each ray at a random fraction of a step (training), False to start at 0 (evaluation).
 
     Returns:
-        packed samples, ray by ray, and from near to far on each ray.
+        Packed samples, ray by ray, and from near to far on each ray.
 
     Raises:
         ValueError: if the rays have a wrong shape or length of directions, if only the rays or only the grid has times,
@@ -148,7 +146,7 @@ def sample(
     if rays.times is None and grid.moving:
         raise ValueError("the grid is of a moving scene, but the rays have no times")
     if rays.times is not None and not grid.moving:
-        raise ValueError("the rays have times, but the grid is of a still scene: OccupancyGrid(..., moving=True)")
+        raise ValueError("the rays have times, but the grid is of a static scene: use OccupancyGrid(..., moving=True)")
     with torch.no_grad():
         stop = 0.0 if sigma_fn is None else early_stop
         samples = grid.marcher.sample(rays, DensityOnly(sigma_fn), jitter, stop)

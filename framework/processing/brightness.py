@@ -1,4 +1,4 @@
-"""Brightness of images of any mode: in 8 bits, the range that is used, and that range stretched."""
+"""Brightness of images of any mode: conversion to 8 bits, range of brightness, and stretching of that range."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from PIL import Image
 from nerfloom.base.errors import DataError
 
 SAMPLES = 500
-"""Rows and columns that are measured for the range."""
+"""Number of rows and columns sampled to measure the range."""
 ENDS = (1.0, 99.0)
-"""Percentiles between which the range of brightness lies: single bright pixels do not count."""
+"""Percentiles that define the range of brightness, so that single bright pixels do not count."""
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
@@ -46,7 +46,7 @@ def stretched(image: Image.Image) -> Image.Image:
     """Return an image's brightness with its range stretched to 0 to 255, in 8 bits.
 
     Args:
-        image: an image of any mode but floating point; one with 16 bits per pixel is stretched before it is rounded.
+        image: an image of any mode but floating point; 16-bit pixels are stretched before rounding.
     """
     levels, top = _levels(image)
     low, high = (end * top for end in tones(image))
@@ -54,7 +54,7 @@ def stretched(image: Image.Image) -> Image.Image:
 
 
 def _levels(image: Image.Image) -> tuple[np.ndarray, float]:
-    """Return the brightness (H, W) of an image in whole numbers, and the number that is white."""
+    """Return the brightness (H, W) of an image in whole numbers, and the number for white."""
     if image.mode.startswith("I"):
         return np.asarray(image), 65535.0
     return np.asarray(eight_bits(image).convert("L")), 255.0

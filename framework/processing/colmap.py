@@ -1,4 +1,4 @@
-"""COLMAP by pycolmap 3.10 or later, whose names differ between versions. These functions run in a child process."""
+"""COLMAP by pycolmap 3.10 or later; names differ between versions. These functions run in a child process."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nerfloom.processing.settings import ColmapFlags
 from nerfloom.processing.worker import Report
 
 FIRST_PAIRS = 8
-"""Number of pairs that are matched first, to estimate the time of all; no part has fewer."""
+"""Number of pairs matched first, to estimate the total time; no part has fewer."""
 SECONDS_OF_A_PART = 5.0
-"""Seconds after which matches are added to the database: what is lost if matching is stopped."""
+"""Interval, in seconds, at which matches are added to the database; stopping loses at most this much."""
 MOST_PAIRS = 1000
-"""Maximum number of pairs of a part."""
+"""Maximum number of pairs in a part."""
 MANY = 10
-"""Minimum number of images of a camera whose principal point is refined."""
+"""Minimum number of images of a camera for refining its principal point."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ def extract(
     """Extract features. COLMAP adds each image to the database when its features are found.
 
     Args:
-        report: called at the beginning only, as COLMAP does not report progress.
-        database: COLMAP's database, which may be missing.
+        report: called only at the beginning, because COLMAP does not report progress.
+        database: COLMAP's database; it is created if missing.
         images: folder of the images.
-        groups: names of the images that share a camera, and its number if it is in the database, for each camera.
+        groups: for each camera, the names of its images, and its number if it is in the database.
         masks: folder of masks, or None.
         flags: the user's flags.
     """
@@ -102,13 +102,13 @@ def extract(
 def match_pairs(
     report: Report, database: Path, pairs: list[tuple[str, str]], list_path: Path, everything: bool, flags: ColmapFlags
 ) -> None:
-    """Match the features of pairs of images, a few at a time: COLMAP adds each part to the database when it is done.
+    """Match features of pairs of images in parts; COLMAP adds each finished part to the database.
 
     Args:
         report: called with the number of pairs done.
         database: COLMAP's database with features.
         pairs: pairs of names.
-        list_path: file to which the list of pairs is written.
+        list_path: file for the list of pairs.
         everything: whether these are all possible pairs.
         flags: the user's flags.
     """
@@ -142,7 +142,7 @@ def match_pairs(
 
 
 def reconstruct(report: Report, database: Path, images: Path, output: Path, flags: ColmapFlags) -> list[int]:
-    """Estimate poses incrementally, and write the resulting models to output/0, output/1, ... from large to small.
+    """Estimate poses incrementally, and write the models to output/0, output/1, ..., largest first.
 
     Args:
         report: called with the number of registered images.
@@ -215,7 +215,7 @@ def read_model(report: Report, folder: Path) -> Model:
     try:
         model = pycolmap.Reconstruction(str(folder))
     except Exception as error:  # pycolmap raises ValueError, RuntimeError and more
-        raise DataError(f"{folder} holds no readable COLMAP model") from error
+        raise DataError(f"{folder} has no readable COLMAP model") from error
     cameras = {
         number: (_lens(camera), int(camera.width), int(camera.height), [float(p) for p in camera.params])
         for number, camera in model.cameras.items()
@@ -237,7 +237,7 @@ def read_model(report: Report, folder: Path) -> Model:
 
 
 def _refine(pycolmap: Any, model: Any) -> None:
-    """Run a bundle adjustment with free principal points, if all cameras have enough images to determine theirs."""
+    """Run a bundle adjustment with free principal points, if all cameras have enough images to determine them."""
     camera_ids = [model.images[number].camera_id for number in model.reg_image_ids()]
     if min(camera_ids.count(camera) for camera in set(camera_ids)) < MANY:
         return
@@ -255,13 +255,13 @@ def _extraction_options(pycolmap: Any) -> Any:
 
 
 def _set(options: Any, name: str, value: Any) -> None:
-    """Set an option, which newer versions keep in `options.sift`."""
+    """Set an option; newer versions keep it in `options.sift`."""
     setattr(options if hasattr(options, name) else options.sift, name, value)
 
 
 def _device(pycolmap: Any, flags: ColmapFlags) -> Any:
     if flags.device_type == "cuda" and not pycolmap.has_cuda:
-        raise DataError("--device-type cuda: this pycolmap was built without CUDA; leave the flag out")
+        raise DataError("--device-type cuda: pycolmap was built without CUDA; leave out the flag")
     return getattr(pycolmap.Device, flags.device_type)
 
 

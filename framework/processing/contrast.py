@@ -1,7 +1,7 @@
-"""Photographs that use a small part of their range: underexposed, foggy, or 12 bits in a file of 16.
+"""Photographs with a small range of brightness: underexposed, foggy, or 12 bits in a 16-bit file.
 
-Features are found by absolute differences of brightness, so such photographs have few. For features alone, brightness
-is stretched to the whole range; what is written for training stays as it is.
+Features are found by absolute differences of brightness, so such photographs have few. For feature detection only,
+brightness is stretched to the full range; the images for training stay unchanged.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from nerfloom.processing.brightness import stretched
 from nerfloom.processing.images import OPERATIONS, PreparedImage, in_parallel, save
 
 NARROW = 0.3
-"""Range of brightness below which it is stretched. Six photographs of a can that were darkened to a range of 0.29 had
-2,987 matches that fit, stretched 4,199; at 0.14 664 and 4,097, at 0.09 none and 4,013; at their own 0.58 4,080 and
-4,224."""
+"""Images with a smaller range of brightness are stretched. Six photographs of a can darkened to a range of 0.29 had
+2,987 verified matches, and 4,199 after stretching. At 0.14 they had 664 and 4,097, at 0.09 none and 4,013, and at their
+own 0.58 4,080 and 4,224."""
 BLANK = 0.008
-"""Range of brightness below which an image shows nothing: two of 255 levels."""
+"""An image with a smaller range of brightness is blank: two of 255 levels."""
 DARK = 0.1
-"""Brightness below which an image that shows nothing is black."""
+"""A blank image below this brightness is black."""
 
 
 def for_features(folder: Path, prepared: list[PreparedImage], images: Path, target: Path) -> Path:
-    """Return the folder of the images whose features are extracted, and say what is dark, foggy or blank.
+    """Return the folder of images for feature extraction, and report dark, foggy and blank images.
 
     Args:
         folder: folder of the sources.
@@ -39,7 +39,7 @@ def for_features(folder: Path, prepared: list[PreparedImage], images: Path, targ
         target: folder for stretched images, with links to the others.
 
     Raises:
-        DataError: if fewer than two images show anything.
+        DataError: if fewer than two images have any content.
     """
     ranges = {image.name: image.tones[1] - image.tones[0] for image in prepared}
     blank = [image for image in prepared if ranges[image.name] < BLANK]
@@ -49,9 +49,9 @@ def for_features(folder: Path, prepared: list[PreparedImage], images: Path, targ
         return images
     middle = float(np.median([ranges[name] for name in narrow]))
     say(
-        f"{len(narrow)} of {len(prepared)} images use a small part of the range of brightness ({middle:.0%} in the "
-        "middle): too dark, foggy, or of few of 16 bits. Features are found in stretched copies; the "
-        "images themselves stay as they are, and so does what is trained on"
+        f"{len(narrow)} of {len(prepared)} images have a small range of brightness (median {middle:.0%}): too dark, "
+        "foggy, or few of 16 bits. Features are found in stretched copies; the "
+        "images for training stay unchanged"
     )
 
     def write(entry: PreparedImage) -> None:
@@ -77,9 +77,7 @@ def _report_blank(blank: list[PreparedImage], count: int) -> None:
     what = "black" if dark else "of one colour"
     if len(blank) > count - 2:
         why = " Was the lens covered, or the exposure far too short?" if dark else ""
-        raise DataError(
-            f"{len(blank)} of {count} images are {what}, as {first}: there is nothing to find in them.{why}"
-        )
+        raise DataError(f"{len(blank)} of {count} images are {what}, such as {first}: they have no features.{why}")
     say(f"{len(blank)} of {count} images are {what} and cannot be placed, the first: {first}")
 
 

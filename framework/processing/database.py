@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 PAIR_BASE = 2**31 - 1
-"""COLMAP's number of a pair of images i < j is this times i, plus j."""
+"""COLMAP's number of a pair of images i < j is this number times i, plus j."""
 
 
 def rows(database: Path, table: str, what: str = "COUNT(*)") -> int:
-    """Return a number from a table; 0 if the database is unreadable now.
+    """Return a number from a table; 0 if the database is unreadable at the moment.
 
     Args:
         database: the database.
         table: name of the table.
-        what: what to select.
+        what: expression to select.
     """
     if not database.is_file():
         return 0
@@ -30,13 +30,13 @@ def rows(database: Path, table: str, what: str = "COUNT(*)") -> int:
 
 
 def features(database: Path) -> dict[str, int]:
-    """Return the number of features of each image in the `database`, by its name."""
+    """Return the number of features of each image in the `database`, by name."""
     query = "SELECT name, rows FROM images JOIN descriptors USING (image_id)"
     return dict(_read(database, query))
 
 
 def camera_of(database: Path, names: list[str]) -> int | None:
-    """Return the number of the camera of the first of some images that has one; None if none has.
+    """Return the camera number of the first of some images that has one; None if there is none.
 
     Args:
         database: the database.
@@ -47,7 +47,7 @@ def camera_of(database: Path, names: list[str]) -> int | None:
 
 
 def pairs(database: Path) -> set[tuple[str, str]]:
-    """Return the pairs of names that were matched by the `database`, each in both orders."""
+    """Return the pairs of names already matched in the `database`, each in both orders."""
     names = dict(_read(database, "SELECT image_id, name FROM images"))
     numbers = [number for (number,) in _read(database, "SELECT pair_id FROM two_view_geometries")]
     found = {(names[number // PAIR_BASE], names[number % PAIR_BASE]) for number in numbers}
@@ -55,19 +55,19 @@ def pairs(database: Path) -> set[tuple[str, str]]:
 
 
 def connected(database: Path) -> int:
-    """Return the number of pairs in the `database` with matches that fit a geometry."""
+    """Return the number of pairs in the `database` whose matches fit a geometry."""
     return rows(database, "two_view_geometries", "SUM(rows > 0)")
 
 
 def matches(database: Path, most: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return matches of connected pairs that fit a geometry, as positions of features in both images.
+    """Return the verified matches of connected pairs, as positions of features in both images.
 
     Args:
         database: the database.
-        most: maximum number of pairs; they are spread over all.
+        most: maximum number of pairs, spread evenly over all pairs.
 
     Returns:
-        Two arrays (M, 2) for each pair, in units of the longer side from the image's middle, y down.
+        Two arrays (M, 2) for each pair, in units of the longer side from the image's centre, y down.
     """
     query = "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0 ORDER BY pair_id"
     connected = _read(database, query)
@@ -80,7 +80,7 @@ def matches(database: Path, most: int) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _positions(database: Path, image: int) -> np.ndarray:
-    """Return the positions (K, 2) of an image's features, in units of the longer side from the image's middle."""
+    """Return the positions (K, 2) of an image's features, in units of the longer side from the image's centre."""
     query = (
         "SELECT width, height, rows, cols, data FROM keypoints "
         f"JOIN images USING (image_id) JOIN cameras USING (camera_id) WHERE image_id = {int(image)}"
@@ -96,7 +96,7 @@ def _read(database: Path, query: str) -> list[tuple]:
     try:
         with closing(_opened(database)) as opened:
             return opened.execute(query).fetchall()
-    except sqlite3.OperationalError:  # a table that is not there yet
+    except sqlite3.OperationalError:  # the table does not exist yet
         return []
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def about(seconds: float) -> str:
-    """Return a duration of `seconds` that is roughly known, such as ``about 40 s`` or ``about 1 h 05 min``."""
+    """Return an approximate duration of `seconds` in words, such as ``about 40 s`` or ``about 1 h 05 min``."""
     if seconds < 99.5:
         return f"about {seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -1,4 +1,4 @@
-"""Features of images, by COLMAP: those that are not in its database yet."""
+"""Extraction of features by COLMAP, for images that are not in its database yet."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def camera_groups(prepared: list[PreparedImage], sharing: str) -> list[list[str]
 
     Args:
         prepared: the prepared images.
-        sharing: single: all share one. per-image: none do. auto: those in a folder with equal size, device and focal
-            length.
+        sharing: single: all images share one camera. per-image: each has its own. auto: images in a folder with equal
+            size, device and focal length share one.
 
     Raises:
-        DataError: if all are to share a camera but differ in size.
+        DataError: if all images share a camera but differ in size.
     """
     sizes = {(image.width, image.height) for image in prepared}
     if sharing == "single" and len(sizes) > 1:
@@ -40,7 +40,7 @@ def extract(job: Job, prepared: list[PreparedImage], images: Path, masks: Path |
     Args:
         job: the reconstruction.
         prepared: the prepared images.
-        images: folder of the images as features are to be found in them.
+        images: folder of the images for feature extraction.
         masks: folder of masks, or None.
     """
     groups = camera_groups(prepared, job.flags.camera_sharing)
@@ -58,7 +58,7 @@ def extract(job: Job, prepared: list[PreparedImage], images: Path, masks: Path |
     found = database.features(job.database)
     mean = sum(found.values()) / max(len(found), 1)
     by = "1 camera" if len(groups) == 1 else f"{len(groups)} cameras"
-    kept = f", {len(known)} kept from before" if known else ""
+    kept = f", {len(known)} reused" if known else ""
     say(
         f"features: {mean:.0f} per image, {len(prepared)} images by {by}{kept}, "
         f"in {job.seconds.get('features', 0.0):.1f} s"

@@ -1,4 +1,4 @@
-"""Frames of a video as they are stored, with their times, by ffmpeg: none is added, left out or moved in time."""
+"""Frames of a video as stored, with their times, by ffmpeg: none is added, left out or moved in time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.base.extras import install_command
 
 SIDE = 1000
-"""Maximum side of the grey pictures that frames are judged by, pixels."""
+"""Maximum side of the grey pictures used to judge frames, pixels."""
 _GREY = f"scale=min({SIDE}\\,iw):min({SIDE}\\,ih):force_original_aspect_ratio=decrease:flags=area,format=gray"
 
 R = TypeVar("R")
@@ -40,18 +40,18 @@ def frame_count(path: Path) -> int:
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
     except Exception as error:  # any type, from ffmpeg or its wrapper
-        raise DataError(f"--data {path} is not a readable video; play it to see whether it is whole") from error
+        raise DataError(f"--data {path} is not a readable video; play it to check that it is complete") from error
     return max(int(count), 1)
 
 
 def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, list[R]]:
     """Apply a function to a small grey picture of each frame.
 
-    A video that cannot be decoded to its end is used up to there, and a line says so.
+    A video that cannot be decoded to its end is used up to there, with a warning.
 
     Args:
         path: the video file.
-        look: function of a picture (H, W) uint8, upright, with at most `SIDE` pixels a side.
+        look: function of an upright picture (H, W) uint8 with at most `SIDE` pixels a side.
 
     Returns:
         The times of the frames, seconds, in order, and the results.
@@ -69,7 +69,7 @@ def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, lis
         results = [look(frame[..., 0]) for frame in frames]
         times = _times(listed)[: len(results)] if results else np.zeros(0)
     if len(times) == 0:
-        raise DataError(f"--data {path} has no frame that can be decoded")
+        raise DataError(f"--data {path} has no readable frame")
     return np.maximum.accumulate(times), results[: len(times)]
 
 
@@ -78,7 +78,7 @@ def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
 
     Args:
         path: the video file.
-        numbers: (K,) their numbers, rising; the first frame is 0.
+        numbers: (K,) frame numbers in ascending order; the first frame is 0.
     """
     arguments = ["-i", str(path), "-map", "0:v:0", *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
     wanted = iter(track(numbers.tolist(), "Reading the frames", total=len(numbers)))
@@ -93,7 +93,7 @@ def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _pictures(path: Path, arguments: list[str]) -> Generator[np.ndarray, None, None]:
-    """Yield the pictures (H, W, C) uint8 that ffmpeg writes as a stream of PGM or PPM files."""
+    """Yield pictures (H, W, C) uint8 from ffmpeg's stream of PGM or PPM files."""
     import imageio_ffmpeg
 
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", *arguments]
@@ -106,7 +106,7 @@ def _pictures(path: Path, arguments: list[str]) -> Generator[np.ndarray, None, N
             if process.wait() != 0:
                 errors.seek(0)
                 last = errors.read().decode(errors="replace").strip().splitlines()[-1:] or ["ffmpeg failed"]
-                say(f"{path} cannot be decoded to its end; the frames before are used: {last[0].strip()}")
+                say(f"{path} cannot be decoded to its end; using the frames before: {last[0].strip()}")
         finally:
             process.kill()
             process.wait()
@@ -114,7 +114,7 @@ def _pictures(path: Path, arguments: list[str]) -> Generator[np.ndarray, None, N
 
 
 def _next_picture(stream: IO[bytes]) -> np.ndarray | None:
-    """Read a PGM or PPM file as ffmpeg writes it, with three lines of text before its pixels; None at the end."""
+    """Read a PGM or PPM file written by ffmpeg, with three lines of text before its pixels; None at the end."""
     kind, size, _ = (stream.readline() for _ in range(3))
     if len(size.split()) != 2:
         return None
@@ -125,7 +125,7 @@ def _next_picture(stream: IO[bytes]) -> np.ndarray | None:
 
 
 def _times(listed: Path) -> np.ndarray:
-    """Read the times (N,) of frames, seconds, from the file of ffmpeg's format framecrc."""
+    """Read the times (N,) of frames, seconds, from a file in ffmpeg's framecrc format."""
     second, times = 1.0, []
     for line in listed.read_text(errors="replace").splitlines():
         if line.startswith("#tb 0:"):
@@ -137,7 +137,7 @@ def _times(listed: Path) -> np.ndarray:
 
 
 def _passthrough() -> list[str]:
-    """Return ffmpeg's option to keep each frame once, at its time; versions before 5.1 call it -vsync."""
+    """Return ffmpeg's option to keep each frame once, at its time; before version 5.1 it is -vsync."""
     import imageio_ffmpeg
 
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-h", "long"]

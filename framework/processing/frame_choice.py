@@ -1,14 +1,14 @@
-"""Choice of frames of a video: different ones, spread evenly over time, and the sharpest nearby."""
+"""Choice of a video's frames: distinct frames, spread evenly over time, the sharpest in each interval."""
 
 from __future__ import annotations
 
 import numpy as np
 
 BLOCK = 16
-"""Side of the squares whose mean brightness tells frames apart, pixels."""
+"""Side of the squares whose mean brightness is compared between frames, pixels."""
 SAME = 0.003
-"""Maximum difference of frames that are repeats, as a share of their contrast. Of videos encoded by x264 and MPEG-4, a
-frame that was repeated differed by up to 0.0025, and one moved by half a pixel by 0.004 or more."""
+"""Maximum difference between repeated frames, as a fraction of their contrast. In videos encoded by x264 and MPEG-4,
+repeated frames differed by up to 0.0025, and frames moved by half a pixel by 0.004 or more."""
 
 
 def sharpness(picture: np.ndarray) -> float:
@@ -36,10 +36,10 @@ def blocks(picture: np.ndarray) -> np.ndarray:
 
 
 def different(frames: list[np.ndarray]) -> np.ndarray:
-    """Return the numbers of the frames that show something else than the last one that does, rising.
+    """Return the indices of frames that differ from the last distinct frame, in ascending order.
 
-    A frame is a repeat if its blocks differ by at most `SAME` of the contrast, on average: encoders and players repeat
-    frames to keep a rate, and a camera that stands still repeats what it sees.
+    A frame is a repeat if its blocks differ on average by at most `SAME` of the contrast. Encoders and players repeat
+    frames to keep a rate, and a camera that stands still repeats its view.
 
     Args:
         frames: `blocks` of each frame.
@@ -53,17 +53,17 @@ def different(frames: list[np.ndarray]) -> np.ndarray:
 
 
 def intervals(times: np.ndarray, count: int) -> np.ndarray:
-    """Divide frames into intervals of equal duration that are not empty.
+    """Divide frames into non-empty intervals of equal duration.
 
-    A pause without frames that is longer than an interval counts as one interval, so that there are always as many as
-    asked for: the interval's length L solves sum(min(d, L)) = count L, with the durations d of frames.
+    A pause without frames that is longer than an interval counts as one interval, so that the number of intervals is as
+    requested. The interval's length L solves sum(min(d, L)) = count L, with the durations d of frames.
 
     Args:
-        times: (N,) seconds, rising.
+        times: (N,) seconds, ascending.
         count: number of intervals.
 
     Returns:
-        (N,) the interval of each frame, from 0 on; each frame has its own if there are no more than `count`.
+        (N,) interval of each frame, counted from 0; if there are no more than `count` frames, each has its own.
     """
     if len(times) <= count:
         return np.arange(len(times))
@@ -79,14 +79,14 @@ def intervals(times: np.ndarray, count: int) -> np.ndarray:
 
 
 def sharpest(sharpnesses: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return the index of the sharpest frame of each group; of equally sharp ones, the first.
+    """Return the index of the sharpest frame of each group; of equally sharp frames, the first.
 
     Args:
         sharpnesses: (N,) sharpness of each frame.
         groups: (N,) group of each frame.
 
     Returns:
-        (G,) indices, rising by group.
+        (G,) indices, in the order of groups.
     """
     order = np.lexsort((np.arange(len(groups)), -sharpnesses, groups))
     first = np.append(True, np.diff(groups[order]) > 0)[: len(order)]

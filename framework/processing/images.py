@@ -47,7 +47,7 @@ class PreparedImage:
     height: int
     """Height after preparation, pixels."""
     device: tuple
-    """Maker, model and focal lengths (mm) from EXIF, which are equal for images of one camera."""
+    """Maker, model and focal lengths (mm) from EXIF; equal for images of one camera."""
     orientation: int
     """EXIF orientation that was undone; 1 for none."""
     tones: tuple[float, float]
@@ -55,10 +55,10 @@ class PreparedImage:
 
 
 def output_names(sources: Iterable[Path]) -> list[str]:
-    """Return names for the output's images folder, all different, without white space and with a lower-case suffix.
+    """Return distinct names for the output's images folder, without white space and with a lower-case suffix.
 
-    COLMAP separates the names in lists of pairs by white space, and some file systems do not distinguish A.jpg from
-    a.jpg. Images other than JPEG become .png.
+    COLMAP separates names in lists of pairs by white space, and some file systems do not distinguish A.jpg from a.jpg.
+    Images other than JPEG become .png.
 
     Args:
         sources: paths of the images in the input folder.
@@ -159,7 +159,7 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
 
 
 def save(image: Image.Image, path: Path, options: dict[str, Any] | None = None) -> None:
-    """Write a JPEG of high quality, without alpha, or a PNG, by the path's suffix.
+    """Write a JPEG of high quality, without alpha, or a PNG, depending on the path's suffix.
 
     Args:
         image: the image.
@@ -176,7 +176,7 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dic
     """Write the masks of prepared images as 0 or 255, upright like them, named as in COLMAP: image.jpg.png.
 
     Args:
-        folder: folder of masks with the images' names (with their suffix, or with .png in place of it or after it).
+        folder: folder of masks named like the images, with their suffix, or with .png instead of it or after it.
         prepared: the prepared images.
         masks: folder to write to.
 
@@ -216,7 +216,7 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dic
 
 
 def in_parallel(work: Callable[[T], R], items: Iterable[T], title: str, total: int) -> list[R]:
-    """Apply a function to every item in threads, with a progress bar; an interruption cancels what has not started.
+    """Apply a function to every item in threads, with a progress bar; an interruption cancels items not yet started.
 
     Args:
         work: the function.
@@ -232,7 +232,7 @@ def in_parallel(work: Callable[[T], R], items: Iterable[T], title: str, total: i
 
 
 def register_heif() -> None:
-    """Make Pillow read HEIC, if the package pillow-heif is installed."""
+    """Enable HEIC in Pillow, if the package pillow-heif is installed."""
     try:
         import pillow_heif  # type: ignore[import-not-found,unused-ignore]
     except ImportError:
@@ -245,7 +245,7 @@ def _cropped(image: Image.Image, crop: int) -> Image.Image:
         return image
     width, height = image.size
     if min(width, height) <= 2 * crop:
-        raise DataError(f"an image of {width}x{height} pixels has no pixel left after cropping {crop} at each side")
+        raise DataError(f"an image of {width}x{height} pixels has no pixels left after cropping {crop} at each side")
     return image.crop((crop, crop, width - crop, height - crop))
 
 

@@ -1,4 +1,4 @@
-"""A reconstruction while it is made: its flags, its files and the time of its stages."""
+"""State of a reconstruction in progress: its flags, its files and the time of each stage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nerfloom.processing.worker import run_in_child
 
 @dataclass(frozen=True)
 class Job:
-    """A reconstruction while it is made."""
+    """A reconstruction in progress."""
 
     flags: ColmapFlags
     """The user's flags."""
@@ -27,7 +27,7 @@ class Job:
 
     @property
     def work(self) -> Path:
-        """Folder of what is unfinished."""
+        """Folder of unfinished files."""
         return unfinished(self.flags.output_dir)
 
     @property
@@ -37,7 +37,7 @@ class Job:
 
     @property
     def stretched(self) -> Path:
-        """Folder of images whose brightness is stretched; it is there if some use a small part of their range."""
+        """Folder of images with stretched brightness; it exists if some images have a small range."""
         return self.work / "stretched"
 
     @property
@@ -47,7 +47,7 @@ class Job:
 
     @property
     def log(self) -> Path | None:
-        """File of COLMAP's output; None leaves it on the terminal."""
+        """File for COLMAP's output; None leaves it on the terminal."""
         return None if self.flags.verbose else self.flags.output_dir / "colmap" / "log.txt"
 
     def run(
@@ -62,13 +62,13 @@ class Job:
         """Run a function in a child process with this job's log.
 
         Args:
-            work, arguments, title, total, count, unit: as `run_in_child` takes them.
+            work, arguments, title, total, count, unit: as in `run_in_child`.
         """
         return run_in_child(work, arguments, title, total, self.log, count, unit)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the time of a `with` block to that of a `stage`."""
+        """Add the duration of a `with` block to a `stage`."""
         start = time.perf_counter()
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start

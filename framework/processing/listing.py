@@ -1,4 +1,4 @@
-"""The files of a folder: images in natural order, and what else is there."""
+"""Files of a folder: images in natural order, and a report on the others."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ from nerfloom.base.errors import DataError
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
 READABLE = (*IMAGE_SUFFIXES, ".tga", ".ppm", ".pgm")
-"""Suffixes of image files that Pillow reads, HEIC with the package pillow-heif."""
+"""Suffixes of image files that Pillow reads (HEIC with the package pillow-heif)."""
 
 
 def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
     """Return the image files in a folder and its subfolders, relative to it, in natural order: 'img2' before 'img10'.
 
-    Hidden files are ignored. Files of other kinds are counted and named in a line.
+    Hidden files are ignored. The number and kinds of other files are reported.
 
     Args:
         folder: the folder.
         leave_out: folders inside it to ignore.
 
     Raises:
-        DataError: if the folder does not exist or has no image.
+        DataError: if the folder does not exist or has no images.
     """
     if not folder.is_dir():
         raise DataError(f"--data {folder}: there is no such folder")
     images, others = _split(folder, leave_out)
     if not images:
-        raise DataError(f"--data {folder} has no image (looked for {', '.join(READABLE)}){_listed(others)}")
+        raise DataError(f"--data {folder} has no images (looked for {', '.join(READABLE)}){_listed(others)}")
     if others:
-        files = "1 file that is no image" if len(others) == 1 else f"{len(others)} files that are no images"
+        files = "1 file that is not an image" if len(others) == 1 else f"{len(others)} files that are not images"
         say(f"left out: {files}{_listed(others)}")
     return images
 
 
 def kind_of(kind: str, data: Path) -> tuple[str, Path]:
-    """Return what a path is, images or a video, where the other was named, and the path; a line says so.
+    """Detect whether a path has images or a video, if the user named the wrong kind; this is reported.
 
     Args:
-        kind: "images" or "video", as the user named it; it is returned if the path is that, or nothing of the two.
+        kind: "images" or "video", as the user named it; returned if it fits, or if neither fits.
         data: the path.
 
     Returns:
-        The kind, and the path of the folder or of the video, which may be the only one of a folder without images.
+        The kind, and the path of the folder or of the video, which may be the only video of a folder without images.
 
     Raises:
         DataError: if a folder without images has several videos.
     """
     if data.is_file():
         if kind == "images" and data.suffix.lower() in VIDEO_SUFFIXES:
-            say(f"{data} is a video: its frames are taken, as by ns-process-data video")
+            say(f"{data} is a video: using its frames, as in ns-process-data video")
             return "video", data
         return kind, data
     if not data.is_dir():
@@ -61,18 +61,18 @@ def kind_of(kind: str, data: Path) -> tuple[str, Path]:
     images, others = _split(data, ())
     videos = [data / path for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
     if images and kind == "video":
-        say(f"{data} is a folder of {len(images)} images: they are taken, as by ns-process-data images")
+        say(f"{data} is a folder of {len(images)} images: using them, as in ns-process-data images")
         return "images", data
     if not images and len(videos) > 1:
-        raise DataError(f"--data {data} has {len(videos)} videos and no image; name one of them: --data {videos[0]}")
+        raise DataError(f"--data {data} has {len(videos)} videos and no images; choose one: --data {videos[0]}")
     if not images and videos:
-        say(f"{data} has no image, but a video: the frames of {videos[0].name} are taken")
+        say(f"{data} has a video and no images: using the frames of {videos[0].name}")
         return "video", videos[0]
     return kind, data
 
 
 def natural_order(path: Path) -> list[tuple[int, int, str]]:
-    """Return a sorting key of `path` that compares numbers in names as numbers."""
+    """Return a sorting key of `path` that compares numbers in names by value."""
     parts = re.split(r"(\d+)", path.as_posix().lower())
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
 
@@ -92,7 +92,7 @@ def _split(folder: Path, leave_out: Iterable[Path]) -> tuple[list[Path], list[Pa
 
 
 def _listed(paths: list[Path]) -> str:
-    """Return how many files there are of each suffix, and the first, as the end of a message."""
+    """Return the number of files of each suffix, and the first file, as the end of a message."""
     if not paths:
         return ""
     counts = Counter(path.suffix.lower() or "without suffix" for path in paths)

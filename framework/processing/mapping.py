@@ -1,4 +1,4 @@
-"""Poses from matches, by COLMAP; where few images were matched and some cannot be placed, from more matches."""
+"""Estimation of poses from matches by COLMAP, with more matches if only few pairs were matched and images remain."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
 from nerfloom.processing.summary import advice
 
 FEWEST_FEATURES = 15
-"""Minimum number of features of an image that can be placed: COLMAP's minimum of matches."""
+"""Minimum number of features of an image that can be placed: COLMAP's minimum number of matches."""
 FEW_FEATURES = 100
-"""Number of features below which an image is likely to be dark, blurred or without texture."""
+"""An image with fewer features is probably dark, blurred or without texture."""
 
 
 def reconstruct(job: Job, names: list[str], matching: str, turned: float) -> list[int]:
-    """Reconstruct, and write the models to sparse/0, sparse/1, ... in the job's folder, from large to small.
+    """Reconstruct, and write the models to sparse/0, sparse/1, ... in the job's folder, largest first.
 
-    If `auto` chose to match few pairs, images that stay unregistered are matched with more, and what registers more
+    If `auto` matched few pairs, the unregistered images are matched with more images. The result with more registered
     images is kept.
 
     Args:
         job: the reconstruction, with matches.
         names: names of all images.
-        matching: the rule that selected the pairs.
-        turned: share of pairs of images between which the camera only turned; more pairs cannot help if it is large.
+        matching: the rule for selecting pairs.
+        turned: fraction of image pairs between which the camera only rotated; if it is large, more pairs cannot help.
 
     Returns:
         The number of registered images of each model.
 
     Raises:
-        DataError: if there is no model, with the reason as far as it is known.
+        DataError: if there is no model, with the reason if known.
     """
     sizes = _map(job, job.work / "sparse", len(names))
     if not sizes and turned >= WITHOUT:
@@ -49,13 +49,13 @@ def reconstruct(job: Job, names: list[str], matching: str, turned: float) -> lis
 
 
 def unfold(job: Job) -> list[int] | None:
-    """Replace the models, and the database, by unfolded ones where something that repeats has folded them.
+    """Replace folded models, and the database, by unfolded ones, if repeated patterns have folded them.
 
     Args:
         job: the reconstruction, with models.
 
     Returns:
-        The number of images of each of the new models; None if nothing was replaced.
+        The number of images of each new model; None if nothing was replaced.
     """
 
     def read(folder: Path) -> colmap.Model:
@@ -86,7 +86,7 @@ def _map(job: Job, folder: Path, count: int) -> list[int]:
 
 
 def _with_more_pairs(job: Job, names: list[str], sizes: list[int]) -> list[int]:
-    """Match images that stayed unregistered with more, and reconstruct again; return the sizes of what is kept."""
+    """Match unregistered images with more images and reconstruct again; return the sizes of the better models."""
     first, again = job.work / "sparse", job.work / "again"
     placed = job.run(colmap.read_model, (first / "0",), "Reading the model").images if sizes else {}
     features = database.features(job.database)
@@ -96,7 +96,7 @@ def _with_more_pairs(job: Job, names: list[str], sizes: list[int]) -> list[int]:
     if known.issuperset(pairs):
         return sizes
     few = f"{left[0]}{', ...' if len(left) > 1 else ''}"
-    match(job, pairs, len(names), f"{len(left)} images stay unregistered ({few}) and are matched with more")
+    match(job, pairs, len(names), f"{len(left)} images are unregistered ({few}) and are matched with more images")
     if database.connected(job.database) == connected:
         return sizes
     found = _map(job, again, len(names))
@@ -108,12 +108,12 @@ def _with_more_pairs(job: Job, names: list[str], sizes: list[int]) -> list[int]:
 
 
 def _reason(job: Job) -> str:
-    """Return why images could not be registered, as far as their features and matches say."""
+    """Return the reason why images could not be registered, from their features and matches."""
     found = database.features(job.database).values()
     middle = statistics.median(found) if found else 0.0
-    dark = ", and some are dark or foggy (see above): take them in more light" if job.stretched.is_dir() else ""
+    dark = ", and some are dark or foggy (see above): take photographs in more light" if job.stretched.is_dir() else ""
     if middle < FEW_FEATURES:
-        return f"they have few features, {middle:.0f} on average, as blurred, dark or blank images do{dark}"
+        return f"they have few features, {middle:.0f} on average; they may be blurred, dark or blank{dark}"
     if not database.connected(job.database):
-        return f"no two of them show the same thing{dark}"
+        return f"no two of them match{dark}"
     return f"none are connected well enough{dark}"

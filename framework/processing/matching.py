@@ -1,4 +1,4 @@
-"""The choice of pairs of images to match, and the matching of those that are not in COLMAP's database yet."""
+"""Choice of image pairs to match, and matching of pairs that are not in COLMAP's database yet."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from nerfloom.processing import colmap, database, retrieval
 from nerfloom.processing.job import Job
 
 ADJACENT = 3
-"""Number of next images that retrieval matches with each image, besides similar ones."""
+"""Number of following images that retrieval matches with each image, besides similar ones."""
 LOOPS = 5
-"""Number of similar images, other than the next ones, that sequential matching matches with each: they close loops."""
+"""Number of similar images beyond the following ones that sequential matching adds for each image, to close loops."""
 RULES = {
     "exhaustive": "all",
     "sequential": "each image with the next ones and with similar ones, to close loops",
     "retrieval": "each image with similar ones",
 }
-"""What each rule matches, in words."""
+"""Description of each rule."""
 
 
 def choose_matching(method: str, count: int, exhaustive_limit: int, ordered: bool) -> str:
-    """Return the rule of matching: exhaustive, sequential or retrieval.
+    """Return the matching rule: exhaustive, sequential or retrieval.
 
     Args:
         method: the user's choice, possibly auto.
         count: number of images.
-        exhaustive_limit: maximum number of images for auto to match all pairs.
+        exhaustive_limit: maximum number of images for which auto matches all pairs.
         ordered: whether the images were taken one after the other, in the order of their names.
     """
     if method != "auto":
@@ -58,10 +58,10 @@ def choose_pairs(matching: str, names: list[str], job: Job) -> list[tuple[str, s
 
 
 def pairs_of(left: list[str], names: list[str], job: Job) -> list[tuple[str, str]]:
-    """Return more pairs of images that stayed unregistered: with all images, or of many with similar ones.
+    """Return more pairs for unregistered images: with all images, or with similar ones if there are many images.
 
     Args:
-        left: names of the images that stayed unregistered.
+        left: names of the unregistered images.
         names: names of all images.
         job: the reconstruction, with features.
     """
@@ -79,13 +79,13 @@ def match(job: Job, pairs: list[tuple[str, str]], count: int, rule: str) -> None
 
     Args:
         job: the reconstruction, with features.
-        pairs: pairs of names; those in the database are not matched again.
+        pairs: pairs of names; pairs in the database are not matched again.
         count: number of images.
-        rule: what the pairs are, for people.
+        rule: description of the pairs for messages.
     """
     known = database.pairs(job.database)
     missing = [pair for pair in pairs if pair not in known]
-    kept = f", {len(pairs) - len(missing)} of them kept from before" if len(missing) < len(pairs) else ""
+    kept = f", {len(pairs) - len(missing)} of them reused" if len(missing) < len(pairs) else ""
     say(f"matching: {len(pairs):,} of {count * (count - 1) // 2:,} pairs{kept}: {rule}")
     before = job.seconds.get("matching", 0.0)
     with job.timed("matching"):

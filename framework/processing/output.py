@@ -1,4 +1,4 @@
-"""The output folder: never overwritten unasked, and incomplete until transforms.json is written."""
+"""The output folder: never overwritten without a flag, and incomplete until transforms.json is written."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerfloom.processing.unfinished import STARTED, go_on, mark, unfinished
 from nerfloom.training.data_folder import processed_folder
 
 FINISHED = "transforms.json"
-"""File that is written last; a folder with it is complete."""
+"""File written last; a folder with it is complete."""
 _OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|(images|masks)(_\d+)?")
 
 
@@ -25,7 +25,7 @@ def check_apart(output: Path, data: Path) -> None:
         data: the folder or file to read.
 
     Raises:
-        DataError: if the output would overwrite the input, or lie among it.
+        DataError: if the output would overwrite the input or be inside it.
     """
     if output.exists() and output.resolve() == data.resolve():
         raise DataError(f"--output-dir {output} is the same folder as --data; {_advice(output)}")
@@ -39,31 +39,29 @@ def _advice(output: Path) -> str:
 
 
 def claim(output: Path, data: Path, overwrite: bool) -> None:
-    """Create the output folder, or with `overwrite` remove what an earlier run wrote to it.
+    """Create the output folder or, with `overwrite`, remove an earlier run's output.
 
     Args:
         output: the folder to write.
         data: the folder or file to read.
-        overwrite: whether to replace an earlier run's output; other files are left alone.
+        overwrite: whether to replace an earlier run's output; other files are kept.
 
     Raises:
-        DataError: if the folder is not empty and `overwrite` is false, or if files to be removed contain `data`.
+        DataError: if the folder is not empty and `overwrite` is False, or if files to be removed contain `data`.
     """
     if output.exists() and not output.is_dir():
         raise DataError(f"--output-dir {output} is a file; choose a folder")
     present = sorted(output.iterdir()) if output.is_dir() else []
     if is_unfinished(output) and not overwrite:
-        raise DataError(
-            f"--output-dir {output} holds a run that was stopped; --resume goes on, --overwrite begins again"
-        )
+        raise DataError(f"--output-dir {output} has a stopped run; --resume continues it, --overwrite starts again")
     if present and not overwrite:
         content = "a processed data set" if (output / FINISHED).exists() else f"'{present[0].name}' but no {FINISHED}"
-        raise DataError(f"--output-dir {output} holds {content}; choose a new folder, or use --overwrite")
+        raise DataError(f"--output-dir {output} has {content}; choose a new folder or use --overwrite")
     written = [path for path in present if _OURS.fullmatch(path.name)]
     for path in written:
         if data.resolve().is_relative_to(path.resolve()):
             raise DataError(f"--overwrite would remove {path}, which contains --data; choose another --output-dir")
-    for path in sorted(written, key=lambda path: path.name != FINISHED):  # first the mark of completion
+    for path in sorted(written, key=lambda path: path.name != FINISHED):  # the mark of completion first
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
@@ -72,14 +70,14 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
 
 
 def begin(flags: ColmapFlags, sources: list[Path]) -> None:
-    """Claim the output folder and mark what the run starts with; with `flags.resume`, go on with what was stopped.
+    """Claim the output folder and record the run's input; with `flags.resume`, continue a stopped run.
 
     Args:
         flags: the user's flags.
-        sources: the files that are read, as `unfinished.mark` takes them.
+        sources: the files to read, as in `unfinished.mark`.
 
     Raises:
-        DataError: as `claim` and `unfinished.go_on`.
+        DataError: see `claim` and `unfinished.go_on`.
     """
     if flags.resume and is_unfinished(flags.output_dir):
         go_on(flags, sources)
@@ -89,12 +87,12 @@ def begin(flags: ColmapFlags, sources: list[Path]) -> None:
 
 
 def is_unfinished(output: Path) -> bool:
-    """Return whether the folder `output` holds a run of COLMAP that was stopped."""
+    """Return whether the folder `output` has a stopped COLMAP run."""
     return not (output / FINISHED).exists() and (unfinished(output) / STARTED).is_file()
 
 
 def ready(output: Path) -> str:
-    """Return the last line of a command: where the data folder is, and how to train on it.
+    """Return the last line of a command: the data folder and the command to train on it.
 
     Args:
         output: the data folder.

@@ -19,7 +19,7 @@ MAX_ANGLE = 0.7
 
 
 def match(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the features of two images that are each other's nearest, by a clear margin.
+    """Return the features of two images that are mutual nearest neighbours by a clear margin.
 
     Args:
         first: (K, D) uint8 descriptors.

@@ -1,37 +1,37 @@
-"""Cameras that turned on the spot: without parallax, nothing tells how far anything is."""
+"""Detection of cameras that only rotated: without parallax, distances are unknown."""
 
 from __future__ import annotations
 
 import numpy as np
 
 WITHOUT = 0.8
-"""Share of pairs that a rotation explains above which a capture has no parallax. Of two panoramas a rotation explained
-99 % and 100 % of the pairs, of two captures by somebody who walked 5 % and 8 %."""
+"""A capture has no parallax if a rotation explains more than this fraction of pairs. In two panoramas a rotation
+explained 99 % and 100 % of the pairs; in two captures by a walking person, 5 % and 8 %."""
 EXPLAINED = 0.003
-"""Maximum median distance of matches that a rotation explains, as a share of the image's longer side."""
+"""Maximum median distance of matches after a rotation that explains them, as a fraction of the image's longer side."""
 MOVED = 0.02
-"""Minimum median distance that matches move for a pair to tell anything, as a share of the longer side."""
+"""Minimum median motion of matches for a pair to count, as a fraction of the longer side."""
 FOCALS = np.geomspace(0.3, 5.0, 25)
-"""Focal lengths that are tried, in units of the image's longer side."""
+"""Focal lengths tried, in units of the image's longer side."""
 PAIRS = 100
-"""Maximum number of pairs that are examined."""
+"""Maximum number of pairs examined."""
 NO_PARALLAX = (
-    "the photographs have no parallax, as from a camera that turned on the spot (a panorama). Nothing tells how far "
-    "anything is, and poses mean nothing: take photographs from different positions, with a step to the side each"
+    "the photographs have no parallax, as if the camera had turned on the spot (a panorama). Distances are unknown "
+    "and poses are meaningless: take photographs from different positions, with a step to the side each"
 )
-"""What is wrong with such a capture, and what to do."""
+"""Message about such a capture, with advice."""
 
 
 def share_that_turned(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return the share of pairs whose matches are explained by a rotation of the camera alone, at one focal length.
+    """Return the fraction of pairs whose matches are explained by a camera rotation alone, with one focal length.
 
-    The focal length is that which explains most. Pairs that hardly moved are left out.
+    The focal length that explains most pairs is used. Pairs with little motion are left out.
 
     Args:
-        pairs: matches of each pair, as positions (M, 2) in units of the image's longer side from its middle.
+        pairs: matches of each pair, as positions (M, 2) in units of the image's longer side from its centre.
 
     Returns:
-        From 0 to 1; 0 if no pair tells anything.
+        From 0 to 1; 0 if no pair counts.
     """
     telling = [(one, two) for one, two in pairs if np.median(np.linalg.norm(one - two, axis=1)) > MOVED]
     if not telling:
@@ -41,10 +41,10 @@ def share_that_turned(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
 
 
 def left_by_rotation(first: np.ndarray, second: np.ndarray, focal: float) -> float:
-    """Return the median distance of matches after the rotation that aligns their rays best (Wahba's problem, by SVD).
+    """Return the median distance of matches after the best rotation of their rays (Wahba's problem, by SVD).
 
     Args:
-        first: (M, 2) positions in one image, in units of the longer side from its middle.
+        first: (M, 2) positions in one image, in units of the longer side from its centre.
         second: (M, 2) positions in the other.
         focal: focal length in the same units.
     """

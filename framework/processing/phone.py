@@ -1,4 +1,4 @@
-"""Conversion of phone captures, whose poses are known: preparation of images, and transforms.json."""
+"""Conversion of phone captures with known poses: preparation of images, and transforms.json."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.transforms import Frame, Lens, content, write
 
 UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
-"""Errors raised if a JSON file lacks a number, or has something else instead."""
+"""Errors raised if a number in a JSON file is missing or is something else."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def read_json(path: Path) -> dict[str, Any]:
     except (ValueError, OSError, RecursionError) as error:
         raise DataError(f"{path} is not readable JSON: {one_line(error)}") from error
     if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object: names and values in braces")
+        raise DataError(f"{path} must contain a JSON object: names and values in braces")
     return content
 
 
@@ -69,7 +69,7 @@ def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
 
 
 def evenly_spaced(items: list, most: int) -> list:
-    """Return at most `most` evenly spaced `items`, the first and the last among them."""
+    """Return at most `most` evenly spaced `items`, including the first and the last."""
     if len(items) <= most:
         return items
     return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
@@ -88,13 +88,13 @@ def write_folder(
     Args:
         folder: folder of the images.
         posed: camera-to-world pose (4, 4) with OpenGL axes, and lens of the uncropped image, by the image's path.
-        output: the output folder, after `output.claim`.
+        output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
         applied: (3, 4) transform from the phone's frame to that of the poses.
         crop: pixels to cut off at each side.
 
     Raises:
-        DataError: if no image is readable, or one differs in size from its lens.
+        DataError: if no image is readable, or an image and its lens differ in size.
     """
     prepared, _ = prepare_all(folder, list(posed), output / "images", upright=False, crop=crop)
     frames = []
@@ -108,7 +108,7 @@ def write_folder(
             raise DataError(f"{folder / image.source} is {actual} pixels, but its camera is for {expected}")
         frames.append(Frame(image.name, pose, lens, source=image.source))
     write_pyramid(output / "images", [image.name for image in prepared], num_downscales)
-    # The phone measures gravity, so the frame is upright and need not be estimated from the poses.
+    # The phone measures gravity, so the up direction need not be estimated from the poses.
     write(output / FINISHED, content(frames, applied, None, {"orientation_override": "none"}))
     say(f"{len(frames)} images with the phone's poses")
     say(ready(output))

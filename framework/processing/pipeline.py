@@ -17,7 +17,7 @@ from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.summary import Summary, lines
 
 FEWEST = 3
-"""Minimum number of images of a reconstruction."""
+"""Minimum number of images for a reconstruction."""
 
 
 def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> None:
@@ -26,7 +26,7 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     Args:
         job: the reconstruction.
         folder: folder of the images.
-        sources: paths of the images in it, as `find_images` returns them.
+        sources: paths of the images in it, from `find_images`.
         masks: folder of masks, or None.
 
     Raises:
@@ -37,7 +37,7 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
         prepared, unreadable = prepare_all(folder, sources, job.images)
         clear = contrast.for_features(folder, prepared, job.images, job.stretched)
         if len(prepared) < FEWEST:
-            raise DataError(f"--data {flags.data}: {len(prepared)} images can be used; at least {FEWEST} are needed")
+            raise DataError(f"--data {flags.data}: {len(prepared)} usable images; at least {FEWEST} are needed")
         mask_of = write_masks(masks, prepared, output / "masks") if masks is not None else {}
     names = [image.name for image in prepared]
     features.extract(job, prepared, clear, output / "masks" if mask_of else None)
@@ -101,7 +101,7 @@ def _keep(work: Path, target: Path, final: Path) -> None:
     """Move the results out of the working folder, models last, and remove the rest."""
     shutil.move(work / "database.db", target / "database.db")
     models = work / "sparse"
-    if final.parent != models:  # the undistorted model belongs to the images
+    if final.parent != models:  # the undistorted model belongs to the undistorted images
         shutil.move(models / "0", target / "distorted")
         shutil.move(final, models / "0")
     shutil.move(models, target / "sparse")

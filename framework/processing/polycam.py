@@ -1,4 +1,4 @@
-"""Polycam's raw exports: keyframes/images (or corrected_images), with a JSON file of pose and lens for each."""
+"""Polycam's raw exports: keyframes/images (or corrected_images), with a JSON file of pose and lens per image."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
 
     Args:
         export: the unpacked raw export.
-        output: the output folder, after `output.claim`.
+        output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
         max_images: maximum number of images, evenly spaced.
-        min_blur_score: minimum of Polycam's blur score; images with a lower one are skipped as blurred.
+        min_blur_score: minimum of Polycam's blur score; images with a lower score are skipped as blurred.
         crop: pixels to cut off at each side.
 
     Raises:
-        DataError: if `export` is not an export, or no image of it is usable.
+        DataError: if `export` is not an export or has no usable image.
     """
     images, cameras = _folders(export)
     posed, blurred, without_camera = {}, 0, 0
@@ -116,9 +116,9 @@ def lens_of(camera: dict[str, Any], path: Path) -> Lens:
 
 
 def _folders(export: Path) -> tuple[Path, Path]:
-    """Return the folders of images and cameras, the ones corrected by Polycam if they exist."""
+    """Return the folders of images and cameras; those corrected by Polycam if they exist."""
     if export.is_file():
-        raise DataError(f"--data {export} is a file; unpack the raw export and pass its folder")
+        raise DataError(f"--data {export} is a file; unpack the raw export and pass the folder")
     for root in (export / "keyframes", export):
         for prefix in ("corrected_", ""):
             images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"

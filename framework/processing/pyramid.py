@@ -10,13 +10,13 @@ from nerfloom.processing.images import in_parallel, save
 
 
 def write_pyramid(folder: Path, names: list[str], num_downscales: int, masks: bool = False) -> None:
-    """Write images reduced by powers of two, averaged over whole blocks of pixels, with sizes rounded down.
+    """Write images reduced by powers of two: means over whole blocks of pixels, with sizes rounded down.
 
     Args:
         folder: the images' folder, such as OUT/images; OUT/images_2 and so on are written.
         names: paths of the images in it.
         num_downscales: number of folders to write.
-        masks: whether the images are masks, of which a reduced pixel is white only if all pixels in its block are.
+        masks: whether the images are masks; a reduced mask pixel is white only if its whole block is.
     """
     factors = [2 ** (level + 1) for level in range(num_downscales)]
 

@@ -1,4 +1,4 @@
-"""Record3D's exports with EXR and RGBD: EXR_RGBD/rgb with numbered images, and metadata.json with the poses."""
+"""Record3D's "EXR + RGBD" exports: EXR_RGBD/rgb with numbered images, and metadata.json with the poses."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
 
     Args:
         export: the folder EXR_RGBD, or its parent.
-        output: the output folder, after `output.claim`.
+        output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
         max_images: maximum number of images, evenly spaced.
 
     Raises:
-        DataError: if `export` is not an export, or no image of it is usable.
+        DataError: if `export` is not an export or has no usable image.
     """
     root = find_root(export)
     path = root / "metadata.json"
@@ -37,7 +37,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
     if len(usable) < len(numbered):
         say(f"{len(numbered) - len(usable)} images have a number beyond the {len(poses)} poses and are skipped")
     if not usable:
-        raise DataError(f"{root / 'rgb'} has no image whose number is that of a pose in {path}")
+        raise DataError(f"{root / 'rgb'} has no image with the number of a pose in {path}")
     if len(usable) < len(poses):
         say(f"{len(poses) - len(usable)} of {len(poses)} poses have no image")
     lenses = lenses_of(metadata, len(poses), path)
@@ -49,7 +49,7 @@ def find_root(export: Path) -> Path:
     """Return the folder with rgb and metadata.json: `export` or one in it.
 
     Raises:
-        DataError: if there is none.
+        DataError: if there is no such folder.
     """
     for root in (export / "EXR_RGBD", export):
         if (root / "rgb").is_dir() and (root / "metadata.json").is_file():
@@ -97,7 +97,7 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def lenses_of(metadata: dict[str, Any], count: int, path: Path) -> list[Lens]:
-    """Return the lens of each pose: its own if the export has one for each, else that of the whole capture (K).
+    """Return the lens of each pose: its own if the export has one for each, otherwise that of the whole capture (K).
 
     Args:
         metadata: content of metadata.json; K is stored column by column.

@@ -1,8 +1,8 @@
-"""Selection of pairs of images to match: consecutive images, and similar ones.
+"""Selection of image pairs to match: consecutive images and similar images.
 
-Similarity is measured by local descriptors aggregated over a small vocabulary computed from the images themselves
-(VLAD: Jegou et al. 2010, "Aggregating local descriptors into a compact image representation"; normalisation:
-Arandjelovic and Zisserman 2013, "All about VLAD"), so that no vocabulary needs to be downloaded.
+Similarity is measured by local descriptors aggregated over a small vocabulary (VLAD: Jegou et al. 2010, "Aggregating
+local descriptors into a compact image representation"; normalisation: Arandjelovic and Zisserman 2013, "All about
+VLAD"). The vocabulary is computed from the images themselves, so nothing needs to be downloaded.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ def all_pairs(count: int) -> list[Pair]:
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Return the pairs of each image with the next ones.
+    """Return the pairs of each image with the following ones.
 
     Args:
         count: number of images.
-        overlap: number of next images, and also the number of those 1, 2, 4, 8, ... further on.
+        overlap: number of following images, and number of further images at distances 1, 2, 4, 8, ... beyond.
     """
     offsets = set(range(1, overlap + 1)) | {2**power for power in range(overlap)}
     return sorted((i, i + offset) for offset in offsets for i in range(count - offset))
 
 
 def similar_pairs(descriptors: np.ndarray, neighbors: int, apart: int = 0) -> list[Pair]:
-    """Return the pairs (i, j), i < j, of each image with the most similar ones, each pair once.
+    """Return the pairs (i, j), i < j, of each image with the most similar ones, without repetitions.
 
     Args:
-        descriptors: (N, D) unit vectors (`global_descriptors`); an image without features is 0, and in no pair.
+        descriptors: (N, D) unit vectors (`global_descriptors`); an image without features is 0 and in no pair.
         neighbors: number of similar images.
-        apart: images with at most this difference of their indices are left out, as they are matched anyway.
+        apart: images whose indices differ by at most this are left out, because they are matched anyway.
     """
     count = len(descriptors)
     similarity = descriptors @ descriptors.T
@@ -62,7 +62,7 @@ def global_descriptors(descriptors: list[np.ndarray], words: int = 32, sample: i
     Args:
         descriptors: local descriptors (K, D) of each image, for any K.
         words: size of the vocabulary.
-        sample: maximum number of descriptors of an image that are used.
+        sample: maximum number of descriptors used per image.
         seed: seed of random choices.
 
     Returns:
@@ -98,7 +98,7 @@ def vocabulary(descriptors: np.ndarray, words: int, random: np.random.Generator,
 
 
 def aggregate(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the sums (W D,) of differences to the nearest centres, normalised to unit length per centre and in all.
+    """Return the sums (W D,) of differences to the nearest centres, normalised to unit length per centre and in total.
 
     Args:
         descriptors: (K, D) local descriptors.
@@ -117,7 +117,7 @@ def read_descriptors(database: Path, names: list[str]) -> list[np.ndarray]:
 
     Args:
         database: COLMAP's database.
-        names: names of the images; an unknown one has no descriptors.
+        names: names of the images; an unknown image has no descriptors.
     """
     with closing(sqlite3.connect(database)) as connection:
         identities = dict(connection.execute("SELECT name, image_id FROM images"))

@@ -1,4 +1,4 @@
-"""Photographs whose names say that they were taken one after the other."""
+"""Detection of photographs whose names show that they were taken one after the other."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from itertools import pairwise
 from pathlib import PurePath
 
 NEXT = 10
-"""Maximum difference between the numbers of neighbours: a few photographs may have been deleted."""
+"""Maximum difference between the numbers of neighbours, since a few photographs may have been deleted."""
 MOST = 0.8
-"""Minimum share of neighbours whose numbers follow each other."""
+"""Minimum fraction of neighbours with consecutive numbers."""
 _NUMBER = re.compile(r"\d+")
 _TIME = re.compile(r"(19|20)\d{6}[_-]?\d{6}")
-"""Date and time, as phones name photographs."""
+"""Date and time in the names of phones' photographs."""
 
 
 def is_sequence(names: Sequence[PurePath]) -> bool:
-    """Return whether neighbours in a list of file names are numbered, or named by the time, one after the other.
+    """Return whether file names in a list are numbered or dated consecutively.
 
     Args:
         names: the names in natural order.
@@ -34,7 +34,7 @@ def _follows(first: PurePath, second: PurePath) -> bool:
 
 
 def _numbered(path: PurePath) -> tuple[str, int] | None:
-    """Return the path with its last number, unless that has over nine digits, taken out, and the number."""
+    """Return the path without its last number, and that number; None if it has more than nine digits."""
     found = list(_NUMBER.finditer(path.stem))
     if not found or len(found[-1][0]) > 9:
         return None

@@ -11,7 +11,7 @@ from nerfloom.base.errors import ConfigError, FlagError
 CameraModel = Literal["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE"]
 """COLMAP's lens models that transforms.json can express."""
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
-"""Rule by which pairs of images are selected for matching."""
+"""Rule for selecting image pairs to match."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +23,9 @@ class OutputFlags:
     output_dir: Path
     """Folder to write; new or empty."""
     overwrite: bool = False
-    """Replace the output of an earlier run in --output-dir; other files there are left alone."""
+    """Replace the output of an earlier run in --output-dir; other files there are kept."""
     num_downscales: int = 3
-    """Number of reduced copies of the images: 3 writes images_2, images_4 and images_8."""
+    """Number of folders of reduced images: 3 writes images_2, images_4 and images_8."""
 
     def check(self) -> None:
         """Check the values.
@@ -46,36 +46,36 @@ class ColmapFlags(OutputFlags):
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
     """Which images share a camera. auto: those in a folder with equal size, device and focal length."""
     matching_method: Matching = "auto"
-    """Which images are matched. auto: neighbours and loops of a video or of numbered photographs, and more where that
-    leaves some out; of others all pairs up to --exhaustive-limit, then retrieval."""
+    """Which images are matched. auto: for videos and numbered photographs, neighbours and loops, and more if some
+    images remain; for others, all pairs up to --exhaustive-limit images, then retrieval."""
     exhaustive_limit: int = 150
-    """Maximum number of images of which auto matches all pairs, or those left out with all."""
+    """Maximum number of images for which auto matches all pairs, or all pairs with unregistered images."""
     num_neighbors: int = 30
-    """Similar images with which retrieval matches each image."""
+    """Number of similar images that retrieval matches with each image."""
     sequential_overlap: int = 10
-    """Following images with which sequential matching matches each image, besides those 16, 32, ... further on."""
+    """Number of following images that sequential matching matches with each, besides those 16, 32, ... further on."""
     max_image_size: int = 1600
     """Longer side, in pixels, at which features are extracted."""
     max_num_features: int = 8192
     """Maximum number of features of an image."""
     refine_intrinsics: bool = False
-    """Adjust everything once more at the end with a free principal point, for cameras with 10 images or more. Rotation
-    of the camera and shift of that point are hard to tell apart: only for captures that determine it well."""
+    """Refine everything once more at the end with a free principal point, for cameras with 10 images or more. Use it
+    only for captures that determine that point well: its shift is hard to distinguish from a camera rotation."""
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), for registered images only."""
     device_type: Literal["cpu", "cuda"] = "cpu"
-    """Device for extraction and matching of features; cuda needs a pycolmap built with it."""
+    """Device for feature extraction and matching; cuda needs a pycolmap built with CUDA."""
     num_threads: int = -1
     """CPU threads; -1 for all."""
     resume: bool = False
-    """Go on with a run that was stopped: features and matches in --output-dir are kept."""
+    """Continue a stopped run: features and matches in --output-dir are kept."""
     verbose: bool = False
-    """Show COLMAP's output, which otherwise goes to OUTPUT_DIR/colmap/log.txt."""
+    """Show COLMAP's output instead of writing it to OUTPUT_DIR/colmap/log.txt."""
 
     def check(self) -> None:
         super().check()
         if self.resume and self.overwrite:
-            raise FlagError("--resume goes on with what --overwrite removes; leave one of them out")
+            raise FlagError("--overwrite removes what --resume continues; leave out one of them")
         minimums = {
             "exhaustive_limit": 0, "num_neighbors": 1, "sequential_overlap": 1,
             "max_image_size": 64, "max_num_features": 64,

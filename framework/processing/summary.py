@@ -1,4 +1,4 @@
-"""The report at the end: how many images were registered, how long it took, and advice if they are too few."""
+"""The final report: number of registered images, time, and advice if too few are registered."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
 
 ENOUGH = 0.8
-"""Share of registered images below which advice is given."""
+"""Advice is given if a smaller fraction of images is registered."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class Summary:
     reprojection_error: float
     """Mean reprojection error, pixels."""
     matching: str
-    """Rule by which pairs were selected."""
+    """Rule for selecting pairs."""
     pairs: int
-    """Number of pairs of images that were matched."""
+    """Number of matched image pairs."""
     turned: float
-    """Share of pairs of images between which the camera only turned (`parallax.share_that_turned`)."""
+    """Fraction of image pairs between which the camera only rotated (`parallax.share_that_turned`)."""
     seconds: dict[str, float]
     """Seconds by stage."""
 
@@ -52,7 +52,7 @@ def lines(summary: Summary) -> list[str]:
     ]
     if summary.other_models:
         sizes = ", ".join(map(str, summary.other_models))
-        messages.append(f"left out: {len(summary.other_models)} other models that are not connected, of {sizes} images")
+        messages.append(f"left out: {len(summary.other_models)} unconnected models, with {sizes} images")
     if summary.turned >= WITHOUT:
         messages.append(f"warning: {NO_PARALLAX}")
     if share < ENOUGH:
@@ -64,7 +64,7 @@ def advice(matching: str) -> str:
     """Return advice for images that cannot be connected.
 
     Args:
-        matching: the rule that selected the pairs.
+        matching: the rule for selecting pairs.
     """
     steps = [
         "take images with more overlap (two thirds or more with the next), sharp, in constant light",

@@ -23,7 +23,7 @@ _PARAMETERS = {
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-"""Names of COLMAP's parameters in their order; f is both focal lengths."""
+"""Names of COLMAP's parameters in their order; f stands for both focal lengths."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: 
 
     Args:
         frames: at least one; a lens that all share is written at the top, otherwise each frame has its own.
-        applied: (3, 4) transform from the original frame (COLMAP's, the phone's) to that of `frames`.
+        applied: (3, 4) transform from the original frame (COLMAP's or the phone's) to that of `frames`.
         points: name of the point cloud in the same folder, or None.
         more: further entries at the top.
 
@@ -144,7 +144,7 @@ def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: 
 
 
 def write(path: Path, value: dict[str, Any]) -> None:
-    """Write JSON so that a killed process leaves a complete file or none.
+    """Write JSON atomically: a killed process leaves a complete file or none.
 
     Args:
         path: the file.

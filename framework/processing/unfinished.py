@@ -1,4 +1,4 @@
-"""The files of a run that was stopped, and the check whether another can go on with them."""
+"""Files of a stopped run, and the check whether another run can continue it."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from nerfloom.processing.settings import ColmapFlags
 from nerfloom.processing.video import write_frames
 
 STARTED = "started.json"
-"""File that says what a run was started with."""
+"""File that records a run's input."""
 FRAMES = "frames"
 """Folder of a video's frames."""
 FREE = (
     "output_dir", "overwrite", "resume", "num_downscales", "matching_method", "exhaustive_limit", "num_neighbors",
     "sequential_overlap", "refine_intrinsics", "device_type", "num_threads", "verbose",
 )  # fmt: skip
-"""Flags that may differ from those of the run that was stopped: features and matches do not depend on them."""
+"""Flags that may differ from the stopped run's, because features and matches do not depend on them."""
 
 
 def unfinished(output: Path) -> Path:
-    """Return the folder of what is unfinished in the folder `output` that is written."""
+    """Return the folder of unfinished files in the output folder `output`."""
     return output / "colmap" / "unfinished"
 
 
 def mark(flags: ColmapFlags, sources: list[Path]) -> None:
-    """Write what a run is started with.
+    """Record a run's input.
 
     Args:
         flags: the user's flags.
-        sources: the files that it reads, under `flags.data`; of a video, that file alone.
+        sources: the files to read, below `flags.data`; for a video, that file alone.
     """
     work = unfinished(flags.output_dir)
     work.mkdir(parents=True, exist_ok=True)
@@ -42,11 +42,11 @@ def mark(flags: ColmapFlags, sources: list[Path]) -> None:
 
 
 def go_on(flags: ColmapFlags, sources: list[Path]) -> None:
-    """Check that features and matches of the run that was stopped serve this one, and remove what else it has left.
+    """Check that this run can use the features and matches of the stopped run, and remove its other leftovers.
 
     Args:
         flags: the user's flags.
-        sources: the files that are read, as in `mark`.
+        sources: the files to read, as in `mark`.
 
     Raises:
         DataError: if that run had other flags or other files.
@@ -56,38 +56,38 @@ def go_on(flags: ColmapFlags, sources: list[Path]) -> None:
         before: dict[str, Any] = json.loads((work / STARTED).read_text(encoding="utf-8"))
         flags_before, files_before = dict(before["flags"]), dict(before["files"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"--resume: {work} does not say what it was started with; --overwrite begins again") from error
+        raise DataError(f"--resume: {work} has no record of its input; use --overwrite to start again") from error
     now = _state(flags, sources)
     for name, value in now["flags"].items():
         if flags_before.get(name) != value:
             flag = "--" + name.replace("_", "-")
             raise DataError(
-                f"--resume: {flag} is {value}, and was {flags_before.get(name)}; give the same flags, "
-                "or begin again by --overwrite"
+                f"--resume: {flag} is {value}, but was {flags_before.get(name)}; use the same flags, "
+                "or start again with --overwrite"
             )
     files = now["files"]
     other = sorted(name for name in files.keys() | files_before if files.get(name) != files_before.get(name))
     if other:
         raise DataError(
             f"--resume: {len(other)} files of --data {flags.data} were added, removed or changed since, "
-            f"the first: {other[0]}; begin again by --overwrite"
+            f"the first: {other[0]}; start again with --overwrite"
         )
     for path in work.iterdir():
         if path.name not in (STARTED, FRAMES) and not path.name.startswith("database.db"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
-    say(f"resuming: features and matches in {work} are kept")
+    say(f"resuming: using features and matches in {work}")
 
 
 def frames_of(output: Path, video: Path, target: int) -> tuple[Path, list[Path]]:
-    """Return the folder of a video's frames, and their paths in it; they are written unless they are there already.
+    """Return the folder of a video's frames and their paths in it; write the frames unless they exist.
 
     Args:
-        output: the folder that is written.
+        output: the output folder.
         video: the video file.
         target: number of frames to write.
 
     Raises:
-        DataError: as `write_frames`.
+        DataError: see `write_frames`.
     """
     folder = unfinished(output) / FRAMES
     if folder.is_dir():

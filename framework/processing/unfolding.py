@@ -1,8 +1,8 @@
-"""Reconstructions that something repeated has folded (`nerfloom.scene.folds`), taken apart.
+"""Repair of reconstructions folded by a repeated pattern (`nerfloom.scene.folds`).
 
-What repeats connects photographs of opposite sides. Neighbours of a sequence do show the same side, so photographs are
-first placed by matches of neighbours alone. What that drifts is mended in a second reconstruction, with the matches
-of photographs that look the same way in the first.
+A repeated pattern connects photographs of opposite sides. Neighbours in a sequence do show the same side, so
+photographs are first placed by matches between neighbours only. A second reconstruction corrects the drift, with
+matches between photographs that look the same way in the first one.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from nerfloom.processing.database import PAIR_BASE
 from nerfloom.scene.folds import angle_between, folds, in_order, thumbnail
 
 NEXT = 3
-"""Number of next photographs that are neighbours of one."""
+"""Number of following photographs that count as neighbours."""
 SAME_WAY = 50.0
-"""Maximum angle between cameras that look the same way, degrees: less than any fold that is noticed."""
+"""Maximum angle between cameras that look the same way, degrees; less than any detected fold."""
 ENOUGH = 0.9
-"""Minimum number of photographs placed without the fold, as a share of those placed with it."""
+"""Minimum number of photographs placed without the fold, relative to the number with it."""
 
 Reconstruct = Callable[[Path, Path], "tuple[Model | None, list[int]]"]
-"""Function of a database and a folder for models that reconstructs, and returns the largest model, None without, and
-the number of images of each."""
+"""Function of a database and a folder for models. It reconstructs, and returns the largest model (None without) and the
+number of images in each model."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class Unfolded:
     model: Model
     """The reconstruction."""
     database: Path
-    """COLMAP's database, with the matches it is made from."""
+    """COLMAP's database with the matches used."""
     models: Path
     """Folder of its models."""
     sizes: list[int]
-    """Number of images of each of the models."""
+    """Number of images in each model."""
 
 
 def thumbnails_of(images: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the thumbnail of each image by its name.
+    """Return the thumbnail of each image, by name.
 
     Args:
         images: folder of the images.
@@ -59,11 +59,11 @@ def thumbnails_of(images: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
 
 
 def folded_pairs(model: Model, thumbnails: dict[str, np.ndarray]) -> list[tuple[str, str]]:
-    """Return the names of neighbours that look alike, and whose cameras look in quite different directions.
+    """Return the names of neighbours that look alike although their cameras look in very different directions.
 
     Args:
         model: the reconstruction.
-        thumbnails: thumbnail of each image by its name.
+        thumbnails: thumbnail of each image, by name.
     """
     names = list(model.images)
     ahead = np.array([_ahead(model, name) for name in names]).reshape(-1, 3)
@@ -74,17 +74,17 @@ def folded_pairs(model: Model, thumbnails: dict[str, np.ndarray]) -> list[tuple[
 def unfold(
     model: Model, thumbnails: dict[str, np.ndarray], database: Path, work: Path, reconstruct: Reconstruct
 ) -> Unfolded | None:
-    """Reconstruct without the matches that fold, where the model is folded.
+    """Reconstruct without the matches that fold the model, if it is folded.
 
     Args:
         model: the reconstruction from all matches.
-        thumbnails: thumbnail of each image by its name.
-        database: COLMAP's database with all matches, which is left as it is.
+        thumbnails: thumbnail of each image, by name.
+        database: COLMAP's database with all matches; it is not changed.
         work: folder for databases and models.
-        reconstruct: makes a model from a database.
+        reconstruct: function that makes models from a database.
 
     Returns:
-        The new reconstruction; None if the model is not folded, or cannot be unfolded, which is then said.
+        The new reconstruction; None if the model is not folded, or cannot be unfolded, which is reported.
     """
     pairs = folded_pairs(model, thumbnails)
     if not pairs:
@@ -92,7 +92,7 @@ def unfold(
     angle = angle_between(*(_ahead(model, name) for name in pairs[0]))
     say(
         f"{pairs[0][0]} and {pairs[0][1]} look alike, but their cameras look {angle:.0f} degrees apart "
-        f"(such pairs: {len(pairs)}): something that repeats has folded the reconstruction. Unfolding it"
+        f"({len(pairs)} such pairs): a repeated pattern has folded the reconstruction. Unfolding it"
     )
     names, best, used = sorted(thumbnails), None, 0
     names = [names[index] for index in in_order(names)]
@@ -114,8 +114,8 @@ def unfold(
     if best is None:
         say(
             "the photographs could not be placed by their neighbours alone, so the poses stay as they are, and some of "
-            f"them are wrong: take more photographs on the way from {pairs[0][0]} to {pairs[0][1]}, or leave out those "
-            "that have little in common with the others"
+            f"them are wrong: take more photographs on the way from {pairs[0][0]} to {pairs[0][1]}, or leave out "
+            "photographs that share little with the others"
         )
     else:
         say(f"unfolded: {len(best.model.images)} images, from {used} pairs that look the same way")
@@ -123,7 +123,7 @@ def unfold(
 
 
 def _ahead(model: Model, name: str) -> np.ndarray:
-    """Return the unit vector (3,) in which a camera looks: the third row of its world-to-camera rotation."""
+    """Return the unit viewing direction (3,) of a camera: the third row of its world-to-camera rotation."""
     row = model.images[name][2][2, :3]
     return row / np.linalg.norm(row)
 

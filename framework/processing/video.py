@@ -1,4 +1,4 @@
-"""Extraction of images from a video: frames as they are stored, each once, the sharpest of each of equal intervals."""
+"""Extraction of images from a video: distinct frames as stored, the sharpest of each of equal intervals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerfloom.processing.images import save
 
 
 def write_frames(video: Path, folder: Path, target: int) -> list[Path]:
-    """Write `target` different frames of a video, or all if it has fewer, as folder/frame_00001.jpg and so on.
+    """Write `target` distinct frames of a video, or all if it has fewer, as folder/frame_00001.jpg and so on.
 
     Args:
         video: the video file.
@@ -41,20 +41,20 @@ def write_frames(video: Path, folder: Path, target: int) -> list[Path]:
 
 
 def line(times: np.ndarray, fresh: int, target: int, written: int) -> str:
-    """Return a line of text: how many frames a video has, and how many of them are written.
+    """Return a line of text with the numbers of frames in the video, of repeats, and of written frames.
 
     Args:
         times: (N,) times of all frames, seconds.
-        fresh: number of different frames.
-        target: number of frames that are wanted.
-        written: number of frames that are written.
+        fresh: number of distinct frames.
+        target: number of requested frames.
+        written: number of written frames.
     """
     count, gaps = len(times), np.diff(times)
     uneven = " at uneven times" if count > 2 and gaps.max() > 1.5 * max(np.median(gaps), 1e-9) else ""
     text = f"video: {count} frames in {times[-1] - times[0]:.1f} s{uneven}"
     if fresh < count:
-        text += f", of which {count - fresh} repeat the one before and are dropped"
+        text += f", {count - fresh} of them repeat the one before and are dropped"
     if written < target:
-        taken = "the only one is" if written == 1 else f"all {written} are"
-        return f"{text}; {taken} taken, as there are no more, though --num-frames-target is {target}"
-    return f"{text}; {written} are taken, the sharpest of each of {target} intervals"
+        taken = "the only one" if written == 1 else f"all {written}"
+        return f"{text}; using {taken}, fewer than --num-frames-target {target}"
+    return f"{text}; using {written}, the sharpest of each of {target} intervals"

@@ -1,4 +1,4 @@
-"""Functions run in a child process, for COLMAP: its output goes to a log, and a crash becomes an error of one line."""
+"""Functions run in a child process, for COLMAP: output goes to a log, and a crash becomes a one-line error."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from nerfloom.base.errors import DataError, NerfloomError
 from nerfloom.processing.estimate import about
 
 Report = Callable[[int], None]
-"""Function that the child calls with the number of units done; with 0 when it begins, after imports."""
+"""Function that the child calls with the number of finished units; with 0 at the beginning, after imports."""
 FEW = 4
-"""Number of units that must be done before the time of all is estimated."""
+"""Minimum number of finished units for an estimate of the total time."""
 SOON = 1.0
-"""Seconds that must have passed before the time of all is estimated."""
+"""Minimum seconds before an estimate of the total time."""
 SHORT = 10.0
-"""Seconds up to which no estimate is said."""
+"""Shorter estimates, in seconds, are not reported."""
 
 
 def run_in_child(
@@ -42,15 +42,15 @@ def run_in_child(
         arguments: arguments after `report`.
         title: title of the progress bar.
         total: units of the progress bar.
-        log: file to which the child's output is appended; None leaves it on the terminal.
-        count: returns the number of units done, for work that cannot report it.
-        unit: name of the units, which take equally long: a line says how long all will take, once a few are done.
+        log: file for the child's output, appended; None leaves the output on the terminal.
+        count: returns the number of finished units, for work that cannot report it.
+        unit: name of the units, which take equally long; an estimate of the total time is reported after a few.
 
     Returns:
         The result of `work`.
 
     Raises:
-        DataError: if the process dies. Errors of `work` are raised as they are.
+        DataError: if the process dies. Errors of `work` are raised unchanged.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -79,7 +79,7 @@ def run_in_child(
 def _numbers(
     receiver: Connection, alive: Callable[[], bool], count: Callable[[], int] | None, outcome: list[Any]
 ) -> Iterator[int | None]:
-    """Yield the number of units done several times a second, until the process ends; None until it begins.
+    """Yield the number of finished units several times a second, until the process ends; None until it begins.
 
     The process's last message is appended to `outcome`.
     """
@@ -102,9 +102,9 @@ def _numbers(
 
 
 def _estimated(numbers: Iterator[int | None], title: str, total: int, unit: str) -> Iterator[int | None]:
-    """Pass on the numbers of units done, and say once how long all will take.
+    """Pass on the numbers of finished units, and report once how long all will take.
 
-    That is measured from the first units on, which take longer, as COLMAP's threads and caches begin with them.
+    Measurement starts after the first units, which take longer while COLMAP's threads and caches start.
     """
     first: tuple[float, int] | None = None
     said = False
@@ -121,7 +121,7 @@ def _estimated(numbers: Iterator[int | None], title: str, total: int, unit: str)
 
 
 def _units(numbers: Iterator[int | None], total: int) -> Iterator[int]:
-    """Yield once for each unit done."""
+    """Yield once for each finished unit."""
     yielded = 0
     for done in numbers:
         for _ in range(yielded, min(done or 0, total)):
@@ -132,7 +132,7 @@ def _units(numbers: Iterator[int | None], total: int) -> Iterator[int]:
 def _child(work: Callable[..., Any], arguments: tuple, sender: Connection, log: Path | None) -> None:
     signal.signal(
         signal.SIGINT, signal.SIG_DFL
-    )  # Python handles Ctrl-C only after the C++ function returns, minutes later
+    )  # Python handles Ctrl-C only when the C++ function returns, minutes later
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     if log is not None:
         file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
@@ -156,7 +156,7 @@ def _child(work: Callable[..., Any], arguments: tuple, sender: Connection, log: 
 
 
 def _exit_with_parent() -> None:
-    """Exit when the parent process ends: a killed parent cannot stop its child. COLMAP releases Python's lock."""
+    """Exit when the parent process ends, since a killed parent cannot stop its child. COLMAP releases Python's lock."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -164,7 +164,7 @@ def _exit_with_parent() -> None:
 
 
 def _last_line(log: Path | None) -> str:
-    """Return the last line of a log, and the log's path, as the end of a message."""
+    """Return the last line of a log and the log's path, as the end of a message."""
     if log is None or not log.is_file():
         return ""
     lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]

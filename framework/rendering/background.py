@@ -1,4 +1,4 @@
-"""A background that is composited behind what a method shows: NeRF++ (Zhang et al. 2020), section 4, equation 7."""
+"""Backgrounds composited behind a method's rendering: NeRF++ (Zhang et al. 2020), section 4, equation 7."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ from nerfloom.samplers.uniform import LAST_INTERVAL, UniformSampler
 
 
 class SphereRenderer(Renderer):
-    """A renderer behind whose picture there is a second field, outside of a sphere.
+    """Renders a second field, outside a sphere, behind another renderer's picture.
 
-    That field is evaluated at points (N, 4) of the inverted sphere (`InvertedRays`), and its density is one in units of
-    1/r, as in the authors' code: a ray has a finite length there. Its share of a colour is the transmittance that is
-    left inside. The far end of the last interval is infinitely far, so that any density there makes the ray opaque.
+    The second field is evaluated at points (N, 4) of the inverted sphere (`InvertedRays`). Its density is per unit of
+    1/r, as in the authors' code, so that the rays there have a finite length. Its contribution to a colour is weighted
+    by the transmittance of the inside. The far end of the last interval is at infinity, so any density there makes the
+    ray opaque.
 
     Args:
-        renderer: renders what is inside, sampled by an `InsideSphere`.
+        renderer: renders the inside, with samples of an `InsideSphere`.
         sphere: (4,) centre and radius, scene units.
         field: density and colour at points of the inverted sphere.
         sampler: chooses samples along inverted rays.
-        endless: whether the last interval is endless: for images that do not tell what is background.
+        endless: whether the last interval is endless: for images without an alpha channel, which do not mark
+            background.
     """
 
     sphere: Tensor
@@ -54,7 +56,7 @@ class SphereRenderer(Renderer):
         return over_background(inside, outside, lambda u: distances_behind(u, rays, self.sphere))
 
     def _sampled(self, rays: InvertedRays) -> Samples:
-        """Return samples of inverted rays, of which those that end before the sphere are transparent."""
+        """Return samples of inverted rays; those of rays that end before the sphere are transparent."""
         samples = self.sampler.sample(rays, self.field, self.training)
         ends = torch.where(rays.fars > rays.nears, LAST_INTERVAL, rays.nears) if self.endless else rays.fars
         if samples.coarse is not None:
@@ -63,19 +65,20 @@ class SphereRenderer(Renderer):
 
 
 def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Tensor], Tensor]) -> Rendered:
-    """Return what is seen of R rays: the inside, and behind it the outside.
+    """Composite R rays: the inside in front of the outside.
 
     Samples, weights and further values are those of the inside.
 
     Args:
         inside: the inside before a black background.
         outside: the outside before the background, with the same number of samples on each ray.
-        distances: function from places (R,) on the rays of `outside`, one each, to distances along those of `inside`.
+        distances: function from positions (R,) on the rays of `outside`, one each, to distances along those of
+            `inside`.
     """
     left = 1 - inside.accumulation
     accumulation = inside.accumulation + left * outside.accumulation
     with torch.no_grad():
-        share = torch.where(accumulation > 1e-6, inside.accumulation / accumulation, 1.0)  # of what is seen
+        share = torch.where(accumulation > 1e-6, inside.accumulation / accumulation, 1.0)  # of the visible light
         depth = torch.lerp(distances(outside.depth), inside.depth, share)
         median = torch.where(inside.accumulation >= 0.5, inside.median_depth, distances(_median(outside, left)))
     extras = dict(inside.extras)
@@ -94,11 +97,11 @@ def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Te
 
 
 def _median(outside: Rendered, left: Tensor) -> Tensor:
-    """Return the place (R,) of the first sample outside behind which the whole ray's transmittance is at most 0.5.
+    """Return the position (R,) of the first outside sample behind which the ray's transmittance is at most 0.5.
 
     Args:
         outside: the outside, with the same number of samples on each ray.
-        left: (R,) transmittance that is left inside.
+        left: (R,) transmittance of the inside.
     """
     assert outside.samples is not None
     assert outside.weights is not None
@@ -116,14 +119,14 @@ def background_renderer(
 ) -> Renderer:
     """Return a renderer with a background if the settings have a sphere.
 
-    The outside is sampled as the inside if that is hierarchical, with a coarse field of its own and as many samples,
-    and otherwise uniformly in 1/r.
+    With hierarchical sampling, the outside is also sampled hierarchically, with its own coarse field and equal numbers
+    of samples. Otherwise it is sampled uniformly in 1/r.
 
     Args:
         config: the settings, decided.
-        scene: properties of the scene; not of its foreground.
-        make_field: creates a field outside, from settings and scene.
-        renderer: renders what is inside; that of `volume_renderer` if None.
+        scene: properties of the whole scene, not of its foreground.
+        make_field: creates a field for the outside, from settings and scene.
+        renderer: renders the inside; if None, that of `volume_renderer`.
     """
     renderer = renderer or volume_renderer(config, scene)
     if config.background_model != "sphere":
@@ -137,7 +140,7 @@ def background_renderer(
 
 
 def _ending_at(samples: Samples, ends: Tensor) -> Samples:
-    """Return samples, the same number on each ray, whose last intervals end at `ends` (R,)."""
+    """Return samples, equally many on each ray, whose last intervals end at `ends` (R,)."""
     changed = samples.padded(samples.t_ends).clone()
     changed[:, -1] = ends
     return replace(samples, t_ends=changed.view(-1), points=samples.t)

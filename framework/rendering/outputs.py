@@ -1,4 +1,4 @@
-"""Outputs: what a picture shows, by name. A method declares those that it has beside the four that all have."""
+"""Outputs: named values of a picture. A method declares outputs beyond the four that all methods have."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ Kind = Literal["color", "opacity", "distance", "direction", "scalar"]
 
 @dataclass(frozen=True)
 class Output:
-    """Something that a picture shows."""
+    """A named value of each pixel of a picture."""
 
     name: str
     """Name on the command line, in the viewer and in Python."""
     kind: Kind
     """color: red, green and blue in [0, 1]. opacity: a number in [0, 1]. distance: along the ray, scene units.
-    direction: a unit vector in scene coordinates. scalar: any number. The last two are means over the rays of a pixel,
-    as colours are; a direction is normalised afterwards."""
+    direction: a unit vector in scene coordinates. scalar: any number. Directions and scalars of a pixel are means over
+    its rays, as colours are; directions are normalised afterwards."""
     label: str = ""
-    """Words above its picture; the name if empty."""
+    """Caption of its picture; the name if empty."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -32,16 +32,16 @@ class Output:
         return (3,) if self.kind in ("color", "direction") else ()
 
     def averaged(self, values: Tensor, rays_per_pixel: int) -> Tensor:
-        """Return the value of each pixel, from those of its rays.
+        """Return the value of each pixel, computed from its rays.
 
         Args:
-            values: (R, *shape) values of rays, those of a pixel one after the other.
+            values: (R, *shape) values of rays; rays of a pixel are consecutive.
             rays_per_pixel: number of rays of a pixel.
         """
         return values if rays_per_pixel == 1 else values.view(-1, rays_per_pixel, *self.shape).mean(1)
 
     def finished(self, values: Tensor) -> Tensor:
-        """Return values (P, *shape) of pixels as a picture holds them: directions with unit length.
+        """Return values (P, *shape) of pixels in their final form: directions are normalised.
 
         Args:
             values: values of pixels.
@@ -49,7 +49,7 @@ class Output:
         return safe_normalize(values.float()) if self.kind == "direction" else values.float()
 
     def pictured(self, values: Tensor) -> Tensor:
-        """Return values (..., *shape) as colours or a grey in [0, 1]; of a distance or a scalar as they are.
+        """Return values (..., *shape) as colours or grey in [0, 1]; distances and scalars are returned unchanged.
 
         Args:
             values: values of pixels.
@@ -62,9 +62,9 @@ DEPTH = Output("depth", "distance", "mean depth, scene units")
 MEDIAN_DEPTH = Output("median_depth", "distance", "depth, scene units")
 ACCUMULATION = Output("accumulation", "opacity", "opacity")
 FIXED = RGB, DEPTH, MEDIAN_DEPTH, ACCUMULATION
-"""Outputs of every method, which are fields of `Rendered`, `Pixels` and `Picture`."""
+"""Outputs of every method: fields of `Rendered`, `Pixels` and `Picture`."""
 NORMALS = Output("normals", "direction")
-"""Directions of surfaces, pointing away from them."""
+"""Outward directions of surfaces."""
 
 
 def empty(outputs: tuple[Output, ...], count: int, device: torch.device) -> dict[str, Tensor]:

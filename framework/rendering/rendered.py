@@ -1,4 +1,4 @@
-"""Results of rendering: of rays, of pixels, and of a whole image."""
+"""Results of rendering: values of rays, of pixels, and of a whole image."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Rendered:
-    """Rendered values of R rays, and the N samples that they were computed from."""
+    """Rendered values of R rays, and the N samples they come from."""
 
     rgb: Tensor
     """(R, 3) colour in [0, 1] over the background."""
@@ -42,17 +42,17 @@ class Rendered:
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
     num_samples: int | Tensor
-    """Number of evaluations of the field on these rays, without those of proposals; () int64 in training steps that do
-    not wait for the device."""
+    """Number of evaluations of the field on these rays, excluding proposals; () int64 in training steps that do not
+    wait for the device."""
     weights: Tensor | None = None
     """(N,) weight of each sample."""
     samples: Samples | None = None
     """The samples."""
     extras: Mapping[str, Any] = field(default_factory=dict)
-    """Further values by name, tensors (R, ...): outputs that the renderer declares, and what losses look at. `coarse`
-    is the coarse level, if it is supervised too."""
+    """Further values by name, tensors (R, ...): outputs declared by the renderer, and inputs of losses. `coarse` is the
+    coarse level, if it is supervised too."""
     error_bound: float = 0.0
-    """Maximum error of a colour channel that the early stop of rays causes."""
+    """Maximum error of a colour channel caused by the early stop of rays."""
 
     @property
     def coarse(self) -> Rendered | None:
@@ -60,10 +60,10 @@ class Rendered:
         return self.extras.get("coarse")
 
     def over(self, coarse: Rendered) -> Rendered:
-        """Return these values with those of the coarse level attached, and the evaluations of both levels added up.
+        """Attach the coarse level to these values, and add up the numbers of evaluations.
 
         Args:
-            coarse: the coarse level, rendered on the same rays.
+            coarse: the coarse level of the same rays.
         """
         extras = {**self.extras, "coarse": coarse}
         return replace(self, extras=extras, num_samples=self.num_samples + coarse.num_samples)
@@ -76,7 +76,7 @@ class Rendered:
 
         Args:
             rays_per_pixel: number of consecutive rays that form a pixel.
-            outputs: further outputs that the pixels get, as far as the rays have them.
+            outputs: further outputs of the pixels; those that the rays lack are left out.
 
         Returns:
             R / rays_per_pixel pixels.
@@ -113,7 +113,7 @@ class Picture:
     extras: Mapping[str, Tensor] = field(default_factory=dict)
     """Further outputs (H, W, ...) by name."""
     outputs: tuple[Output, ...] = ()
-    """What `extras` are, as the model declares them (`Model.outputs`)."""
+    """Declarations of `extras`, from the model (`Model.outputs`)."""
     num_rays: int = 0
     """Number of rays that were cast for the image; 0 if the method casts none."""
 

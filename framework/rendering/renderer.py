@@ -20,9 +20,9 @@ class Renderer(nn.Module, ABC):
     """
 
     optimised: Optimised | None = None
-    """Optimiser settings of its parameters; those of the model if None."""
+    """Optimiser settings of its parameters; if None, the model's."""
     outputs: tuple[Output, ...] = ()
-    """What it computes beside colours, depths and opacity, and pictures show (`Rendered.extras`)."""
+    """Declarations of outputs beside colour, depths and opacity (`Rendered.extras`)."""
 
     @abstractmethod
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
@@ -31,7 +31,7 @@ class Renderer(nn.Module, ABC):
         Args:
             rays: the rays; R may be 0.
             samples: samples along the rays. If the sampler has attached density and features (`Samples.sigma`,
-                `Samples.features`), these are used and not evaluated again.
+                `Samples.features`), these are used and the field is not evaluated again.
             field: the field that was sampled.
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """

@@ -1,4 +1,4 @@
-"""Traced rays, rendered or learnt from in one compiled call where sampler, renderer and field are the plain ones."""
+"""Traced rays: rendered or trained in one compiled call, if sampler, renderer and field are the basic ones."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from nerfloom.samplers.occupancy import OccupancySampler
 def error_of_traced(
     rays: Rays, pixels: PixelTargets, sampler: Sampler, field: Field, renderer: Renderer, thin: float = 0.0
 ) -> TracedError | None:
-    """Return the mean squared error of pixels in training mode, by `traced_error`.
+    """Return the mean squared error of pixels in training mode, computed by `traced_error`.
 
     Args:
         rays: R rays.
-        pixels: what these should show.
+        pixels: target pixels.
         sampler: chooses the positions along each ray.
         field: density and colour.
         renderer: turns samples into colours.
         thin: as in `traced_error`.
 
     Returns:
-        None without rays, or where one of the parts computes something else.
+        None if there are no rays, or if a part overrides the basic computation.
     """
     if not sampler.training or not isinstance(sampler, OccupancySampler) or sampler.is_fixed(rays):
         return None
@@ -42,7 +42,7 @@ def error_of_traced(
 
 
 def traced_rays(rays: Rays, background: Tensor, sampler: Sampler, field: Field, renderer: Renderer) -> Rendered | None:
-    """Return rays as they are rendered outside of training, by `traced_colors`, without weights and samples.
+    """Render rays outside of training by `traced_colors`, without weights and samples.
 
     Args:
         rays: R rays.
@@ -52,7 +52,7 @@ def traced_rays(rays: Rays, background: Tensor, sampler: Sampler, field: Field, 
         renderer: turns samples into colours.
 
     Returns:
-        None with gradients, without rays, or where one of the parts computes something else.
+        None if gradients are enabled, if there are no rays, or if a part overrides the basic computation.
     """
     if sampler.training or torch.is_grad_enabled() or not isinstance(sampler, OccupancySampler):
         return None
@@ -74,7 +74,7 @@ def traced_rays(rays: Rays, background: Tensor, sampler: Sampler, field: Field, 
 def _plain(
     rays: Rays, sampler: OccupancySampler, field: Field, renderer: Renderer
 ) -> tuple[GridDensity, GridColor] | None:
-    """Return the field's density and colour, if it has such, and sampler and renderer are the plain ones."""
+    """Return the field's density and colour for the kernels; None unless sampler, field and renderer are basic ones."""
     if type(sampler) is not OccupancySampler or sampler.endless or not len(rays):
         return None
     if type(renderer) is not VolumeRenderer or not isinstance(field, HasGridColor):

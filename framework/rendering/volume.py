@@ -1,7 +1,8 @@
 """Volume rendering: NeRF (Mildenhall et al. 2020), equation 3; gradients scaled down near cameras.
 
-The scaling is that of Philip and Deschaintre 2023, "Gradient Scaling for Floater-Free Neural Radiance Fields": what is
-near a camera is seen by few others, at a higher density of samples, so that it would learn faster than what is far.
+Gradient scaling follows Philip and Deschaintre 2023, "Gradient Scaling for Floater-Free Neural Radiance Fields".
+Content near a camera is seen by few other cameras and sampled more densely, so without scaling it learns faster than
+the rest.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from nerfloom.samplers.proposal import half_edge
 class VolumeRenderer(Renderer):
     """A renderer that composites densities, or alphas if the field has them (`HasAlpha`): NeRF, equation 3.
 
-    Subclasses can override `shade`, which computes colours and weights of samples, or `render`, which calls it.
+    Subclasses can override `shade`, which computes colours and weights of samples, or `render`, which calls `shade`.
 
     Args:
         unit_length: distance from the camera up to which gradients are scaled down in training, by squared distance,
             scene units; None for no scaling.
-        thin: share of the mean gradient below which samples are thinned in training on the CPU; 0 for none.
+        thin: samples below this fraction of the mean gradient are thinned in training on the CPU; 0 for none.
     """
 
     def __init__(self, unit_length: float | None = None, thin: float = 0.0) -> None:
@@ -65,7 +66,7 @@ class VolumeRenderer(Renderer):
 
 
 def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
-    """Return the renderer of most methods, with gradients scaled near cameras and thinned as the settings say."""
+    """Return the renderer of most methods, with gradient scaling near cameras and thinning from the settings."""
     return VolumeRenderer(scaled_up_to(config, scene), config.thin_gradients)
 
 
@@ -75,7 +76,7 @@ def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
 
 
 def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
-    """Return samples with density or alpha, and features; those that have them are returned as they are.
+    """Return samples with density or alpha, and features; samples that already have them are returned unchanged.
 
     Args:
         rays: R rays.
@@ -108,7 +109,7 @@ def shade(
         field: the field, which computes colours from features and directions.
         background: (R, 3) or (3,) colour in [0, 1] of the background.
         gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
-        thin: share of the mean gradient below which samples are thinned, if they have densities; 0 for none.
+        thin: samples with densities are thinned below this fraction of the mean gradient; 0 for none.
 
     Raises:
         ValueError: if the samples have no density or no features.
@@ -155,7 +156,7 @@ def volume_render(
 
 
 def mean_distance(moments: Tensor, opacity: Tensor, fars: Tensor) -> Tensor:
-    """Return the mean distance (R,) of what rays show; the far end of rays that show nothing.
+    """Return the mean distance (R,) of the visible light of rays; the far end for transparent rays.
 
     Args:
         moments: (R,) sums of weight times distance.

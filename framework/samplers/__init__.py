@@ -1,1 +1,1 @@
-"""Samplers, which choose where on each ray a field is evaluated. Each file has one sampler."""
+"""Samplers choose the positions on rays at which a field is evaluated. Each file has one sampler."""

@@ -1,4 +1,4 @@
-"""Backgrounds, outside of a scene's box: nothing, a field on the inverted sphere, or the same field, contracted.
+"""Backgrounds, outside a scene's box: none, a second field on the inverted sphere, or the same field, contracted.
 
 The inverted sphere is NeRF++ (Zhang et al. 2020), contraction mip-NeRF 360 (Barron et al. 2022).
 """
@@ -18,24 +18,24 @@ from nerfloom.data.scene import Scene
 from nerfloom.samplers.choice import SamplingConfig, sampler_choice
 
 MARGIN = 1.1
-"""Radius of the sphere, in units of the distance of the farthest camera from its centre, as in NeRF++'s own code."""
+"""Radius of the sphere, relative to the distance of the farthest camera from its centre, as in NeRF++'s own code."""
 Model = Literal["none", "sphere", "contraction"]
-"""A background that is decided."""
+"""A decided background."""
 
 
 @dataclass(frozen=True)
 class BackgroundConfig(SamplingConfig):
-    """Settings of a method that can show what is outside of the scene's box."""
+    """Settings of a method that can show the outside of the scene's box."""
 
     RANGES: ClassVar[dict[str, Range]] = {"num_background_samples": (1, 2**14)}
     """Allowed ranges."""
     background_model: Auto[Literal["none", "sphere", "contraction"]] = AUTO
-    """What is outside of the scene's box. none: nothing. sphere: a second field in inverse distance (NeRF++), outside
-    of a sphere around the box's centre and all cameras. contraction: the same field, contracted, not with --sampler
-    hierarchical. auto: what suits the method if the scene may extend beyond the box, otherwise none."""
+    """Model of the outside of the scene's box. none: nothing. sphere: a second field in inverse distance (NeRF++),
+    outside a sphere around the box's centre and all cameras. contraction: the same field, contracted; not with
+    --sampler hierarchical. auto: the method's default if the scene may extend beyond the box, otherwise none."""
     num_background_samples: int = 32
-    """Samples per ray outside of the sphere, uniform in inverse distance (sphere). With --sampler hierarchical there
-    are as many outside as inside."""
+    """Samples per ray outside the sphere, uniform in inverse distance (sphere). With --sampler hierarchical, the
+    outside gets the same numbers of samples as the inside."""
 
 
 BackgroundConfigT = TypeVar("BackgroundConfigT", bound=BackgroundConfig)
@@ -44,20 +44,20 @@ BackgroundConfigT = TypeVar("BackgroundConfigT", bound=BackgroundConfig)
 def decide_background(
     config: BackgroundConfigT, scene: Scene, suits: Model = "contraction", bounded: str | None = None
 ) -> tuple[BackgroundConfigT, list[Decision]]:
-    """Decide what is outside of the box, and by which sampler the inside is sampled.
+    """Decide the background, and the sampler for the inside of the box.
 
     Args:
-        config: the method's settings; those two are filled in if they are left open.
+        config: the method's settings; the background and the sampler are filled in if they are open.
         scene: properties of the scene.
-        suits: the background that suits the method if the scene may extend beyond the box. Contraction is left out
-            with hierarchical sampling, which follows rays in space as it is.
-        bounded: the sampler of what ends; that of `sampler_choice` if None.
+        suits: the method's default background if the scene may extend beyond the box. Contraction is not used with
+            hierarchical sampling, which samples rays in uncontracted space.
+        bounded: the sampler for bounded scenes; if None, that of `sampler_choice`.
 
     Returns:
-        The settings, and the decisions that were made.
+        The settings, and the decisions made.
 
     Raises:
-        ConfigError: if contraction is asked for with hierarchical sampling, or a sphere in normalised device
+        ConfigError: if contraction is selected with hierarchical sampling, or a sphere in normalised device
             coordinates.
     """
     ends = str(config.sampler) == "hierarchical"
@@ -73,7 +73,7 @@ def decide_background(
         raise ConfigError("--background-model sphere: normalised device coordinates have no outside")
     choice = sampler_choice(config, foreground(config, scene).unbounded)
     if config.background_model == "sphere":
-        choice = replace(choice, reason="the background shows what is outside")
+        choice = replace(choice, reason="the background shows the outside")
     if bounded is not None and choice.value != "proposal":
         choice = replace(choice, value=bounded)
     config, more = fill(config, choice)
@@ -81,9 +81,9 @@ def decide_background(
 
 
 def foreground(config: BackgroundConfig, scene: Scene) -> Scene:
-    """Return the scene as the method's own field and sampler see it: without what the background shows.
+    """Return the scene for the method's own field and sampler, without the part that the background shows.
 
-    Inside of a sphere the box is the cube around the sphere.
+    With a sphere, the box is the cube around the sphere.
     """
     if config.background_model == "sphere":
         sphere = foreground_sphere(scene)
@@ -93,10 +93,10 @@ def foreground(config: BackgroundConfig, scene: Scene) -> Scene:
 
 
 def foreground_sphere(scene: Scene) -> Tensor:
-    """Return the sphere (4,), centre and radius, that divides inside and outside.
+    """Return the sphere (4,), centre and radius, that separates inside and outside.
 
-    It is around the centre of the box, and contains the box's inscribed ellipsoid and, with a margin, all training
-    cameras: as in NeRF++, where cameras look out of the sphere and never into it. Without cameras it contains the box.
+    It is centred on the box. It contains the box's inscribed ellipsoid and, with a margin, all training cameras, as in
+    NeRF++: cameras look out of the sphere and never into it. Without cameras it contains the box.
     """
     centre, half = scene.box.mean(0), (scene.box[1] - scene.box[0]) / 2
     if scene.camera_to_worlds is None:

@@ -15,19 +15,19 @@ from nerfloom.geometry.rays import Rays, Samples
 
 
 class Sampler(nn.Module, ABC):
-    """Base class of samplers, which choose where along rays a field is evaluated.
+    """Base class of samplers, which choose the positions along rays at which a field is evaluated.
 
-    A sampler's learnt values are parameters, and its other state is in buffers.
+    Learnt values of a sampler are parameters; its other state is in buffers.
     """
 
     optimised: Optimised | None = None
-    """Optimiser settings of its parameters; those of the model if None."""
+    """Optimiser settings of its parameters; if None, the model's."""
     samples_per_step: int | None = None
-    """Number of samples per training step, to which the number of rays is adapted; None for a fixed number of rays."""
+    """Target number of samples per training step; the number of rays adapts. None for a fixed number of rays."""
     has_coarse_level: bool = False
-    """Whether its samples come with a coarse level, which is rendered and supervised too (`Samples.coarse`)."""
+    """Whether its samples include a coarse level, which is rendered and supervised too (`Samples.coarse`)."""
     learns_from_weights: bool = False
-    """Whether it learns by a `loss` of its own, which the method's objective has as `SamplerLoss`."""
+    """Whether the sampler learns by its own `loss`; the method's objective then includes `SamplerLoss`."""
 
     @abstractmethod
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
@@ -35,8 +35,8 @@ class Sampler(nn.Module, ABC):
 
         Args:
             rays: the rays to sample.
-            field: the field, for samplers that evaluate it in order to sample. They attach the values to the result
-                (`Samples.sigma`, `Samples.features`), gradients included.
+            field: the field, for samplers that evaluate it in order to sample. Such samplers attach the values to the
+                result (`Samples.sigma`, `Samples.features`), gradients included.
             jitter: True for random positions (training), False for fixed ones (evaluation).
         """
 
@@ -49,22 +49,22 @@ class Sampler(nn.Module, ABC):
         """
 
     def step_kind(self, step: int) -> StepKind:
-        """Return what sampling in a training step computes besides the values of tensors.
+        """Return the kind of training step: what sampling computes besides values of tensors.
 
         Args:
             step: number of training steps done.
         """
-        return StepKind(varies="the sampler decides how many samples a ray has")
+        return StepKind(varies="the number of samples on a ray varies")
 
     def read_counts(self) -> None:
-        """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
+        """Read counts from the device and adapt sizes; called when the device is waited for anyway."""
 
     def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
         """Return the loss () that trains the sampler itself; None if it does not learn in this step.
 
         Args:
             samples: N samples that the sampler returned for a batch.
-            weights: (N,) weights of these samples when rendered.
+            weights: (N,) rendering weights of these samples.
         """
         return None
 
@@ -82,28 +82,28 @@ class SkipsCells(Protocol, metaclass=SeesRegistered):
     """A sampler that skips the empty cells of a grid over a box, or over L nested boxes (`Occupancy`)."""
 
     box: Tensor
-    """(2, 3) corners of the grid, of the smallest box if there are several, scene units."""
+    """(2, 3) corners of the grid, scene units; of the smallest box if there are several."""
     resolution: int
     """Number n of cells along each axis of a box."""
     levels: int
     """Number L of boxes."""
     slices: int
-    """Number T of equal parts of the time from 0 to 1, each of which has cells of its own; 1 for a still scene, or if
-    there are several boxes."""
+    """Number T of equal parts of the time from 0 to 1, each with its own cells; 1 for a static scene, or if there are
+    several boxes."""
     occupied: Tensor
     """(L n^3,) or (T n^3,) bool, True for cells that are sampled; cell (x, y, z) of box or slice l has the index
     ((l n + x) n + y) n + z."""
     carved: Tensor
-    """(L n^3,) or (T n^3,) bool, True for cells that stay empty; also for those in the middle of a box, in the place of
-    which a smaller box is looked at."""
+    """(L n^3,) or (T n^3,) bool, True for cells that stay empty. This includes cells in the middle of a box that a
+    smaller box covers."""
     early_stop: float
     """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
     def occupied_when(self, time: float | None = None) -> Tensor:
-        """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+        """Return the cells (L n^3,) that are occupied in the time slice of `time`; at any time if it is None."""
 
     def carve(self, hull: Tensor) -> None:
         """Mark all cells outside `hull`, (L n^3,) or (T n^3,) bool, as empty, permanently."""
 
     def forget(self) -> None:
-        """Discard what was computed from `occupied`; to be called after `occupied` has changed."""
+        """Discard cached values of `occupied`; must be called after `occupied` has changed."""

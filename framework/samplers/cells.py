@@ -1,4 +1,4 @@
-"""Cells of occupancy grids by their number: where they are, which are beside them, and density at places in them."""
+"""Cells of occupancy grids by index: their positions, their neighbours, and densities at positions inside them."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from nerfloom.fields.base import DensityFunction
 from nerfloom.geometry.points import Points
 
 CHUNK = 2**15
-"""Number of positions that are evaluated at once."""
+"""Number of positions evaluated at once."""
 
 
 def places(cells: Tensor, resolution: int) -> Tensor:
-    """Return the box or slice, and the place along x, y and z, (N, 4) int32 of cells.
+    """Return box or slice, and coordinates along x, y and z, (N, 4) int32 of cells.
 
     Args:
-        cells: (N,) numbers of cells, counted box by box or slice by slice, along z first.
+        cells: (N,) indices of cells, counted box by box or slice by slice, along z first.
         resolution: cells along each axis.
     """
-    n, narrow = resolution, cells.int()  # divided in half of the time
+    n, narrow = resolution, cells.int()  # int32 division takes half the time
     rows, columns = narrow // n, narrow // n**2
     return torch.stack([columns // n, columns % n, rows % n, narrow % n], dim=-1)
 
 
 def beside(cells: Tensor, resolution: int, parts: int, in_time: bool) -> Tensor:
-    """Return a random neighbour (N,) int64 of each of some cells, or the cell itself.
+    """Return a random neighbour (N,) int64 of each cell, or the cell itself.
 
     Args:
-        cells: (N,) numbers of cells, as in `places`.
+        cells: (N,) indices of cells, as in `places`.
         resolution: cells along each axis.
         parts: number of boxes or slices.
-        in_time: whether neighbours are also in the slices before and after, rather than in the same box.
+        in_time: whether neighbours include adjacent slices; otherwise they are in the same box.
     """
     n, place = resolution, places(cells, resolution).long()
     moved = place if in_time else place[:, 1:]
@@ -42,7 +42,7 @@ def beside(cells: Tensor, resolution: int, parts: int, in_time: bool) -> Tensor:
 
 
 def densities_at(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:
-    """Return the density (N,) at positions, in chunks: allocating large results costs more than the work.
+    """Return the density (N,) at positions, evaluated in chunks, because allocating large results is slow.
 
     Args:
         density: the density.
@@ -57,12 +57,12 @@ def densities_at(density: DensityFunction, positions: Tensor, times: Tensor | No
 def densities_over_time(
     density: DensityFunction, positions: Tensor, starts: Tensor, length: float, looks: int
 ) -> Tensor:
-    """Return the maximum density (N,) over random times, one in each of a few equal parts of a slice of time.
+    """Return the maximum density (N,) over random times, one in each of several equal parts of a time slice.
 
     Args:
         density: the density.
         positions: (N, 3) scene coordinates.
-        starts: (N,) first times of the positions' slices, in [0, 1].
+        starts: (N,) start times of the positions' slices, in [0, 1].
         length: length of a slice.
         looks: number of parts; 0 for a static scene.
     """

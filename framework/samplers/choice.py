@@ -1,4 +1,4 @@
-"""Choice of a method's sampler: an occupancy grid, or proposals."""
+"""Choice of a method's sampler: occupancy grid or proposals."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from nerfloom.scene.motion import MotionConfig, vertices_in_time
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 PROPOSAL_SAMPLES, NERF_SAMPLES = (128, 64), 32
-"""Intervals a ray of each proposal, and samples a ray, where there is time for them."""
+"""Default intervals per ray of each proposal, and samples per ray; fewer if the training time is short."""
 FITTED_SECONDS, FEWEST_SAMPLES = 150.0, 12
-"""Seconds of training on two threads of a CPU up to which `samples_choices` takes the fewest samples a ray."""
+"""Up to this training time, in seconds on two CPU threads, `samples_choices` uses the fewest samples per ray."""
 MOST_PROPOSALS = 8
 """Maximum number of proposals."""
 COARSEST_MOVING, MOVING_FEATURES = 64, 8
-"""Vertices per axis of space of the first proposal of a scene that moves, each further one having twice as many, and
-features of a vertex: those of K-Planes, whose proposals are planes in space and time."""
+"""Spatial vertices per axis of the first proposal of a moving scene (each further proposal has twice as many), and
+features per vertex. The values are those of K-Planes, whose proposals are planes in space and time."""
 
 
 @dataclass(frozen=True)
@@ -54,34 +54,34 @@ class SamplingConfig(RayConfig):
     }
     """Minimum and maximum of these settings."""
     sampler: Auto[Literal["occupancy", "proposal"]] = AUTO
-    """occupancy: march through the occupied cells of the box, or, if the scene may extend beyond it, of nested boxes
-    around it. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
-    otherwise occupancy. Of a scene that may, both see all of space, contracted."""
+    """occupancy: march through the occupied cells of the box, or of nested boxes if the scene may extend beyond the
+    box. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
+    otherwise occupancy. For scenes that may extend beyond the box, both sample all of space, contracted."""
     silhouette_cells: bool = True
-    """Never sample cells of the occupancy grid that an image with an alpha channel shows to be empty (occupancy)."""
+    """Never sample cells of the occupancy grid that an image's alpha channel shows to be empty (occupancy)."""
     silhouette_pixels: bool = True
     """Never draw pixels whose ray passes only through such empty cells (occupancy)."""
     grid_resolution: int = 128
     """Cells along each axis of the occupancy grid (occupancy, in a box)."""
     nested_resolution: int = 64
-    """Cells along each axis of each of the nested boxes, a multiple of 4 (occupancy, beyond the box)."""
+    """Cells along each axis of each nested box, a multiple of 4 (occupancy, beyond the box)."""
     grid_levels: int = 8
-    """Most nested boxes, each twice as large as the one before; fewer if these reach the far end of the scene
-    (occupancy, beyond the box)."""
+    """Maximum number of nested boxes, each twice as large as the one before; fewer if these reach the far end of the
+    scene (occupancy, beyond the box)."""
     cone_angle: float = 1 / 64
-    """Growth of a step per unit of distance from the camera: about a cell of the nested boxes; 1/256 in the paper
-    (occupancy, beyond the box)."""
+    """Growth of a step per unit of distance from the camera. The default is about one cell of the nested boxes; 1/256
+    in the paper (occupancy, beyond the box)."""
     seen_cells: bool = True
-    """Never sample cells of nested boxes that no training image shows, or only from nearer than the points that it is
-    known to show (occupancy, beyond the box)."""
+    """Never sample cells of nested boxes that no training image shows, or that images show only from closer than their
+    known points (occupancy, beyond the box)."""
     num_steps: Auto[int] = 512
     """Steps along the diagonal of the box (occupancy)."""
     eval_step_scale: Auto[float] = 1.0
-    """Length of a step in rendering, in those of training (occupancy)."""
+    """Length of a step in rendering, relative to a training step (occupancy)."""
     early_stop: float = 1e-4
     """Transmittance below which the rest of a ray is dropped: the maximum error of a colour channel (occupancy)."""
     train_early_stop: float = 1e-2
-    """The same threshold during training, where less exact colours are sufficient (occupancy)."""
+    """The same threshold during training, where less exact colours suffice (occupancy)."""
     num_proposal_samples: Auto[tuple[int, ...]] = PROPOSAL_SAMPLES
     """Intervals per ray of each proposal (proposal)."""
     num_nerf_samples: Auto[int] = NERF_SAMPLES
@@ -90,12 +90,12 @@ class SamplingConfig(RayConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.num_proposal_samples is not None and not 1 <= len(self.num_proposal_samples) <= MOST_PROPOSALS:
-            raise ConfigError(f"--num-proposal-samples must name 1 to {MOST_PROPOSALS} proposals, as in 128 64")
+            raise ConfigError(f"--num-proposal-samples takes 1 to {MOST_PROPOSALS} numbers, such as 128 64")
 
 
 @dataclass(frozen=True)
 class HierarchicalConfig(SamplingConfig):
-    """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as NeRF is."""
+    """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as in NeRF."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "num_coarse_samples": (LEAST_COARSE, 2**14),
@@ -104,12 +104,12 @@ class HierarchicalConfig(SamplingConfig):
     """Minimum and maximum of these settings."""
     sampler: Auto[Literal["hierarchical", "occupancy", "proposal"]] = AUTO  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
-    small density fields that choose the samples, in all of space, contracted. auto: proposal if the scene may extend
+    small density fields that choose the samples in all of space, contracted. auto: proposal if the scene may extend
     beyond the box, otherwise hierarchical."""
     num_coarse_samples: int = 64
     """Stratified samples per ray for the coarse field (hierarchical)."""
     num_fine_samples: int = 128
-    """Further samples per ray for the fine field, drawn from the weights of the coarse field (hierarchical)."""
+    """Further samples per ray for the fine field, drawn from the coarse field's weights (hierarchical)."""
 
 
 SamplingConfigT = TypeVar("SamplingConfigT", bound=SamplingConfig)
@@ -128,23 +128,23 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
 
 
 def decide_sampler(config: SamplingConfigT, scene: Scene) -> tuple[SamplingConfigT, list[Decision]]:
-    """Decide `--sampler auto` by the scene: `Method.decide` of a method that leaves no other setting open.
+    """Decide `--sampler auto` from the scene: `Method.decide` of a method with no other open setting.
 
     Returns:
-        the settings, and the decisions that were made.
+        the settings, and the decisions made.
     """
     return fill(config, sampler_choice(config, scene.unbounded))
 
 
 def decide_samples(config: SamplingConfigT, count: int) -> tuple[SamplingConfigT, list[Decision]]:
-    """Decide the number of samples in a training step with an occupancy grid; other samplers have a number of rays.
+    """Decide the number of samples per training step with an occupancy grid; other samplers use a number of rays.
 
     Args:
         config: the method's settings, with the sampler decided.
-        count: number of samples that suits the method.
+        count: the method's default number of samples.
 
     Returns:
-        the settings, and the decision, if it was made.
+        the settings, and the decision, if one was made.
     """
     if config.sampler != "occupancy":
         return config, []
@@ -153,16 +153,16 @@ def decide_samples(config: SamplingConfigT, count: int) -> tuple[SamplingConfigT
 
 
 def samples_choices(config: SamplingConfig, unlimited: tuple[int, ...] = PROPOSAL_SAMPLES) -> tuple[Choice, Choice]:
-    """Return the intervals of two proposals and the samples of a ray that suit the time on a CPU.
+    """Return intervals of two proposals and samples per ray that suit the training time on a CPU.
 
-    With few samples more rays are seen in the same time. A cup had 28.3, 28.9, 29.3 and 29.5 dB after 100 s with 32,
-    24, 16 and 12 samples. After 600 s fern had 26.6 dB with 16 and 26.9 dB with 32, in half as many steps
-    (docs/notes/captures.md). So there are 12 up to 150 s on two threads, and more by the square root of time, 24 at 600
-    s, up to 32.
+    Fewer samples per ray allow more rays in the same time. A cup reached 28.3, 28.9, 29.3 and 29.5 dB after 100 s with
+    32, 24, 16 and 12 samples. After 600 s fern had 26.6 dB with 16 samples and 26.9 dB with 32, in half as many steps
+    (docs/notes/captures.md). So there are 12 samples up to 150 s on two threads. Beyond, they grow with the square root
+    of time, to 24 at 600 s and at most 32.
 
     Args:
-        config: the method's settings, whose time and machine count.
-        unlimited: intervals of each proposal without a limit of time.
+        config: the method's settings; training time and machine are used.
+        unlimited: intervals of each proposal without a time limit.
     """
     seconds, proposals, count, suits = _seconds(config), unlimited, NERF_SAMPLES, "there is time for it"
     if seconds < math.inf:
@@ -175,16 +175,17 @@ def samples_choices(config: SamplingConfig, unlimited: tuple[int, ...] = PROPOSA
 
 
 def batch_choice(config: SamplingConfig, fewest: int, most: int, until: float) -> Choice:
-    """Return the samples of a training step that suit the time on a CPU, for feature planes.
+    """Return the samples per training step that suit the training time on a CPU, for feature planes.
 
-    Small steps are more steps, which learn more in a short time; large ones have less noise (docs/notes/learning.md).
-    That was measured with an occupancy grid; with proposals there are as many as without a limit of time.
+    Smaller steps allow more steps, which learn more in a short time; larger steps have less noise
+    (docs/notes/learning.md). This was measured with an occupancy grid; with proposals the number is that without a time
+    limit.
 
     Args:
-        config: the method's settings, with the sampler decided, whose time and machine count.
-        fewest: samples in a short time.
-        most: maximum, and the samples without a limit of time.
-        until: seconds on two threads from which on the samples grow with the time.
+        config: the method's settings, with the sampler decided; training time and machine are used.
+        fewest: samples for short times.
+        most: maximum number of samples, also used without a time limit.
+        until: time in seconds on two threads beyond which the samples grow with time.
     """
     seconds = _seconds(config) if config.sampler == "occupancy" else math.inf
     count = most if seconds == math.inf else min(1024 * round(fewest / 1024 * max(seconds / until, 1.0)), most)
@@ -193,14 +194,14 @@ def batch_choice(config: SamplingConfig, fewest: int, most: int, until: float) -
 
 
 def _seconds(config: SamplingConfig) -> float:
-    """Return the seconds on two threads that are worth the time; infinity without a limit, or not on a CPU."""
+    """Return the training time converted to seconds on two threads; infinity without a limit, or not on a CPU."""
     if config.max_seconds is None or device_kind(config.machine) != "cpu":
         return math.inf
     return config.max_seconds * relative_speed(config.machine)
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
-    """Return the box (2, 3) around which a method's field contracts all of space; None if the field ends at the box."""
+    """Return the box (2, 3) around which a method's field contracts all of space; None without contraction."""
     return scene.box if scene.unbounded and config.sampler in ("occupancy", "proposal") else None
 
 
@@ -216,11 +217,11 @@ def make_sampler(
     Args:
         config: the settings, decided.
         scene: properties of the scene.
-        make_coarse: creates the coarse field of `--sampler hierarchical`, or returns None if the field serves as its
-            own; None if the method has no such level.
-        proposals: density fields of `--sampler proposal`; if None, hash grids, or planes in space and time for a method
-            that learns motion.
-        learn_every: interval of steps at which proposals learn.
+        make_coarse: creates the coarse field of `--sampler hierarchical`; it returns None if the field is its own
+            coarse field. None if the method has no coarse level.
+        proposals: density fields of `--sampler proposal`. If None, they are hash grids, or planes in space and time for
+            a method that learns motion.
+        learn_every: number of steps from one update of the proposals to the next.
 
     Raises:
         ConfigError: if the hierarchical sampler is selected and the method has no coarse level.
@@ -273,12 +274,12 @@ def _sampler(
 
 
 def _moving_proposal(scene: Scene, resolution: int) -> DensityField:
-    """Return a density on planes in space and time, of `resolution` vertices per axis of space."""
+    """Return a density on planes in space and time, with `resolution` vertices per spatial axis."""
     vertices = (resolution,) * 3 + (vertices_in_time(scene),)
     return DensityField(scene.box, FeaturePlanes((vertices,), MOVING_FEATURES), unbounded=scene.unbounded)
 
 
 def _levels(config: SamplingConfig, scene: Scene) -> int:
-    """Return the number of nested boxes: enough to reach the far end, but no more than `config` allows."""
+    """Return the number of nested boxes that reach the far end, at most the one in `config`."""
     reach = math.log2(max(scene.far / half_edge(scene.box), 1.0))  # infinite where the far end is
     return 1 + math.ceil(min(reach, config.grid_levels - 1))

@@ -16,11 +16,11 @@ from nerfloom.kernels.march.waves import Occupancy, Wave
 from nerfloom.samplers.sample_capacity import Room
 
 SHORTEST = 1e-10
-"""Length by which the optical depth of an empty slot is divided, scene units."""
+"""Divisor for the optical depth of an empty slot, scene units."""
 
 
 class Steps(NamedTuple):
-    """Steps of rays through a grid, as `nerfloom.kernels.march.fixed_slots.fill` takes them."""
+    """Steps of rays through a grid, in the form of `nerfloom.kernels.march.fixed_slots.fill`."""
 
     occupancy: Occupancy
     """The grid, of one box."""
@@ -29,7 +29,7 @@ class Steps(NamedTuple):
     number: int
     """Number of steps along the diagonal of the box."""
     shift: Tensor | None
-    """(R,) fraction of a step by which the first step starts in front of the box; None for 0."""
+    """(R,) fraction of a step by which the first step starts before the box; None for 0."""
 
 
 def sample_into_slots(
@@ -41,10 +41,10 @@ def sample_into_slots(
     early_stop: float,
     usual: int | None = None,
 ) -> Samples:
-    """Return samples in occupied cells, up to the early stop, without a wait for the device.
+    """Return samples in occupied cells, up to the early stop, without waiting for the device.
 
-    The density is evaluated at all candidates, and again, with gradient, where light reaches. What a step has needed is
-    noted in `room`.
+    The density is evaluated at all candidates, and again, with gradient, at those that light reaches. The sizes that
+    the step needed are recorded in `room`.
 
     Args:
         rays: R rays, R > 0.
@@ -53,14 +53,14 @@ def sample_into_slots(
         evaluate: density or opacity, and features, of intervals.
         surface: the field, if it has opacities.
         early_stop: transmittance below which the rest of a ray is dropped.
-        usual: number of samples that a step should have; None for any.
+        usual: target number of samples per step; None without a target.
     """
     count, sizes = len(rays), room.of(len(rays), usual)
     with torch.no_grad():
         found = fill(rays, *steps, (sizes.runs, sizes.candidates))
         placed = found.placed
         stopping = evaluate(_wave(rays, placed))[0]
-        if surface is not None:  # the density with the same opacity in each interval
+        if surface is not None:  # the density that gives the same opacity in each interval
             stopping = alpha_depth(stopping) / (placed.t_ends - placed.t_starts).clamp(min=SHORTEST)
         reached = reach(placed, stopping, early_stop, steps.number)
         kept = placed.first(reached, sizes.kept)
@@ -95,6 +95,6 @@ def attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, featu
 
 
 def _wave(rays: Rays, placed: Placed) -> Wave:
-    """Return intervals in slots with their positions on `rays`."""
+    """Return intervals in slots, with their positions on `rays`."""
     owners = placed.slots.owners
     return Wave(placed.t_starts, placed.t_ends, owners, rays.points(owners, (placed.t_starts + placed.t_ends) / 2))

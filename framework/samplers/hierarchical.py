@@ -19,18 +19,18 @@ from nerfloom.samplers.uniform import samples_from_points, stratified_points
 LEAST_COARSE = 3
 """Minimum number of stratified samples per ray; fine samples are drawn from the weights between first and last."""
 PADDING = 0.01
-"""Added to the blurred weights of intervals, so that all can be drawn: Mip-NeRF, equation 18."""
+"""Added to the blurred weights of intervals, so that every interval can be drawn: Mip-NeRF, equation 18."""
 
 
 class HierarchicalSampler(Sampler):
-    """Stratified samples, and further ones drawn from the weights that a coarse field has at the stratified ones.
+    """Stratified samples, and further samples drawn from a coarse field's weights at the stratified ones.
 
-    The coarse level is rendered and supervised too (`Samples.coarse`). It has one of two kinds:
+    The coarse level is rendered and supervised too (`Samples.coarse`). There are two kinds of coarse level:
 
-    - A coarse field of its own, which belongs to the sampler, at points: NeRF. The fine field is evaluated at the
-      points of both levels.
-    - The field itself, in intervals: Mip-NeRF, where one network is asked about cones of any length. The intervals of
-      the fine level are drawn from the blurred weights of the coarse ones, and take their place.
+    - A separate coarse field of the sampler, evaluated at points: NeRF. The fine field is evaluated at the points of
+      both levels.
+    - The field itself, evaluated in intervals: Mip-NeRF, where one network takes cones of any length. The intervals of
+      the fine level are drawn from the blurred weights of the coarse intervals and replace them.
 
     Args:
         coarse: the coarse field; None for the field itself.
@@ -38,7 +38,7 @@ class HierarchicalSampler(Sampler):
         num_fine: samples per ray drawn from the weights.
 
     Raises:
-        ValueError: if there are fewer than 3 stratified samples, which leave no weights between first and last.
+        ValueError: if there are fewer than 3 stratified samples, so that no weights remain between first and last.
     """
 
     has_coarse_level = True
@@ -46,7 +46,7 @@ class HierarchicalSampler(Sampler):
     def __init__(self, coarse: Field | None, num_coarse: int = 64, num_fine: int = 128) -> None:
         super().__init__()
         if num_coarse < LEAST_COARSE:
-            raise ValueError(f"{num_coarse} stratified samples cannot say where to look: at least {LEAST_COARSE} can")
+            raise ValueError(f"{num_coarse} stratified samples are too few; at least {LEAST_COARSE} are needed")
         self.coarse, self.num_coarse, self.num_fine = coarse, num_coarse, num_fine
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
@@ -103,10 +103,10 @@ def stratified_edges(rays: Rays, count: int, jitter: bool) -> Tensor:
 
 
 def blurred(weights: Tensor) -> Tensor:
-    """Return weights (R, B) that are no less than their own and half of what is beside them: Mip-NeRF, equation 18.
+    """Return a blurred envelope of weights (R, B), never below the weights themselves: Mip-NeRF, equation 18.
 
-    A maximum of two neighbours, then a mean of two: an envelope, so that samples are drawn around what intervals find
-    and not only in them. Mip-NeRF adds a constant besides (`PADDING`).
+    It is a maximum of two neighbours, then a mean of two, so that samples are drawn also beside intervals with weight.
+    Mip-NeRF also adds a constant (`PADDING`).
 
     Args:
         weights: (R, B) weights of intervals.

@@ -1,4 +1,4 @@
-"""The pixels of a view through which an occupancy grid is seen: all others show the background alone."""
+"""Pixels of a view through which an occupancy grid is visible; all others show only the background."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 
 LEAST = 2**14
-"""Minimum number of pixels of a view; to find those of a smaller one takes as long as their rays."""
+"""Minimum number of pixels of a view; for smaller views the search takes as long as tracing all rays."""
 
 
 def pixels_in_view(sampler: Sampler, view: View) -> Tensor | None:
-    """Return the pixels of a view whose rays may meet an occupied cell, and some more around these.
+    """Return the pixels of a view whose rays may meet an occupied cell, with a margin around them.
 
     Args:
         sampler: the sampler.
         view: the view, on the sampler's device.
 
     Returns:
-        (height, width) bool; None if that is not known: of other samplers, of grids that space does not end at, of
-        lenses, and of small views.
+        (height, width) bool; None if unknown: for other samplers, unbounded grids, lens distortion, and small views.
     """
     camera, small = view.camera, view.height * view.width < LEAST
     if type(sampler) is not OccupancySampler or sampler.levels > 1 or sampler.endless:

@@ -1,4 +1,4 @@
-"""Sampling of the part of rays that is inside of a sphere; what is outside belongs to a background."""
+"""Sampling of the part of rays inside a sphere; the background covers the outside."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerfloom.samplers.choice import make_sampler
 
 
 class InsideSphere(Sampler):
-    """Samples of another sampler, up to where rays leave a sphere.
+    """Samples of another sampler, clipped where rays leave a sphere.
 
     Args:
         sampler: chooses the samples between the near and the far end of each ray.
@@ -65,7 +65,7 @@ def make_foreground_sampler(
 
     Args:
         config: the settings, decided.
-        scene: properties of the scene; not of its foreground.
+        scene: properties of the whole scene, not of its foreground.
         make_coarse: creates the coarse field of `--sampler hierarchical`, as in `make_sampler`.
     """
     sampler = make_sampler(config, foreground(config, scene), make_coarse)
@@ -75,7 +75,7 @@ def make_foreground_sampler(
 def clipped(samples: Samples, nears: Tensor, fars: Tensor) -> Samples:
     """Return samples whose intervals lie between two distances.
 
-    Samplers make the last interval of a ray endless, or march from a little before to a little behind.
+    Samplers may make the last interval of a ray endless, or march from slightly before the near end to slightly beyond.
 
     Args:
         samples: N samples of R rays.

@@ -1,10 +1,10 @@
 """Sampling with an occupancy grid, which skips empty space, in waves, which skip hidden space.
 
-The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2): it holds a decaying maximum of the density in each
-cell, and a cell is skipped while a step through it is nearly transparent. A scene without bounds has several nested
-boxes, each twice as large as the one before, through which steps grow with distance; all that is behind the largest is
-one last sample, as long as it takes to be opaque. The grid of a moving scene in one box may have slices of time, so
-that a ray skips what is empty at its own time.
+The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2). It holds a decaying maximum of the density in each
+cell; a cell is skipped while a step through it is nearly transparent. An unbounded scene has several nested boxes, each
+twice as large as the one before, and steps grow with distance. One last sample, long enough to be opaque, covers all
+space behind the largest box. The grid of a moving scene in one box may have slices of time, so that a ray skips cells
+that are empty at its own time.
 """
 
 from __future__ import annotations
@@ -43,45 +43,45 @@ MAX_LEVELS = 16
 FARTHEST = 1e10
 """Far end of the last sample of an endless ray, scene units."""
 WARM_UP_STEPS = 256
-"""Number of training steps in which the cells are updated in the order of a fixed shuffle."""
+"""Number of training steps during which cells are updated in a fixed shuffled order."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, CELLS_A_TIME, MOVING_DECAY = 4, 6, 0.95
-"""Times at which a cell of a moving scene is evaluated at each update: with slices of time, one for as many cells as
-matter may cross in a slice, up to this number. Factor of a density that is not kept in slices, for it may be rare."""
+"""Number of times at which a cell of a moving scene is evaluated in each update. With time slices there is one for
+every `CELLS_A_TIME` cells that matter may cross in a slice, up to this maximum. `MOVING_DECAY` replaces the decay
+without slices, because an occupied time may be rare."""
 SHARE, SHARE_OF_SLICES = 64, 512
-"""Numbers of cells for each one that is drawn from all cells at an update after warm-up, without and with slices of
-time. With them there are more cells, of which fewer are occupied."""
+"""One in this many of all cells is drawn in each update after warm-up, without and with time slices. With slices there
+are more cells, and a smaller fraction is occupied."""
 PASSES, PASSES_OF_SLICES = 4, 1
-"""Passes over all cells during warm-up, without and with slices of time."""
+"""Number of passes over all cells during warm-up, without and with time slices."""
 COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
-"""Training steps until which the march through nested boxes takes longer steps, and how much longer these are. While
-nothing is known to be empty, few rays would take all samples."""
+"""Step until which the march through nested boxes takes longer steps, and their relative length. Without known empty
+cells, few rays would use up all samples."""
 SHUFFLE_STRIDE = 2654435761
-"""A prime number, whose multiples modulo the number of cells visit every cell once per pass, in scattered order."""
+"""A prime number. Its multiples modulo the number of cells visit every cell once per pass, in scattered order."""
 
 
 class OccupancySampler(Sampler):
     """Samples at steps through the occupied cells of a box, or of nested boxes.
 
     Args:
-        box: (2, 3) corners of the box, the smallest if there are several, scene units.
+        box: (2, 3) corners of the box, scene units; of the smallest box if there are several.
         resolution: cells along each axis of a box.
         num_steps: steps along the diagonal of the box.
         early_stop: transmittance below which the rest of a ray is dropped: the maximum error of a colour channel. 0
-            drops nothing.
-        train_early_stop: the same threshold during training, where less exact colours are sufficient; `early_stop` if
-            None.
-        alpha_threshold: a cell is occupied if the opacity of one step through it is at least this, or at least the mean
-            over its box, or over the smallest one, if both are less.
-        cone: growth of the step per unit of distance, beyond the distance where it exceeds the even step; 0 for even
-            steps throughout.
-        moving: whether the scene changes with time; a cell is then occupied if it is at any time of its slice.
-        levels: number of nested boxes, each of twice the size and with as many cells.
-        endless: whether rays have a last sample for all that is behind the largest box, which any density makes opaque:
-            for images without an alpha channel.
-        slices: number T of equal parts of the time from 0 to 1, each of which has cells of its own.
-        eval_step_scale: length of a step outside of training, in those of training.
+            disables the early stop.
+        train_early_stop: the same threshold during training, where less exact colours suffice; `early_stop` if None.
+        alpha_threshold: a cell is occupied if the opacity of one step through it reaches this threshold or, if that is
+            less, the mean opacity over its box or over the smallest box, whichever is larger.
+        cone: growth of the step per unit of distance, once this exceeds the even step; 0 for even steps throughout.
+        moving: whether the scene changes with time; a cell then counts as occupied if it is so at any time of its
+            slice.
+        levels: number of nested boxes; each is twice as large as the one before, with the same number of cells.
+        endless: whether rays have a last sample for all space behind the largest box; any density makes it opaque. For
+            images without an alpha channel.
+        slices: number T of equal parts of the time from 0 to 1, each with its own cells.
+        eval_step_scale: length of a step outside of training, relative to a training step.
 
     Raises:
         ConfigError: if the number of cells, boxes, slices or steps is out of range.
@@ -110,24 +110,24 @@ class OccupancySampler(Sampler):
         super().__init__()
         if not 1 <= resolution <= MAX_CELLS or not num_steps >= 1:
             raise ConfigError(
-                f"an occupancy grid has 1 to {MAX_CELLS} cells along an axis and 1 step or more, "
+                f"an occupancy grid needs 1 to {MAX_CELLS} cells along an axis and at least 1 step, "
                 f"not {shown(resolution)} and {shown(num_steps)}"
             )
         if not 1 <= levels <= MAX_LEVELS or (levels > 1 and resolution % 4):
             raise ConfigError(
-                f"1 to {MAX_LEVELS} boxes are nested, with a multiple of 4 cells along an axis, "
+                f"an occupancy grid has 1 to {MAX_LEVELS} nested boxes with a multiple of 4 cells along an axis, "
                 f"not {shown(levels)} with {resolution}"
             )
         if slices != 1 and not (1 < slices * resolution**3 <= MAX_CELLS**3 and slices > 0 and moving and levels == 1):
             raise ConfigError(
-                f"{shown(slices)} slices of time: there is 1, or more in one box of a scene that moves, with at most "
+                f"{shown(slices)} slices of time: several need one box of a moving scene, and at most "
                 f"{MAX_CELLS}^3 cells in all"
             )
         self.resolution, self.levels, self.endless, self.slices = resolution, levels, endless, slices
         self.step_size, self.num_steps = (box[1] - box[0]).norm().item() / num_steps, num_steps
         self.room = Room(math.ceil(most_steps(num_steps) / RUN), most_steps(num_steps))
         self.always_fixed = False
-        """Whether training steps have a fixed number of samples on the CPU too, for tests and counts."""
+        """Whether training steps use a fixed number of samples on the CPU too, for tests and counts."""
         self.early_stop = early_stop
         self.train_early_stop = early_stop if train_early_stop is None else train_early_stop
         self.alpha_threshold = alpha_threshold
@@ -145,18 +145,18 @@ class OccupancySampler(Sampler):
 
     @property
     def occupied_share(self) -> float:
-        """Fraction of the cells that are occupied, of those that are not in a smaller box."""
+        """Fraction of occupied cells among those that no smaller box covers."""
         return int(self.occupied.sum()) / (self.slices * int(own_cells(self.levels, self.resolution).sum()))
 
     @property
     def occupancy(self) -> Occupancy:
-        """The grid in the form that `march` needs."""
+        """The grid in the form for `march`."""
         if self._packed is None or self._packed.occupied is not self.occupied:
             self._packed = Occupancy(self.occupied, self.box, self.resolution, self.levels, self.slices)
         return self._packed
 
     def kept(self) -> tuple[int, Tensor | None]:
-        """Return the number K of the cells that are not carved, and their indices (K,) int32; None if these are all."""
+        """Return the number K of cells that are not carved, and their indices (K,) int32; None if no cell is carved."""
         known = self._kept
         if known is None or (known[1] is not None and known[1].device != self.carved.device):
             found = (~self.carved).nonzero().squeeze(-1).int()
@@ -164,19 +164,19 @@ class OccupancySampler(Sampler):
         return known
 
     def occupied_when(self, time: float | None = None) -> Tensor:
-        """Return the cells (L n^3,) that are occupied in the slice of `time`, or at any time if it is None."""
+        """Return the cells (L n^3,) that are occupied in the time slice of `time`; at any time if it is None."""
         of_slices = self.occupied.view(self.slices, -1)
         if time is None:
             return of_slices.any(0)
         return of_slices[min(max(int(time * self.slices), 0), self.slices - 1)]
 
     def forget_all(self) -> None:
-        """Discard also which cells are not carved; to be called after `carved` has changed."""
+        """Discard the cached list of cells that are not carved; must be called after `carved` has changed."""
         self._kept = None
         self.forget()
 
     def forget(self) -> None:
-        """Discard `occupancy`, which is computed again on demand; to be called after `occupied` has changed."""
+        """Discard the cached `occupancy`; must be called after `occupied` has changed."""
         if self._packed is not None and self._has_fixed_sizes:
             self._packed.refresh()
         else:
@@ -184,7 +184,7 @@ class OccupancySampler(Sampler):
 
     @property
     def _has_fixed_sizes(self) -> bool:
-        """Whether training steps take a fixed number of samples, for which Python need not wait for the device."""
+        """Whether training steps use a fixed number of samples, so that Python need not wait for the device."""
         ahead = self.always_fixed or devices.runs_ahead(self.occupied.device)
         return ahead and self.levels == 1 and not self.cone and not self.endless
 
@@ -193,19 +193,18 @@ class OccupancySampler(Sampler):
     def sample(self, rays: Rays, field: Field, jitter: bool, early_stop: float | None = None) -> Samples:
         """Return samples in occupied cells, up to the early stop, with densities and features attached.
 
-        A ray whose light reaches past the largest box of an endless grid has one sample more.
-
-        The samples that are dropped could have changed a colour channel by at most the threshold of the early stop.
+        In an endless grid, a ray whose light reaches beyond the largest box gets one more sample. The dropped samples
+        change a colour channel by at most the threshold of the early stop.
 
         Args:
             rays: R rays; they must not require a gradient.
             field: the field, which is evaluated at the samples.
             jitter: True to start each ray at a random fraction of a step, False to start at 0.
-            early_stop: transmittance below which the rest of a ray is dropped; if None, the sampler's own:
-                `train_early_stop` in training mode, and else `early_stop`.
+            early_stop: transmittance below which the rest of a ray is dropped. If None, `train_early_stop` in training
+                mode, otherwise `early_stop`.
 
         Raises:
-            ValueError: if the rays require a gradient, which marched samples do not have.
+            ValueError: if the rays require a gradient, because marched samples have none.
         """
         own = self.train_early_stop if self.training else self.early_stop
         stop = own if early_stop is None else early_stop
@@ -232,7 +231,7 @@ class OccupancySampler(Sampler):
         evaluated = Waves()
         while (wave := marched.wave(marched.next_limit)) is not None:
             stopping = evaluated.evaluate(len(wave.owners), partial(evaluate, wave))[0]
-            if surface is not None:  # the march needs the density with the same opacity in each interval
+            if surface is not None:  # the march needs the density that gives the same opacity
                 stopping = alpha_depth(stopping.detach()) / (wave.t_ends - wave.t_starts)
             marched.advance(stopping)
         rest = marched.rest(self.occupancy.outer) if self.endless else None
@@ -256,7 +255,7 @@ class OccupancySampler(Sampler):
         return attached(samples, surface, *evaluated.choose(order, chosen))
 
     def is_fixed(self, rays: Rays) -> bool:
-        """Return whether `sample` returns a number of samples of `rays` that does not depend on what is on them."""
+        """Return whether the number of samples of `rays` is independent of the grid's contents."""
         return self.training and len(rays) > 0 and self._has_fixed_sizes
 
     def step_kind(self, step: int) -> StepKind:
@@ -266,7 +265,7 @@ class OccupancySampler(Sampler):
         self.room.read()
 
     def begin(self, rays: Rays, jitter: bool, early_stop: float) -> March:
-        """Return a march before its first wave.
+        """Return a march positioned before its first wave.
 
         Args:
             rays: R rays; they must not require a gradient.
@@ -274,14 +273,14 @@ class OccupancySampler(Sampler):
             early_stop: transmittance below which the rest of a ray is dropped.
 
         Raises:
-            ValueError: if the rays require a gradient, which marched samples do not have.
+            ValueError: if the rays require a gradient, because marched samples have none.
         """
         stride, shift = self._stride if self.training else self._eval_stride, self._shift(rays, jitter)
         return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
 
     def _shift(self, rays: Rays, jitter: bool) -> Tensor | None:
         if is_followed(rays.origins, rays.directions):
-            raise ValueError("marched samples carry no gradient to rays: detach these, or take a ProposalSampler")
+            raise ValueError("marched samples carry no gradient to rays: detach the rays or use a ProposalSampler")
         return torch.rand(len(rays), device=rays.origins.device) if jitter else None
 
     # -- updating the grid ------------------------------------------------------------------------------------
@@ -290,8 +289,8 @@ class OccupancySampler(Sampler):
         """Mark cells as empty, permanently.
 
         Args:
-            hull: (L n^3,) or (T n^3,) bool (`nerfloom.scene.silhouettes`), False for these cells; or, with slices of
-                time, (n^3,) for all of them.
+            hull: (L n^3,) or (T n^3,) bool (`nerfloom.scene.silhouettes`), False for these cells. With time slices also
+                (n^3,), for all slices.
         """
         own = own_cells(self.levels, self.resolution).to(hull.device)
         self.carved.view(self.slices, -1).copy_(~(hull.view(-1, len(own)) & own))
@@ -300,10 +299,10 @@ class OccupancySampler(Sampler):
         self.forget_all()
 
     def expect_motion(self, distance: float) -> None:
-        """Evaluate a cell at more times in each update if matter crosses many cells meanwhile.
+        """Evaluate each cell at more times per update if matter crosses many cells within a slice.
 
         Args:
-            distance: distance that matter may move in one slice of time, scene units.
+            distance: maximum distance that matter moves in one slice of time, scene units.
         """
         cells = distance * self.resolution / float((self.box[1] - self.box[0]).max())
         wanted = min(math.ceil(cells / CELLS_A_TIME), TIMES_PER_VISIT)
@@ -313,10 +312,10 @@ class OccupancySampler(Sampler):
     def update(self, step: int, density: DensityFunction) -> None:
         """Evaluate the density in some cells and update `occupied`, every 8 steps during warm-up and every 16 later.
 
-        During warm-up the cells are taken in the order of a fixed shuffle, so that all are evaluated soon; those of
-        nested boxes are all occupied until then. Afterwards one part is drawn from all cells that are not carved, so
-        that an empty cell can become occupied again, one part from the occupied cells, and one part from the neighbours
-        of occupied cells.
+        During warm-up the cells are visited in a fixed shuffled order, so that all are evaluated soon; until then,
+        cells of nested boxes count as occupied. Afterwards, one part is drawn from all cells that are not carved, so
+        that an empty cell can become occupied again. Further parts are drawn from the occupied cells and from their
+        neighbours.
 
         Args:
             step: number of training steps done.
@@ -326,7 +325,7 @@ class OccupancySampler(Sampler):
         if self.levels > 1:
             self._stride = next((longer for until, longer in COARSE_STEPS if step < until), 1.0)
         if step == 0:
-            self.kept()  # for which a device is waited for, before the first step
+            self.kept()  # waits for the device once, before the first step
         if step == 0 or step % (8 if warming_up else 16):
             return
         cells = self._shuffled(step // 8 - 1) if warming_up else self._drawn()
@@ -341,7 +340,7 @@ class OccupancySampler(Sampler):
         evaluated = torch.isfinite(before)
         self.density_grid.index_copy_(0, cells, torch.where(evaluated, torch.maximum(before, sigma), sigma))
         if self.levels > 1 and step < WARM_UP_STEPS // 4:
-            return  # cells that are not known yet would raise the mean, and empty all that are
+            return  # unknown cells would raise the mean, which would empty all known ones
         densities, occupied = self.density_grid.view(self.levels, -1), self.occupied.view(self.levels, -1)
         middle = 0.0  # mean opacity in the smallest of several boxes
         for number, step_size in enumerate(self._step_sizes()):
@@ -352,7 +351,7 @@ class OccupancySampler(Sampler):
         self.forget()
 
     def _step_sizes(self) -> list[float]:
-        """Return the length of a step in each box: near the faces, of a ray from the middle, if steps grow."""
+        """Return the step length in each box; with growing steps, that near its faces for a ray from the middle."""
         if self.levels == 1:
             return [self.step_size]
         half = float((self.box[1] - self.box[0]).min()) / 2
@@ -361,7 +360,7 @@ class OccupancySampler(Sampler):
     def _shuffled(self, turn: int) -> Tensor:
         """Return the cells of update number `turn` during warm-up, which makes four passes over the grid.
 
-        Only one in eight of the empty cells is returned, because few of them become occupied again.
+        Only one in eight of the empty cells is returned, because few become occupied again.
         """
         num_kept, kept = self.kept()
         count = math.ceil((PASSES if self.slices == 1 else PASSES_OF_SLICES) * num_kept * 8 / WARM_UP_STEPS)
@@ -371,7 +370,7 @@ class OccupancySampler(Sampler):
         return cells[self.occupied.index_select(0, cells) | (torch.rand(count, device=cells.device) < 1 / 8)]
 
     def _drawn(self) -> Tensor:
-        """Return random cells of all that are not carved, of the occupied ones, and of their neighbours.
+        """Return random cells: of all that are not carved, of the occupied cells, and of their neighbours.
 
         Matter that reaches only a little into a neighbour may be missed by one evaluation: for a thin shell the error
         is 30 times smaller with the neighbours than without (benchmarks/quadrature.py). A cell that is drawn twice is
@@ -394,7 +393,7 @@ class OccupancySampler(Sampler):
 
 
 def _opened(samples: Samples, rays: Tensor) -> Samples:
-    """Return samples that are evaluated where they were, the last one of each of `rays` (K,) ending at `FARTHEST`."""
+    """Return samples with unchanged positions in which the last sample of each of `rays` (K,) ends at `FARTHEST`."""
     ends = samples.t_ends.clone()
     ends[samples.offsets[rays + 1] - 1] = FARTHEST
     return replace(samples, t_ends=ends, points=samples.t)

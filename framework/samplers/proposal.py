@@ -1,11 +1,11 @@
 """Sampling with proposals, which are small density fields: mip-NeRF 360 (Barron et al. 2022), section 3.
 
-A proposal is evaluated cheaply in many intervals of a ray, and the intervals of the next level are drawn from its
-weights. The proposals are trained so that their weights bound those of the last level from above (`interlevel_loss`).
+Proposals are cheap to evaluate in many intervals of a ray. Intervals of the next level are drawn from their weights.
+The proposals are trained so that their weights bound those of the last level from above (`interlevel_loss`).
 
 Intervals are drawn in normalised distance s in [0, 1], from the near to the far end of a ray. In a bounded scene s is
-linear in the distance; in an unbounded scene it is linear up to half the edge of the box, and linear in disparity
-beyond, or follows Zip-NeRF's power ladder.
+linear in the distance. In an unbounded scene it is linear up to half the edge of the box and linear in disparity
+beyond, or it follows Zip-NeRF's power ladder.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ from nerfloom.samplers.base import Sampler
 ANNEALING_SLOPE = 10.0
 """Parameter b of the annealing of weights w^(b x / ((b - 1) x + 1)), where x is the fraction of `anneal_steps` done."""
 PADDING = 0.01
-"""Sum of what is added to the weights of a ray, so that every interval can be drawn."""
+"""Sum of the padding added to the weights of a ray, so that every interval can be drawn."""
 ALWAYS_LEARN_UNTIL, LEARN_EVERY = 256, 4
-"""Step until which the proposals learn in every step, and the interval of steps at which they learn afterwards."""
+"""Step until which the proposals learn in every step, and the number of steps between updates afterwards."""
 FARTHEST = 1e10
 """Far end of the last interval of an endless ray, scene units."""
 
 
 class ProposalSampler(Sampler):
-    """Samples that are drawn from the weights of one or more proposals in sequence.
+    """Samples drawn in levels, from the weights of one or more proposals.
 
     Args:
         box: (2, 3) corners of the box that holds the scene, scene units.
         counts: intervals per ray of each proposal, followed by the number of samples per ray.
         resolutions: cells along an axis at the finest level of each proposal's hash grid.
         unbounded: whether the scene extends beyond the box.
-        endless: whether the last interval ends at `FARTHEST`, so that any density there makes the ray opaque: for
+        endless: whether the last interval ends at `FARTHEST`, so that any density there makes the ray opaque. For
             images without an alpha channel.
         log2_table_size: maximum number of entries per level of the proposals' hash grids, as a power of two.
         num_levels: levels of the proposals' hash grids.
         anneal_steps: training steps over which the weights are annealed.
-        fields: other density fields in place of hash grids; the last one serves all further levels too.
-        learn_every: interval of steps at which the proposals learn, after the first `ALWAYS_LEARN_UNTIL`.
-        ladder: exponent of the power ladder by which distances of an unbounded scene are spaced; None for disparity.
-        blurs: for each proposal, the radius of the box with which the samples' histogram is blurred before it is
-            compared (Zip-NeRF's loss), in normalised distance; empty for the loss of mip-NeRF 360.
+        fields: other density fields instead of hash grids; the last field is also used for all further levels.
+        learn_every: number of steps between updates of the proposals, after the first `ALWAYS_LEARN_UNTIL`.
+        ladder: exponent of the power ladder that spaces distances of an unbounded scene; None for disparity.
+        blurs: for each proposal, the radius in normalised distance of the box filter on the samples' histogram in
+            Zip-NeRF's loss; empty for the loss of mip-NeRF 360.
 
     Raises:
-        ValueError: if there is not one count more than there are resolutions, more fields than levels, or not one blur
-            for each proposal.
+        ValueError: unless there is one count more than resolutions, at most one field per proposal, and one blur per
+            proposal (or none).
     """
 
     box: Tensor
@@ -89,7 +89,7 @@ class ProposalSampler(Sampler):
     ) -> None:
         super().__init__()
         if fields is None and len(counts) != len(resolutions) + 1:
-            raise ValueError(f"{len(counts)} counts for {len(resolutions)} proposals: one more is needed")
+            raise ValueError(f"{len(counts)} counts for {len(resolutions)} proposals: give one more")
         if fields is not None and not 1 <= len(fields) < len(counts):
             raise ValueError(f"{len(fields)} density fields for {len(counts) - 1} proposals")
         if blurs and len(blurs) != len(counts) - 1:
@@ -108,12 +108,12 @@ class ProposalSampler(Sampler):
 
     @property
     def proposals(self) -> list[Field]:
-        """The density fields, in the order in which they are evaluated."""
+        """The density fields, in the order of evaluation."""
         fields = [field for field in self.fields if isinstance(field, Field)]
         return fields + fields[-1:] * (len(self.counts) - 1 - len(fields))
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
-        """Return the samples of the last level, with the proposals' gradients attached in steps in which they learn."""
+        """Return the samples of the last level. In steps in which proposals learn, their gradients are attached."""
         learning = self.learning and self.training and torch.is_grad_enabled()
         nears, fars = self._ends(rays)
         samples = propose(
@@ -129,7 +129,7 @@ class ProposalSampler(Sampler):
         )
         if not self.endless:
             return samples
-        if field.footprint in ("gaussian", "frustum"):  # before the last interval is endless: that would be at infinity
+        if field.footprint in ("gaussian", "frustum"):  # before the last interval becomes endless
             samples = samples.evaluated(*field.density(sample_points(rays, samples, field.footprint)))
         ends = samples.padded(samples.t_ends).clone()
         ends[:, -1] = FARTHEST
@@ -142,7 +142,7 @@ class ProposalSampler(Sampler):
         self.learning = self.learns(step)
 
     def learns(self, step: int) -> bool:
-        """Return whether the proposals learn in the training step after `step` others."""
+        """Return whether the proposals learn in training step number `step`, counted from 0."""
         return step < ALWAYS_LEARN_UNTIL or step % self.learn_every == 0
 
     def step_kind(self, step: int) -> StepKind:
@@ -152,7 +152,7 @@ class ProposalSampler(Sampler):
         return interlevel_loss(samples, weights, self.blurs) if samples.proposals else None
 
     def _ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Return the distances (R,) at which sampling starts and ends; in a bounded scene those inside the box."""
+        """Return the distances (R,) at which sampling starts and ends; in a bounded scene, within the box."""
         if self.unbounded:
             return rays.nears, rays.fars
         enter, leave = intersect_box(rays.origins.detach(), rays.directions.detach(), self.box)
@@ -172,18 +172,18 @@ def propose(
     ladder: float | None = None,
     footprints: Sequence[Footprint] | None = None,
 ) -> Samples:
-    """Return samples that are drawn in levels, each from the weights of the level before.
+    """Return samples drawn in levels, each from the weights of the level before.
 
     Args:
         rays: R rays, sampled from the near to the far end.
-        densities: density of each level but the last.
+        densities: density of each proposal level.
         counts: intervals per ray of each level, followed by the number of samples per ray: one more than densities.
-        scale: the distance up to which normalised distance is linear, or the unit of the ladder, as in `spacing`.
+        scale: distance up to which normalised distance is linear, or the unit of the ladder, as in `spacing`.
         jitter: True for random positions, False for fixed ones.
-        power: exponent of the weights that are drawn from, as in `resample`; less than 1 flattens them.
+        power: exponent of the weights before drawing, as in `resample`; less than 1 flattens them.
         learning: whether to keep the proposals' weights, gradients attached, in `Samples.proposals`.
         ladder: exponent of the power ladder, as in `spacing`.
-        footprints: kind of the points' size that each density needs; none if not given.
+        footprints: size of points that each density needs; none if empty.
     """
     nears, fars = rays.nears, rays.fars
     count, device = len(rays), nears.device
@@ -215,7 +215,7 @@ def propose(
 
 
 def density_of(proposal: Field) -> DensityFunction | GridDensity:
-    """Return the density of a proposal, as a small network on a hash grid if it is that.
+    """Return the density of a proposal; in the kernels' form if it is a small network on a hash grid.
 
     Args:
         proposal: the field.
@@ -232,12 +232,12 @@ def half_edge(box: Tensor) -> float:
 def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = ()) -> Tensor:
     """Return the loss () of the proposals, whose weights should bound those of the last level from above.
 
-    mip-NeRF 360, equation 13, or Zip-NeRF's anti-aliased loss: the mean over rays, summed over proposals. It is 0 if no
-    proposal is learning.
+    mip-NeRF 360, equation 13, or Zip-NeRF's anti-aliased loss: the mean over rays, summed over proposals. It is 0 if
+    the proposals are not learning.
 
     Args:
         samples: N samples of a `ProposalSampler`.
-        weights: (N,) their weights when rendered; without a gradient.
+        weights: (N,) rendering weights of the samples; without a gradient.
         blurs: radius of the box for each proposal, for the anti-aliased loss; empty for that of mip-NeRF 360.
     """
     if samples.edges is None or not samples.proposals or samples.num_rays == 0:
@@ -253,7 +253,7 @@ def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = 
 
 
 def _points(rays: Rays, t: Tensor, footprint: Footprint) -> Points:
-    """Return the points of intervals with edges `t` (R, B + 1), with a footprint, and without a gradient for rays."""
+    """Return the points of intervals with edges `t` (R, B + 1), with a footprint; rays get no gradient."""
     origins, directions = rays.origins.detach(), rays.directions.detach()
     if footprint != "none":
         detached = replace(rays, origins=origins, directions=directions)

@@ -1,8 +1,8 @@
-"""A march is given as much room as the steps before have needed.
+"""Sample-buffer capacity of a march, adapted to recent steps.
 
-A device that runs ahead of Python notes how much room each step would have needed. When the device is waited for
-anyway, these numbers are read, and decide on the room of the steps that follow. It changes only where it has become too
-small or far too large, so that most steps have the same sizes.
+On a device that runs ahead of Python, each step records how much capacity it needed. When Python waits for the device
+anyway, it reads these numbers and sets the capacity of the following steps. The capacity changes only if it has become
+too small or far too large, so that most steps have the same sizes.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 HEADROOM = 1.3
-"""Room that is given, in units of the most that a step since the last reading has needed."""
+"""New capacity, relative to the largest need since the last reading."""
 LEAST, MOST = 1.08, 2.0
-"""Room, in the same units, below which more is given, and above which less is."""
+"""The capacity grows below the first and shrinks above the second of these ratios of capacity to need."""
 PIECE, LIMIT = 256, 2**21
-"""Numbers of slots are multiples of the former, and at most the latter."""
+"""Numbers of slots are multiples of the first and at most the second."""
 MOST_KEPT = 4
-"""Maximum number of kept samples, in units of the number that a step should have."""
+"""Maximum number of kept samples, relative to the target number per step."""
 
 
 class Sizes(NamedTuple):
@@ -31,43 +31,43 @@ class Sizes(NamedTuple):
     candidates: int
     """For steps in occupied cells, whose density is evaluated."""
     kept: int
-    """For those that light reaches."""
+    """For steps that light reaches."""
 
 
 class Room:
-    """The room of the steps of a march.
+    """Capacity for the steps of a march.
 
     Args:
-        runs: largest number of runs of steps that a ray can have.
-        steps: largest number of steps that a ray can have.
+        runs: maximum number of runs of steps on a ray.
+        steps: maximum number of steps on a ray.
     """
 
     def __init__(self, runs: int, steps: int) -> None:
         self.per_ray: tuple[float, float, float] = float(runs), float(steps), float(steps)
         """Numbers of slots for each ray."""
         self.rays = self.left_out = 0
-        """Number of rays so far, and of those that were left out, as last read."""
+        """Numbers of rays so far and of dropped rays, as last read."""
         self._needed: Tensor | None = None
         self._counted: Tensor | None = None
 
     def of(self, rays: int, usual: int | None = None) -> Sizes:
-        """Return the numbers of slots for some rays.
+        """Return the numbers of slots for a batch of rays.
 
         Args:
             rays: number of rays.
-            usual: number of samples that a step should have, which bounds those that are kept, as before anything is
-                known of a run that goes on; None for no bound but `LIMIT`.
+            usual: target number of samples per step. It bounds the kept samples, also when a resumed run has no counts
+                yet. None for no bound but `LIMIT`.
         """
         runs, candidates, kept = (min(PIECE * math.ceil(each * rays / PIECE), LIMIT) for each in self.per_ray)
         return Sizes(runs, candidates, kept if usual is None else min(kept, MOST_KEPT * max(usual, PIECE)))
 
     def note(self, rays: int, needed: tuple[Tensor, Tensor, Tensor], left_out: Tensor) -> None:
-        """Note on the device what a step has needed, without a wait.
+        """Record on the device what a step needed, without waiting.
 
         Args:
             rays: number of rays.
             needed: numbers () of runs, of candidates and of kept samples.
-            left_out: () number of rays that were left out.
+            left_out: () number of dropped rays.
         """
         per_ray = torch.stack(needed).float() / rays
         if self._needed is None or self._counted is None or self._needed.device != per_ray.device:
@@ -77,7 +77,7 @@ class Room:
         self._counted[1].add_(left_out)
 
     def read(self) -> None:
-        """Read what steps have needed since the last time, and decide on the room of those that follow."""
+        """Read the needs of steps since the last reading, and set the capacity of the following steps."""
         if self._needed is None or self._counted is None:
             return
         *needed, rays, left_out = torch.cat([self._needed, self._counted.float()]).tolist()  # no device lacks float32
@@ -90,6 +90,6 @@ class Room:
 
 
 def _enough(given: float, needed: float) -> float:
-    """Return the room of a ray for what one has `needed`: that which is `given` if it suits."""
-    least = max(needed, 1.0)  # where nothing is found, something may be in the next step
+    """Return the capacity per ray for the largest need, `needed`; `given` if that still fits."""
+    least = max(needed, 1.0)  # a step without samples may be followed by one with some
     return given if LEAST * least <= given <= MOST * least else HEADROOM * least

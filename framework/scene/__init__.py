@@ -1,1 +1,1 @@
-"""Properties of a scene found in its images: the profile, and space that silhouettes show to be empty."""
+"""Properties of a scene computed from its images, such as the space that silhouettes show to be empty."""

@@ -1,10 +1,10 @@
-"""The box around matter of unknown size and place, by the silhouettes of images that show all of it.
+"""Bounding box of matter of unknown size and position, from silhouettes of images that show all of it.
 
-The smallest rectangle around an image's opaque pixels gives four planes through the camera, and matter is on the inner
-side of each. Where it reaches the image's border it goes on, and of the four only the plane opposite holds; where it
-reaches two borders at a corner, or two opposite ones, none does. The inner sides of all images' planes are a convex
-polytope, and the box around its vertices is the smallest that the planes allow. Matter is taken to be in front of
-cameras that show only a part of it.
+The bounding rectangle of an image's opaque pixels gives four planes through the camera, with all matter on the inner
+side of each. If matter reaches a border of the image, it may continue outside; then only the plane opposite that border
+is used. If it reaches two adjacent or opposite borders, no plane of the image is used. The planes of all images bound a
+convex polytope, and the result is the bounding box of its vertices. If a camera shows only a part of the matter, all
+matter is assumed to be in front of it.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ from nerfloom.cameras.poses import nearest_point
 from nerfloom.kernels.native import torch_on_one_thread
 
 REACH = 3.0
-"""Half the side of the cube around the point that cameras look at outside which no matter is assumed, in the largest
-distance of a camera from that point. A box that reaches it is taken to be unknown."""
+"""Half the side of the cube around the point that cameras look at which is assumed to hold all matter, relative to the
+largest distance of a camera from that point. A box that reaches the cube's faces counts as unknown."""
 SAME = 1e-9
-"""Distance that rounding may put a vertex outside of a plane, relative to the farthest camera's."""
+"""Distance by which rounding may put a vertex outside a plane, relative to the distance of the farthest camera."""
 BEYOND = (2.0, 0.1)
-"""Pixels, and share of the matter's size in an image, by which matter may go beyond the box there: the pixels at its
-edge are opaque as a whole, and poses are not exact."""
+"""Tolerance by which matter may extend beyond the box in an image, in pixels and as a fraction of the matter's size:
+pixels at its edge count as fully opaque, and poses are not exact."""
 
 LARGER = 0.25
-"""Share of the images at whose opposite borders there must be matter for it to be larger than what they show."""
+"""Matter is larger than the images if at least this fraction of images have matter at opposite borders."""
 
 
 @torch.no_grad()
 def enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | None = None) -> Tensor | None:
-    """Return a box (2, 3) float64 that holds all matter, as small as the images' rectangles of opaque pixels allow.
+    """Return the smallest box (2, 3) float64 that holds all matter, from the images' rectangles of opaque pixels.
 
     Args:
-        cameras: M central cameras: all rays of one start at one point.
-        opaque: for each, its pixels (H, W) bool that are not fully transparent.
+        cameras: M central cameras: all rays of a camera start at one point.
+        opaque: for each camera, the pixels (H, W) bool that are not fully transparent.
         within: box (2, 3) that holds all matter; None if none is known.
 
     Returns:
-        Minimum and maximum corner; None if the images, without `within`, leave the matter unbounded, or if they
-        contradict each other, as of several objects that no image shows together.
+        Minimum and maximum corner. None if the images, without `within`, leave the matter unbounded, or if they
+        contradict each other, for example when no image shows all of several objects.
     """
-    with torch_on_one_thread():  # whose operations are small
+    with torch_on_one_thread():  # the operations are small
         return _enclosing_box(cameras, opaque, within)
 
 
 def is_larger(opaque: Sequence[Tensor]) -> bool:
-    """Return whether matter is larger than what images show: whether it is at opposite borders of `LARGER` of them.
+    """Return whether matter is larger than the images: it touches opposite borders in a fraction `LARGER` of them.
 
     Args:
-        opaque: for each image, its pixels (H, W) bool that are not fully transparent.
+        opaque: for each image, the pixels (H, W) bool that are not fully transparent.
     """
     across = [bool(mask[:, 0].any() & mask[:, -1].any() | mask[0].any() & mask[-1].any()) for mask in opaque]
     return sum(across) >= LARGER * len(across)
@@ -71,7 +71,7 @@ def _enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | 
     unit = float((origins - middle).norm(dim=-1).max())
     if not 0 < unit < torch.inf:
         return None
-    poses = torch.cat([poses[:, :, :3], (origins - middle)[..., None] / unit], -1)  # so that rounding is relative
+    poses = torch.cat([poses[:, :, :3], (origins - middle)[..., None] / unit], -1)  # keeps rounding relative
     limits = poses.new_tensor([[-REACH] * 3, [REACH] * 3]) if within is None else (within.double() - middle) / unit
     vertices = _vertices(*_planes(poses, extents, ends, limits))
     if not len(vertices) or (within is None and bool((vertices.abs() > REACH * (1 - SAME)).any())):
@@ -84,17 +84,17 @@ def _enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | 
 
 
 def _ends(opaque: Tensor) -> Tensor:
-    """Return whether all matter ends at what an image shows of it: left and below (first row), right and above."""
+    """Return whether all matter ends within the image: left and below (first row), right and above."""
     left, right, top, bottom = (side.any() for side in (opaque[:, 0], opaque[:, -1], opaque[0], opaque[-1]))
-    across, down = ~(top | bottom), ~(left | right)  # what goes on upwards may be wider there
+    across, down = ~(top | bottom), ~(left | right)  # matter that continues upwards may be wider there
     return torch.stack([across & ~left, down & ~bottom, across & ~right, down & ~top]).view(2, 2)
 
 
 def _extent(cameras: Cameras, index: int, opaque: Tensor) -> Tensor | None:
-    """Return the smallest and largest x / -z and y / -z (2, 2) of rays through opaque pixels; None if one has none.
+    """Return the smallest and largest x / -z and y / -z (2, 2) of rays through opaque pixels; None without such rays.
 
-    They are taken at the pixels' corners. Along a row, x / -z grows with the column, whatever the lens, so that the
-    first and the last opaque pixel of each row suffice, and so for columns.
+    They are computed at the pixels' corners. Along a row, x / -z grows with the column for every lens, so the first and
+    the last opaque pixel of each row suffice. The same holds for columns.
     """
     rows, columns = opaque.any(1).nonzero().squeeze(1), opaque.any(0).nonzero().squeeze(1)
     across, down = opaque[rows].to(torch.uint8), opaque[:, columns].to(torch.uint8)
@@ -113,13 +113,13 @@ def _extent(cameras: Cameras, index: int, opaque: Tensor) -> Tensor | None:
 
 
 def _planes(poses: Tensor, extents: Tensor, ends: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
-    """Return normals (P, 3) and offsets (P,) of the planes about all matter, where normal . x <= offset, and a box's.
+    """Return normals (P, 3) and offsets (P,) of planes with all matter at normal . x <= offset, box planes included.
 
     Args:
         poses: (M, 3, 4) camera-to-world.
         extents: (M, 2, 2) smallest and largest x / -z and y / -z of matter.
-        ends: (M, 2, 2) bool, whether matter ends there.
-        box: (2, 3) minimum and maximum corner of a box around all of it.
+        ends: (M, 2, 2) bool, whether matter ends within the image on that side.
+        box: (2, 3) minimum and maximum corner of a box around all matter.
     """
     axes = torch.eye(3, dtype=poses.dtype)
     local = torch.stack(
@@ -131,9 +131,9 @@ def _planes(poses: Tensor, extents: Tensor, ends: Tensor, box: Tensor) -> tuple[
 
 
 def _vertices(normals: Tensor, offsets: Tensor) -> Tensor:
-    """Return the vertices (V, 3) of the polytope normal . x <= offset: the ends of each two planes' line.
+    """Return the vertices (V, 3) of the polytope normal . x <= offset, from the lines where two planes meet.
 
-    The polytope is larger by `SAME` than the planes make it, so that rounding excludes nothing.
+    The polytope is enlarged by `SAME`, so that rounding excludes nothing.
     """
     offsets = offsets + SAME
     a, b = torch.combinations(torch.arange(len(normals))).unbind(1)
@@ -156,9 +156,9 @@ def _vertices(normals: Tensor, offsets: Tensor) -> Tensor:
 
 
 def _explains(box: Tensor, poses: Tensor, extents: Tensor, ends: Tensor) -> bool:
-    """Return whether a box (2, 3) can be what all images show: whether each has it wherever it has matter.
+    """Return whether a box (2, 3) is consistent with all images: it covers the matter that each of them shows.
 
-    `poses`, `extents`, here without what is uncertain of them, and `ends` are as in `_planes`.
+    `poses`, `extents` (here without the uncertain margins) and `ends` are as in `_planes`.
     """
     corners = torch.stack(torch.meshgrid(*box.T, indexing="ij"), -1).view(-1, 3)
     local = (corners - poses[:, None, :, 3]) @ poses[:, :, :3]
@@ -166,4 +166,4 @@ def _explains(box: Tensor, poses: Tensor, extents: Tensor, ends: Tensor) -> bool
     tangents = local[..., :2] / -local[..., 2:].clamp(max=-1e-12)
     covered = ((tangents.amin(1) <= extents[:, 0]) & (tangents.amax(1) >= extents[:, 1])).all(-1)
     whole = ends.flatten(1).all(1)
-    return bool((covered & ahead | whole & ~ahead).all())  # all of it, from within the box, says nothing more
+    return bool((covered & ahead | whole & ~ahead).all())  # from within the box, no constraint

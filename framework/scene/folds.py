@@ -1,10 +1,10 @@
-"""Folded reconstructions: opposite sides of an object that are placed on one, because something repeats.
+"""Folded reconstructions: opposite sides of an object placed on top of each other, because a pattern repeats.
 
-A label that is printed twice around a can looks the same from both sides. Matching then takes one side for the other,
-and reprojection errors stay small, as all that is seen of the label fits. What is behind it does not: cameras in the
-same position show different rooms, which a radiance field can only explain by fog before each of them (Cai et al.
-2023, "Doppelgangers"). In a sequence of photographs a fold leaves a trace: neighbours that look alike, and whose
-cameras look in quite different directions.
+A label printed twice around a can looks the same from both sides. Matching may then confuse the sides. Reprojection
+errors stay small, because the visible part of the label fits. The surroundings do not fit: cameras at the same position
+show different rooms, which a radiance field can only explain by fog before each of them (Cai et al. 2023,
+"Doppelgangers"). In a sequence of photographs a fold leaves a trace: neighbours that look alike although their cameras
+look in very different directions.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy as np
 SIDE = 16
 """Rows and columns of a thumbnail."""
 FEWEST = 12
-"""Minimum number of photographs of a sequence."""
+"""Minimum number of photographs in a sequence."""
 SEQUENCE = 0.75
-"""Maximum difference between neighbours of a sequence, in units of the difference between distant ones (medians)."""
+"""Maximum difference between neighbours in a sequence, relative to the difference between distant ones (medians)."""
 ALIKE = 1.5
-"""Maximum difference between neighbours that look alike, in units of the median difference between neighbours."""
+"""Maximum difference between neighbours that look alike, relative to the median difference between neighbours."""
 TURN, TURNS = 75.0, 6.0
-"""Minimum angle between the cameras of a fold: degrees, and in units of the median angle between neighbours. What is
-printed four times around an object folds by 90 degrees."""
+"""Minimum angle between the cameras of a fold: in degrees, and relative to the median angle between neighbours. A
+pattern printed four times around an object folds by 90 degrees."""
 
 
 def thumbnail(image: np.ndarray) -> np.ndarray:
     """Return an image's luminance in `SIDE` rows and columns, with mean 0 and standard deviation 1.
 
     Args:
-        image: (H, W, 3 or more) of any numeric type, with `SIDE` rows and columns or more.
+        image: (H, W, 3 or more) of any numeric type.
 
     Returns:
         (SIDE^2,) float32; 0 for an image of one colour.
@@ -42,29 +42,29 @@ def thumbnail(image: np.ndarray) -> np.ndarray:
     starts = [np.arange(SIDE) * size // SIDE for size in light.shape]
     sums = np.add.reduceat(np.add.reduceat(light, starts[0], axis=0), starts[1], axis=1)
     counts = np.outer(*(np.diff(start, append=size) for start, size in zip(starts, light.shape, strict=True)))
-    small = (sums / np.maximum(counts, 1)).ravel()  # an image of fewer rows or columns repeats some
+    small = (sums / np.maximum(counts, 1)).ravel()  # smaller images repeat some rows or columns
     small -= small.mean()
     return (small / max(float(small.std()), 1e-6)).astype(np.float32)
 
 
 def in_order(names: Sequence[str]) -> list[int]:
-    """Return the indices of file `names` in the order in which photographs are taken: numbers count as numbers."""
+    """Return the indices of file `names` in the order of taking: numbers in names sort by value."""
     parts = [re.split(r"(\d+)", name) for name in names]
     keys = [[int(part) if odd % 2 else part for odd, part in enumerate(each)] for each in parts]
     return sorted(range(len(names)), key=lambda index: keys[index])
 
 
 def folds(names: Sequence[str], directions: np.ndarray, thumbnails: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of neighbours that look alike, and whose cameras look in quite different directions.
+    """Return the pairs of neighbours that look alike although their cameras look in very different directions.
 
     Args:
-        names: M file names, whose order (`in_order`) is that of the sequence.
-        directions: (M, 3) unit vectors, in which the cameras look.
+        names: M file names; their order (`in_order`) is that of the sequence.
+        directions: (M, 3) unit viewing directions of the cameras.
         thumbnails: (M, D) `thumbnail` of each photograph.
 
     Returns:
-        Indices of both photographs of each pair. None if the photographs are no sequence, in which neighbours look more
-        alike than distant ones do.
+        Indices of both photographs of each pair. Empty if the photographs are not a sequence, in which neighbours look
+        more alike than distant ones.
     """
     if len(names) < FEWEST:
         return []
@@ -85,5 +85,5 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _differences(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the root mean square of the differences (N,) between thumbnails (N, D)."""
+    """Return the root-mean-square differences (N,) between thumbnails (N, D)."""
     return np.sqrt(np.square(first - second).mean(-1))

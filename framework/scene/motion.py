@@ -1,4 +1,4 @@
-"""Settings of ray methods that learn motion, and what the number of the images' times decides."""
+"""Settings of ray methods that learn motion, and choices that depend on the number of image times."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from nerfloom.base.decisions import Choice
 from nerfloom.data.scene import Scene
 
 TIMES_A_VERTEX, LEAST_VERTICES, MOST_VERTICES = 6, 3, 2**10
-"""Times of images for each vertex along an axis of time, and the minimum and maximum number of vertices. The paper's
-settings have 2, for training fifty times as long as minutes on a processor are: docs/notes/motion.md."""
+"""Number of image times per vertex along a time axis, and the minimum and maximum number of vertices. The paper has 2
+times per vertex, for training fifty times as long as minutes on a processor: docs/notes/motion.md."""
 
 
 TIMES_A_SLICE, MOST_SLICES = 9, 16
-"""Times of images for each slice of time in the occupancy grid, and the maximum number of slices."""
+"""Number of image times per time slice of the occupancy grid, and the maximum number of slices."""
 
 
 @dataclass(frozen=True)
@@ -29,28 +29,28 @@ class MotionConfig(RayConfig):
     }
     """Allowed ranges."""
     smallest_box: bool = True
-    """Learn only the part of the box that the images' silhouettes leave at any time (occupancy)."""
+    """Learn only the part of the box that silhouettes show to be occupied at some time (occupancy)."""
     time_slices: Auto[int] = AUTO
-    """Equal parts of time with cells of their own in the occupancy grid, so that a ray skips what is empty at its own
-    time (occupancy). If not given: one for some nine times of the images, 16 at most, if silhouettes show what is
-    empty; else 1."""
+    """Number of time slices of the occupancy grid. Each has its own cells, so that a ray skips cells that are empty at
+    its own time (occupancy). auto: one per nine image times, at most 16, if silhouettes mark empty space; otherwise
+    1."""
     empty_loss_mult: float = 0.0
-    """Weight of the opacity of rays through transparent pixels, which are empty at the time of their image; 0 for
-    none."""
+    """Weight of the opacity of rays through transparent pixels, which are empty at the time of their image; 0 to
+    disable."""
     transparent_share: float = 1.0
-    """Share of the drawn transparent pixels that are rendered, at random, and count as many times more; 1 for all."""
+    """Fraction of the drawn transparent pixels that is rendered; their weight grows accordingly. 1 renders all."""
 
 
 def vertices_in_time(scene: Scene) -> int:
-    """Return the number of vertices along an axis of time, by the number of times of the images of `scene`."""
+    """Return the number of vertices along a time axis, from the number of image times of `scene`."""
     return min(max(scene.num_times // TIMES_A_VERTEX, LEAST_VERTICES), MOST_VERTICES)
 
 
 def slices_choice(scene: Scene, sampler: str) -> Choice:
-    """Return the slices of time in the occupancy grid that suit the scene.
+    """Return the number of time slices of the occupancy grid that suits the scene.
 
     Args:
-        scene: properties of the data.
+        scene: properties of the scene.
         sampler: the chosen sampler.
     """
     shown = scene.moving and scene.has_alpha and not scene.unbounded and sampler == "occupancy"

@@ -1,9 +1,9 @@
-"""Visual hulls of a scene that moves: space that transparent images show to be empty at a time.
+"""Visual hulls of a moving scene: space that transparent pixels show to be empty at a time.
 
-A transparent pixel says that its ray is empty at the time of its image. At another moment, a ball is empty if the image
-shows the larger one to be empty that matter could have come from: its radius is greater by what matter moves meanwhile
-(`nerfloom.scene.speed`). So a cell may be occupied at a moment if no image shows the ball around it to be empty and
-some `WITNESSES` of the images about that moment show matter in its direction.
+The ray of a transparent pixel is empty at the time of its image. At another moment, a ball is empty if the image shows
+a larger ball to be empty. The radius grows by the distance that matter moves in between (`nerfloom.scene.speed`). So a
+cell may be occupied at a moment if no image shows the ball around it to be empty, and if `WITNESSES` of the images near
+that moment show matter in its direction.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from nerfloom.data.travel import Travel
 from nerfloom.scene.silhouettes import Silhouettes, held_cells
 
 NEAREST = 32
-"""Number of images that are asked about a moment: those since which, or until which, matter moves least."""
+"""Number of images used for a moment: those with the least motion between their time and the moment."""
 SPAN = 1 / 64
-"""Distance, longest edges of the box, that matter may move within a moment, unless there would be too many moments."""
+"""Distance that matter may move within a moment, in longest edges of the box, unless moments get too many."""
 MOST_MOMENTS = 96
-"""Maximum number of moments, beside one for each slice, whose hulls make up those of slices."""
+"""Maximum number of moments whose hulls form those of slices, beyond one moment for each slice."""
 BOX_CELLS = 32
 """Cells along each axis in the search for the smallest box of a moving scene."""
 
@@ -32,16 +32,16 @@ BOX_CELLS = 32
 def moving_hulls(
     silhouettes: Silhouettes, box: Tensor, resolution: int, times: Tensor, travel: Travel, slices: int = 1
 ) -> Tensor:
-    """Return the cells of a box that may be occupied in each slice of time, of a scene that moves.
+    """Return the cells of a box that may be occupied in each time slice of a moving scene.
 
-    A slice has the cells of all its moments.
+    A slice is the union of its moments.
 
     Args:
         silhouettes: silhouettes of the M training images.
         box: (2, 3) minimum and maximum corner.
         resolution: number n of cells along each axis.
         times: (M,) times of the images, in [0, 1].
-        travel: how far matter may move.
+        travel: distance that matter may have moved up to each time.
         slices: number T of equal parts of the time from 0 to 1.
 
     Returns:
@@ -55,18 +55,18 @@ def moving_hulls(
 
 @torch.no_grad()
 def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel) -> Tensor:
-    """Return the smallest box (2, 3), inside `box`, of all that may be occupied at any time, of a scene that moves.
+    """Return the smallest box (2, 3) within `box` of everything that may be occupied at any time in a moving scene.
 
-    If no image has matter at its border, what is outside an image's frame is taken to be empty, too.
+    If no image has matter at its border, space outside the images' frames also counts as empty.
 
     Args:
         silhouettes: silhouettes of the M training images.
         box: (2, 3) minimum and maximum corner.
         times: (M,) times of the images, in [0, 1].
-        travel: how far matter may move.
+        travel: distance that matter may have moved up to each time.
     """
     silhouettes = silhouettes.closed_if_whole()
-    for _ in range(3):  # each time with smaller cells
+    for _ in range(3):  # with smaller cells in each round
         inside = torch.zeros((BOX_CELLS,) * 3, dtype=torch.bool, device=box.device)
         ends = None
         for _, images, margins in _moments(silhouettes, box, times, travel, 1):
@@ -74,7 +74,7 @@ def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Tra
             if len(cells := inside.nonzero()):
                 ends = torch.stack([cells.amin(0), cells.amax(0) + 1])
                 (x0, y0, z0), (x1, y1, z1) = ends.tolist()
-                inside[x0:x1, y0:y1, z0:z1] = True  # what is in the middle does not change the box
+                inside[x0:x1, y0:y1, z0:z1] = True  # the middle does not change the box
         if ends is None:
             return box
         box = box[0] + (box[1] - box[0]) * ends / BOX_CELLS
@@ -82,7 +82,7 @@ def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Tra
 
 
 def nearest(margins: Tensor) -> list[int]:
-    """Return which `NEAREST` of `margins` (M,) are the smallest, the smallest first, and all as large as the last."""
+    """Return the indices of the `NEAREST` smallest of `margins` (M,), in ascending order, with all ties of the last."""
     largest = margins.kthvalue(min(NEAREST, len(margins))).values
     chosen = (margins <= largest).nonzero().squeeze(-1)
     return chosen[margins[chosen].argsort(stable=True)].tolist()
@@ -91,7 +91,7 @@ def nearest(margins: Tensor) -> list[int]:
 def _moments(
     silhouettes: Silhouettes, box: Tensor, times: Tensor, travel: Travel, slices: int
 ) -> Iterator[tuple[int, list[int], list[float]]]:
-    """Yield the slice of each moment, the images about it, and for each how far matter may move meanwhile.
+    """Yield for each moment its slice, the images near it, and for each image the distance matter moves in between.
 
     `silhouettes`, `box`, `times`, `travel` and `slices` are as in `moving_hulls`.
     """

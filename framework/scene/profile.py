@@ -1,4 +1,4 @@
-"""The profile of a scene: properties of its data, and the decisions that follow from them."""
+"""The profile of a scene: properties of its data, and decisions based on them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ class SceneProfile:
     moving: bool
     """Whether the images have times."""
     transparent: float | None
-    """Share of fully transparent pixels; None if no image has alpha."""
+    """Fraction of fully transparent pixels; None if no image has alpha."""
     ignored: float | None
-    """Share of pixels that are masked out or have no ray; None if there are none."""
+    """Fraction of pixels that are masked out or have no ray; None if there are none."""
     light: float | None
     """Spread of the light between images, in stops (`light.light_spread`); None with alpha."""
     camera: str
     """Model of the cameras."""
     decisions: tuple[Decision, ...]
-    """Decisions on options that were left open."""
+    """Decisions on open settings."""
     scenes: int = 1
-    """Number of scenes that the images show."""
+    """Number of scenes in the images."""
 
     @classmethod
     def of(cls, dataset: Dataset, decisions: list[Decision]) -> SceneProfile:

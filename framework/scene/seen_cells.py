@@ -1,8 +1,7 @@
-"""Cells of space that some image shows: in all others matter could not be learned, and would only be in the way.
+"""Cells of space that at least one image shows; matter in other cells cannot be learned and would only be in the way.
 
-Instant-NGP leaves out cells that no training camera sees (Mueller et al. 2022, `mark_untrained_density_grid` of the
-authors' code). Space right before a camera, nearer than the points that its image is known to show, does not count as
-shown by it.
+Instant-NGP skips cells that no training camera sees (Mueller et al. 2022, `mark_untrained_density_grid` of the authors'
+code). Here, space right before a camera, nearer than the points its image shows, does not count as shown.
 """
 
 from __future__ import annotations
@@ -13,22 +12,22 @@ from torch import Tensor
 from nerfloom.cameras.cameras import Cameras
 
 BLOCK = 4
-"""Cells along an edge of the cubes that are tested as one."""
+"""Cells along an edge of the cubes that are tested together."""
 AROUND = 4
-"""Distance, in radii of a cube, within which a camera sees it, wherever it looks."""
+"""Distance, in radii of a cube, within which a camera is assumed to see it in any viewing direction."""
 MARGIN = 2.0
-"""Minimum factor of a cube's radius in the image, which is larger beside the middle of the image than in it."""
+"""Minimum factor for a cube's radius in the image; objects off the image centre appear larger."""
 
 
 @torch.no_grad()
 def seen_cells(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int) -> Tensor:
-    """Return the cells of a box that some image shows from no nearer than the camera's least distance.
+    """Return the cells of a box that some image shows, beyond that camera's nearest distance.
 
-    Cells are tested in cubes of `BLOCK`, by a ball around each: those that are returned may be too many, never too few.
+    Cells are tested in cubes of `BLOCK`, by their bounding balls. The result may have too many cells, never too few.
 
     Args:
         cameras: M cameras.
-        nearest: (M,) distance from each camera before which its image shows nothing, scene units.
+        nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
         box: (2, 3) minimum and maximum corner.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
 
@@ -47,7 +46,7 @@ def seen_cells(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int) 
 
 
 def _shows(cameras: Cameras, index: int, centers: Tensor, radius: float, nearest: Tensor) -> Tensor:
-    """Return whether camera `index` may show some of the balls around `centers` (N, 3), (N,) bool."""
+    """Return whether camera `index` may show a part of each ball around `centers` (N, 3), (N,) bool."""
     distances = (centers - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1)
     columns, rows, ahead = cameras.project(centers, index)
     focal = torch.maximum(cameras.fx[index], cameras.fy[index])
@@ -58,9 +57,9 @@ def _shows(cameras: Cameras, index: int, centers: Tensor, radius: float, nearest
 
 
 def _margin(cameras: Cameras, index: int) -> float:
-    """Return how much larger a small ball is in a corner of the image than in its middle, at least `MARGIN`.
+    """Return how much larger a small ball appears in a corner of the image than in its centre, at least `MARGIN`.
 
-    It is 1 + tan(a)^2 at the angle a from the axis, along the line to the middle.
+    The factor is 1 + tan(a)^2 at the angle a from the axis, along the line to the centre.
     """
     one = cameras[index : index + 1]
     across, down = (

@@ -1,8 +1,8 @@
-"""Space that several training images show: where rays start.
+"""Space that several training images show. Rays start there.
 
-What a single image shows could be at any distance, so matter that only one camera sees, mostly right before it, is not
-where anything is, and hides what lies behind it from other viewpoints. (Instant-NGP, Mueller et al. 2022, leaves out
-what no camera at all sees: `mark_untrained_density_grid` of the authors' code.)
+The content of a single image could be at any distance. Matter that only one camera sees, mostly right before it, is
+usually wrong, and hides what lies behind it from other viewpoints. (Instant-NGP, Mueller et al. 2022, skips space that
+no camera sees: `mark_untrained_density_grid` of the authors' code.)
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from nerfloom.kernels.march.first_shared import CELLS, LEVELS, first_shared
 from nerfloom.kernels.native import torch_on_one_thread
 
 BLOCK = 4
-"""Cells along an edge of the cubes that are tested before their cells are."""
+"""Cells along an edge of the cubes that are tested first."""
 
 
 class SharedSpace(nn.Module):
-    """The cells of nested boxes that too few training images show; none before `leave_out`.
+    """The cells of nested boxes that too few training images show; empty until `leave_out` is called.
 
     Args:
         box: (2, 3) corners of the smallest box, scene units.
@@ -31,7 +31,7 @@ class SharedSpace(nn.Module):
 
     box: Tensor
     unshared: Tensor
-    """(L n^3 + 1,) bool, box by box; the last one stands for all of space beyond the boxes, which is not left out."""
+    """(L n^3 + 1,) bool, box by box; the last entry stands for all space beyond the boxes and is False."""
 
     def __init__(self, box: Tensor) -> None:
         super().__init__()
@@ -39,20 +39,20 @@ class SharedSpace(nn.Module):
         self.register_buffer("unshared", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
 
     def leave_out(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
-        """Leave out the cells that fewer than `least` images show, or fewer than all if there are fewer images.
+        """Exclude cells that fewer than `least` images show, or fewer than all if there are fewer images.
 
         Args:
             cameras: M training cameras.
-            nearest: (M,) distance from each camera before which its image shows nothing, scene units.
+            nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
             least: minimum number of images, at least 1.
         """
         least = min(least, len(cameras))
-        with torch_on_one_thread():  # whose operations are small
+        with torch_on_one_thread():  # the operations are small
             seen = [times_seen(cameras, nearest, box, CELLS, least) for box in nested_boxes(self.box, LEVELS)]
         self.unshared[:-1] = torch.cat(seen) < least
 
     def forward(self, rays: Rays) -> Rays:
-        """Return rays that start at the first place that enough images show; as they were where there is none.
+        """Return rays that start where they first meet space that enough images show; unchanged if they never do.
 
         Args:
             rays: R rays; R may be 0.
@@ -62,29 +62,29 @@ class SharedSpace(nn.Module):
 
 @torch.no_grad()
 def share_cut_off(space: SharedSpace, rays: Rays, distances: Tensor) -> float:
-    """Return the share of rays that would start behind what they are known to show.
+    """Return the fraction of rays that would start behind their known point.
 
     Args:
-        space: cells that are left out.
+        space: excluded cells.
         rays: R rays.
-        distances: (R,) of what they show, scene units.
+        distances: (R,) known distances along the rays, scene units.
     """
     return float((space(rays).nears > distances).double().mean())
 
 
 @torch.no_grad()
 def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, most: int) -> Tensor:
-    """Return how many images show each cell of a box, as far as it is at most `most`.
+    """Return the number of images that show each cell of a box, at most `most`.
 
-    An image shows a cell if the whole ball around it is within the image: at the edges of images, no ray of theirs may
-    meet what lies in the rest of a cell. And its middle is beyond the distance before which the image shows nothing.
+    An image shows a cell if the whole ball around it is within the frame, because no ray may meet the part of a cell
+    beyond the image's edge. The cell's centre must also be beyond the camera's nearest distance.
 
     Args:
         cameras: M cameras.
-        nearest: (M,) distance from each camera before which its image shows nothing, scene units.
+        nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
         box: (2, 3) minimum and maximum corner, scene units.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
-        most: number from which on cameras are not counted.
+        most: maximum count.
 
     Returns:
         (n^3,) uint8; the index of a cell is (x n + y) n + z.
@@ -105,16 +105,16 @@ def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, 
 
 
 def _within(cameras: Cameras, index: int, centers: Tensor, margin: float) -> Tensor:
-    """Return which of `centers` (N, 3) are within one camera's image, which grows by a margin there, (N,) bool.
+    """Return whether balls or parts of balls around `centers` (N, 3) are within one camera's image, (N,) bool.
 
-    A ball at the angle a from the axis is 1 + tan(a)^2 times as large on a plane's image as in the image's middle.
+    A ball at the angle a from the axis is 1 + tan(a)^2 times as large in a planar image as in the image's centre.
 
     Args:
         cameras: M cameras.
-        index: which of them.
-        centers: places.
-        margin: radius of the balls around them of which a part is enough, scene units; if negative, of which all is
-            needed.
+        index: index of the camera.
+        centers: centres of the balls.
+        margin: radius of the balls, scene units. If positive, a part of a ball within the image suffices; if negative,
+            the whole ball must be within.
     """
     distances = (centers - cameras.camera_to_worlds[index, :, 3]).norm(dim=-1)
     columns, rows, ahead = cameras.project(centers, index)

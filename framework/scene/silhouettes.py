@@ -1,7 +1,7 @@
-"""Visual hulls (Laurentini 1994): space that transparent images show to be empty before training.
+"""Visual hulls (Laurentini 1994): space that transparent pixels show to be empty before training.
 
-A point that is fully transparent in some image is empty. Therefore a cell of space whose projection into one image has
-no opaque pixel can be skipped for good, and so can the pixels whose ray meets no other cell.
+A point that is fully transparent in some image is empty. So a cell whose projection into one image has no opaque pixel
+can be skipped permanently, and so can the pixels whose rays meet no other cell.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from nerfloom.geometry.bounds import cell_corners
 from nerfloom.kernels.images.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
 
 COARSEST = 8
-"""Maximum side of the first cubes tested, cells."""
+"""Maximum side of the cubes tested first, cells."""
 WITNESSES = 3
-"""Images, if there are as many, that must show matter in the direction of what may be occupied in a scene that moves.
-Without them much is left that no image has in its frame at that moment."""
+"""Number of images (or all, if fewer) that must show matter in the direction of a cell for it to be occupied in a
+moving scene. Without this, many cells remain that no image has in its frame at that moment."""
 KEPT_COUNTS = 48
-"""Number of images whose sums are kept, of images that exceed the memory."""
+"""Number of images whose sums are cached if the images exceed the memory."""
 
 
 class _Counts(Sequence[Tensor]):
-    """The cumulative sums of a data set's images; memory keeps only those requested last."""
+    """Cumulative sums of a data set's images; only those requested last stay in memory."""
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
@@ -43,7 +43,7 @@ class _Counts(Sequence[Tensor]):
         if image not in self._kept:
             opaque, kept = self._dataset.image(image)[..., 3] > 0, self._dataset.kept_of(image)
             if kept is not None:
-                opaque |= ~kept  # nothing is known about these
+                opaque |= ~kept  # masked pixels say nothing
             if len(self._kept) == KEPT_COUNTS:
                 del self._kept[next(iter(self._kept))]
             self._kept[image] = opaque_sums(opaque)
@@ -52,21 +52,21 @@ class _Counts(Sequence[Tensor]):
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """The pixels of M images that are not fully transparent; the boxes that they are compared with are on the CPU."""
+    """The pixels of M images that are not fully transparent. Boxes to compare with them must be on the CPU."""
 
     dataset: Dataset
     """Images with alpha, and pinhole cameras."""
     sums: Sequence[Tensor]
     """M tensors (H + 1, W + 1) int32: number of such pixels above and to the left of a pixel's corner."""
     closed: bool = False
-    """Whether there is nothing outside the images' frames."""
+    """Whether space outside the images' frames is known to be empty."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> Silhouettes:
-        """Sum up each image of `dataset`, on the CPU, so that the count in any rectangle of pixels takes four look-ups.
+        """Sum up each image of `dataset` on the CPU, so that counting in any rectangle of pixels takes four look-ups.
 
-        If the images exceed the memory, so do the sums; they are then computed each time they are requested. A hull is
-        found in thousands of small parts, each by the answers to those before, which takes a GPU far longer.
+        If the images exceed the memory, so do the sums; they are then computed on each request. A hull is found in
+        thousands of small dependent parts, which takes a GPU far longer than the CPU.
         """
         dataset = dataset.to("cpu")
         counts = _Counts(dataset)
@@ -76,7 +76,7 @@ class Silhouettes:
         return len(self.sums)
 
     def closed_if_whole(self) -> Silhouettes:
-        """Return silhouettes outside whose frames there is nothing, if no image cuts through what it shows."""
+        """Return silhouettes with empty space outside their frames, if no image cuts off matter at its border."""
         return replace(self, closed=not any(self._touch_border(image) for image in self.at_full_size))
 
     def _touch_border(self, image: int) -> bool:
@@ -86,7 +86,7 @@ class Silhouettes:
 
     @property
     def at_full_size(self) -> list[int]:
-        """The images that are not reduced beside others: alpha that is rounded shows less of what is there."""
+        """Indices of the images at full size; in smaller copies, alpha is rounded and shows less."""
         reductions = self.dataset.reductions
         return [image for image in range(len(self)) if reductions is None or int(reductions[image]) == 1]
 
@@ -99,7 +99,7 @@ class Silhouettes:
 
 @torch.no_grad()
 def visual_hull(silhouettes: Silhouettes, box: Tensor, resolution: int) -> Tensor:
-    """Return the cells of a box that no image of a still scene shows to be empty, by refinement from coarse to fine.
+    """Return the cells of a box that no image of a static scene shows to be empty, by refinement from coarse to fine.
 
     Args:
         silhouettes: silhouettes of the training images.
@@ -125,9 +125,9 @@ def held_cells(
     `silhouettes`, `box` and `resolution` are as in `visual_hull`.
 
     Args:
-        margins: distance, for each image, up to which around a cell all must be shown to be empty; `WITNESSES` of the
-            images must then show matter in the cell's direction, too. None for a still scene, without either.
-        known: (n^3,) bool, cells that need not be found; None for none.
+        margins: for each image, the distance around a cell that must be shown to be empty as well; also, `WITNESSES` of
+            the images must show matter in the cell's direction. None for a static scene, without either.
+        known: (n^3,) bool, cells that need not be tested; None for none.
     """
     size = min(COARSEST, 1 << (resolution - 1).bit_length())
     count = -(-resolution // size)
@@ -165,26 +165,26 @@ def held_balls(
     reach = [radius + margin for margin in margins or [0.0] * len(images)]
     for image, r in zip(images, reach, strict=True):
         hold_balls(silhouettes.photograph(image), centers, r, held, every=True)
-    if margins is not None:  # only of what is left, which is little
+    if margins is not None:  # only for the few remaining balls
         held[held.clone()] = _witnessed(silhouettes, images, centers[held], reach)
     return held
 
 
 def _whole_cubes(cells: Tensor, resolution: int, size: int) -> Tensor:
-    """Return of which cubes, `size` cells wide and counted along each axis, all of `cells` (n^3,) bool are true."""
+    """Return the cubes, `size` cells wide and counted along each axis, in which all of `cells` (n^3,) bool are True."""
     count = resolution // size
     return cells.view(count, size, count, size, count, size).all(5).all(3).all(1)
 
 
 def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor, reach: Sequence[float]) -> Tensor:
-    """Return in the direction of which balls (N,) `WITNESSES` of `images` show matter, or all if they are fewer."""
+    """Return the balls (N,) in whose direction `WITNESSES` of `images` (all, if fewer) show matter."""
     wanted = min(WITNESSES, len(images))
     count = torch.zeros(len(centers), dtype=torch.int32, device=centers.device)
     for image, radius in zip(images, reach, strict=True):
         enough = count >= wanted
         if bool(enough.all()):
             break
-        shown = enough.clone()  # these are not looked at again
+        shown = enough.clone()  # balls with enough witnesses are not tested again
         hold_balls(silhouettes.photograph(image), centers, radius, shown, every=False)
         count += shown & ~enough
     return count >= wanted
@@ -192,11 +192,11 @@ def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor,
 
 @torch.no_grad()
 def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution: int) -> PixelSet:
-    """Return the pixels that may see a cell of the hull, counted through all images; all others see only background.
+    """Return the pixels that may see a cell of the hull, counted over all images; all others see only background.
 
     Args:
         silhouettes: silhouettes of the images.
-        hull: (n^3,) bool, as `visual_hull` returns it.
+        hull: (n^3,) bool, from `visual_hull`.
         box: (2, 3) minimum and maximum corner.
         resolution: number n of cells along each axis.
     """

@@ -1,9 +1,9 @@
-"""Speeds of matter about each time, found from silhouettes alone: the slowest motion that explains all they show.
+"""Speeds of matter near each time, from silhouettes alone: the slowest motion that is consistent with all of them.
 
-An opaque pixel needs matter on its ray at the time of its image. If matter is assumed to be slower than it is, other
-images seem to show its place to be empty, and nothing is left on the ray to be seen. So speeds are raised, about the
-times of images with such a ray, until there is none. A pixel before something that stays says nothing, for that is left
-on its ray at any speed: what moves must be seen beside it, in some images.
+An opaque pixel needs matter on its ray at the time of its image. If the assumed speed is too low, other images seem to
+show that the whole ray is empty. So the speed is raised near the times of such images until no such ray is left. A
+pixel in front of static matter gives no information, because that matter stays on its ray at any speed. So moving
+matter must be seen beside static matter in some images.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from nerfloom.scene.moving_hulls import nearest
 from nerfloom.scene.silhouettes import Silhouettes, held_balls
 
 LEAST_IMAGES, LEAST_TIMES = 24, 8
-"""Minimum number of images, and of their different times; from fewer, no speed is found."""
+"""Minimum number of images, and of distinct times; with fewer, no speed is estimated."""
 SLOWEST = 0.25
-"""First speed that is tried, longest edges of the box for the time from 0 to 1. Lower ones save little."""
+"""First speed tried, in longest edges of the box per unit of time. Lower speeds save little."""
 FASTER = 2**0.5
-"""Ratio between a speed and the next one that is tried."""
+"""Ratio of consecutive speeds tried."""
 SAFETY = 2**0.5
-"""Ratio of the speed that is used to the speed found: pixels, balls and moving matter have a size, which is slack."""
+"""Ratio of the speed used to the speed found. Pixels, balls and matter have a size, which makes the latter too low."""
 AROUND = 2
-"""Number of times, before and after that of an image with a ray left, about which speeds are raised."""
+"""Number of times, before and after that of an image with an unexplained ray, at which the speed is raised."""
 MOST_RAYS = 2**15
-"""Number of rays that are tried, evenly over all images."""
+"""Maximum number of rays tested, spread evenly over all images."""
 BALLS = 128
-"""Number of balls in a row that are as long as the box's diagonal."""
+"""Number of balls in a row as long as the box's diagonal."""
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """Rays through opaque pixels of an image, next to transparent ones, that must meet something."""
+    """Rays through opaque pixels beside transparent ones. Each must meet matter."""
 
     origins: Tensor
     """(R, 3)."""
@@ -56,7 +56,7 @@ class _Rays:
         return _Rays(self.origins[index], self.directions[index], self.enter[index], self.leave[index])
 
     def balls(self, spacing: float) -> tuple[Tensor, Tensor]:
-        """Return centres (N, 3) of balls along the rays, `spacing` apart, and for each the number (N,) of its ray."""
+        """Return centres (N, 3) of balls along the rays, `spacing` apart, and the index (N,) of each ball's ray."""
         count = int(((self.leave - self.enter) / spacing).ceil().max())
         positions = self.enter[:, None] + spacing * (torch.arange(count, device=self.enter.device) + 0.5)
         owners, steps = (positions < self.leave[:, None] + spacing / 2).nonzero().unbind(1)
@@ -66,7 +66,7 @@ class _Rays:
 
 @torch.no_grad()
 def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | None:
-    """Return how far matter may move, with some `SAFETY`; None if the images or their times are too few to tell.
+    """Return how far matter may move, including `SAFETY`; None if there are too few images or times.
 
     Args:
         silhouettes: silhouettes of the M training images.
@@ -93,7 +93,7 @@ def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | 
             if len(rays):
                 middle = int(which[number])
                 too_slow[max(middle - AROUND, 0) : middle + AROUND + 1] = True
-        too_slow &= speeds < enough  # matter may be anywhere then; what is not explained yet is no motion
+        too_slow &= speeds < enough  # beyond this speed matter may be anywhere; motion does not explain the rest
         if not bool(too_slow.any()):
             return Travel.of(knots, SAFETY * speeds)
         speeds = torch.where(too_slow, FASTER * speeds, speeds)
@@ -113,9 +113,9 @@ def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tenso
 
 
 def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
-    """Return the pixels (H, W) bool of an image that are opaque beside one that is not.
+    """Return the opaque pixels (H, W) bool of an image beside a transparent one.
 
-    They show thin things and the ends of all others, which are the first to go astray.
+    They show thin objects and the edges of others, which a wrong speed affects first.
     """
     sums, kept = silhouettes.sums[image], silhouettes.dataset.kept_of(image)
     opaque = sums.diff(dim=0).diff(dim=1) > 0
@@ -127,7 +127,7 @@ def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
 def _explained(
     silhouettes: Silhouettes, images: Sequence[int], number: int, rays: _Rays, travelled: Tensor, spacing: float
 ) -> Tensor:
-    """Return the rays (R,) bool of image `number` that the other images, at `travelled` (M,), leave room for matter."""
+    """Return which rays (R,) bool of image `number` can meet matter, given the other images; `travelled` is (M,)."""
     if not len(rays):
         return torch.zeros(0, dtype=torch.bool)
     margins = (travelled - travelled[number]).abs()

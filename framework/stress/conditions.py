@@ -1,8 +1,8 @@
-"""Hard conditions: the changes of images and settings that each makes, and the outcome that is expected.
+"""Hard conditions: the changes of images and settings in each, and the expected outcome.
 
 Under every condition, a run must not crash, must end with finite parameters, and may drop only steps with spoiled
 pixels. Each condition has a maximum loss of PSNR against the plain run; if a larger loss has a reason that no method
-can avoid, the condition names it.
+can avoid, the condition states it.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ ALLOWED = 2.0
 ALLOWED_OF_OTHER_PICTURES = 5.0
 """Maximum loss of PSNR, dB, if the test views show more or less of the ball than those of the plain run.
 
-For test views that are easier than the plain ones (all white, black or transparent), or that show as much of the ball
-(4 degrees), it is `ALLOWED`.
+If test views are easier than the plain ones (all white, black or transparent), or show the same part of the ball (4
+degrees), the maximum is `ALLOWED`.
 """
 
 A_THIRD = "a third of the steps teach nothing, as they should"
@@ -47,7 +47,7 @@ def _none(config: TrainConfig) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Condition:
-    """A hard condition and the outcome that is expected."""
+    """A hard condition and its expected outcome."""
 
     name: str
     """Name for the command line and the table."""
@@ -58,19 +58,19 @@ class Condition:
     settings: Settings = _none
     """Changed settings of the run."""
     rays: int | None = None
-    """Number of rays per step; the method's if None."""
+    """Number of rays per step; None for the method's."""
     spoil: Spoil | None = None
-    """Change of every third batch; none if None."""
+    """Change of every third batch; None without."""
     allowed: float = ALLOWED
     """Maximum loss of PSNR against the plain run, dB; with more, the outcome is degraded."""
     reason: str | None = None
-    """Reason why more may be lost; None if there is none."""
+    """Reason why more may be lost; None without."""
     may_refuse: bool = False
     """Whether a clear error (NerfloomError) is as good as a result."""
     may_skip: bool = False
     """Whether any step may be dropped because it is not finite."""
     ball_only: bool = False
-    """Whether it needs images from other positions, which can be rendered of the ball only."""
+    """Whether the condition needs images from other positions, which only the ball provides."""
 
 
 def _both(change: Callable[[Dataset], Dataset]) -> Change:
@@ -79,7 +79,7 @@ def _both(change: Callable[[Dataset], Dataset]) -> Change:
 
 
 def _train(change: Callable[[Dataset], Dataset]) -> Change:
-    """Return a change of the training images alone."""
+    """Return a change of the training images only."""
     return lambda views: replace(views, train=change(views.train))
 
 
@@ -95,7 +95,7 @@ def _fixed(**settings: Any) -> Settings:
 UNIT = "density is per unit of length, and starts at about 1: a format that does not place cameras wants --scale-factor"
 FAR_OFF = "float32 resolves 0.001 there, and frequency encodings nothing: such a scene should be placed"
 
-PLAIN = Condition("plain", "nothing hard: what the others are compared with")
+PLAIN = Condition("plain", "the reference: no hard condition")
 CONDITIONS = (
     PLAIN,
     # -- images
@@ -106,7 +106,7 @@ CONDITIONS = (
         "one-image",
         "a single photograph",
         _train(first_image),
-        reason="it says little of the other sides",
+        reason="it shows little of the other sides",
         may_refuse=True,
     ),
     Condition(
@@ -114,19 +114,19 @@ CONDITIONS = (
         "photographs of one pixel",
         _both(one_pixel),
         allowed=ALLOWED_OF_OTHER_PICTURES,
-        reason="a dozen pixels are all that there is, each the mean of a picture of which its ray sees the middle",
+        reason="there are only a dozen pixels, each the mean of an image whose centre its ray sees",
     ),
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
     # -- cameras
     Condition(
         "field-of-view-4",
-        "pictures 4 degrees wide, from as far away as that takes",
+        "images 4 degrees wide, from correspondingly far away",
         lambda _: ball_views(4.0),
         ball_only=True,
     ),
     Condition(
         "field-of-view-170",
-        "pictures 170 degrees wide, from inside: from outside, hardly a pixel would see the ball",
+        "images 170 degrees wide, from inside: from outside, hardly any pixel would see the ball",
         lambda _: ball_views(170.0, RADIUS / 2),
         allowed=ALLOWED_OF_OTHER_PICTURES,
         reason="a pixel in the middle spans over 40 degrees",
@@ -151,20 +151,20 @@ CONDITIONS = (
     # -- training
     Condition(
         "another-seed",
-        "the plain run from another seed: what runs differ by anyway",
+        "the plain run with another seed: the usual difference between runs",
         settings=lambda config: {"machine": {"seed": config.machine.seed + 1}},
     ),
     Condition(
         "learning-rate-x10",
         "ten times the learning rate",
         settings=lambda config: {"learning_rate": 10 * config.learning_rate},
-        reason="ten times the rate that it was tuned for",
+        reason="ten times the tuned rate",
     ),
     Condition("float32", "--mixed-precision False", settings=_fixed(mixed_precision=False)),
     Condition("bfloat16", "--mixed-precision True", settings=_fixed(mixed_precision=True)),
     Condition(
         "float16",
-        "--mixed-precision float16, which is not offered: its range would want a gradient scaler",
+        "--mixed-precision float16, which is not supported: its range would need a gradient scaler",
         settings=_fixed(mixed_precision="float16"),
         may_refuse=True,
     ),
@@ -173,7 +173,7 @@ CONDITIONS = (
         "one ray a step",
         settings=_fixed(train_rays_per_pixel_from=1.0),  # never several rays per pixel
         rays=1,
-        reason="it sees no more pixels than it does steps",
+        reason="it sees only one pixel per step",
     ),
     Condition("8192-rays", "8192 rays a step", rays=8192, reason="steps take longer: fewer may fit into the time"),
     # -- invalid data
@@ -181,7 +181,7 @@ CONDITIONS = (
     Condition("inf-pixels", "an infinite pixel in every third batch", spoil=spoiled_pixel(math.inf), reason=A_THIRD),
     Condition(
         "nan-pose",
-        "a camera whose pose is NaN, past the format that should have refused it",
+        "a camera with a NaN pose that its format has not refused",
         _train(lambda d: spoiled_pose(d, math.nan)),
         may_refuse=True,
         may_skip=True,

@@ -1,8 +1,8 @@
-"""Injection of values that are not finite behind the checks that would refuse them.
+"""Injection of non-finite values behind the checks that would refuse them.
 
-Images are uint8 and hold no NaN, and formats refuse a pose that is not finite (`cameras.check_pose`). But a format may
-lack the check, and floating-point images may be supported later. Therefore pixels are spoiled in the batch, after it
-was drawn, and a pose in the data set, after it was read. This tests the trainer, the samplers and the kernels.
+Images are uint8 and contain no NaN, and formats refuse poses that are not finite (`cameras.check_pose`). But a format
+may lack the check, and floating-point images may be supported later. So pixels are spoiled in the batch after it is
+drawn, and a pose in the data set after it is read. This tests the trainer, the samplers and the kernels.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Any
 from nerfloom.data.dataset import Dataset
 
 EVERY = 3
-"""Distance between spoiled batches. More than one, as ten non-finite steps in a row end a run."""
+"""Distance between spoiled batches; more than one, because ten consecutive non-finite steps end a run."""
 
 Spoil = Callable[[Any, int], Any]
-"""Function from a batch and the number of the step to the spoiled batch."""
+"""Function from a batch and the step number to the spoiled batch."""
 
 
 def spoiled_pixel(value: float) -> Spoil:
     """Return a function that sets all channels of a pixel to `value` in every third batch, from the first.
 
-    At least as many steps must be dropped (`spoiled_batches`); a method that drops fewer hides the fault.
+    At least that many steps must be dropped (`spoiled_batches`); a method that drops fewer hides the fault.
     """
 
     def spoil(batch: Any, step: int) -> Any:

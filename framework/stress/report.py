@@ -52,7 +52,7 @@ def table(results: Sequence[Result]) -> list[list[str]]:
 
 
 def notes(results: Sequence[Result]) -> list[str]:
-    """Return a line for each verdict of `results` that is no pass, with its reason."""
+    """Return a line with the reason for each verdict of `results` other than pass."""
     return [
         f"{result.method}, {verdict.name}: {verdict.outcome}: {verdict.error or verdict.reason}"
         for result in results

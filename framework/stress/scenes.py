@@ -24,7 +24,7 @@ from nerfloom.evaluation.evaluator import spread
 from nerfloom.testing.ball import RADIUS, cameras_at, trace
 
 HALF_SIZE = 1.5
-"""Half the edge of the ball's box, scene units. Every ray of FIELD_OF_VIEW or less meets the box."""
+"""Half the edge of the ball's box, scene units. Every ray within FIELD_OF_VIEW meets the box."""
 FIELD_OF_VIEW, SIZE = 30.0, 24
 """Angle of view of the ball's images, degrees, and their width and height, pixels."""
 SHARE = 0.7
@@ -32,11 +32,11 @@ SHARE = 0.7
 NUM_TRAIN, NUM_TEST = 12, 4
 """Number of training and of test images."""
 LONGER_SIDE = 48
-"""Minimum longer side of the reduced images of a data set, pixels; the factor is a whole number."""
+"""Minimum longer side of a data set's reduced images, pixels; the reduction factor is an integer."""
 NEAREST = 0.02
 """Minimum near distance, scene units, for cameras inside the box."""
 RAYS_PER_PIXEL = 16
-"""Rays per pixel of the ball's images, whose pixels are means over their area."""
+"""Rays per pixel of the ball's images; pixels are means over their area."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def ball_views(field_of_view: float = FIELD_OF_VIEW, distance: float | None = No
 
     Args:
         field_of_view: angle of view of the images, degrees.
-        distance: distance of the cameras from the ball's centre, to which they look; inside if less than RADIUS. If
+        distance: distance of the cameras from the ball's centre, which they look at; less than RADIUS is inside. If
             None, the distance at which the ball takes SHARE of the images' width.
     """
     radius = distance_for(field_of_view) if distance is None else distance
@@ -145,9 +145,9 @@ def _few(parser: DataParser, data: Path | None, split: Split, count: int) -> Dat
 
 
 def reduced(dataset: Dataset, side: int) -> Dataset:
-    """Return images reduced by the largest whole number with which the longest side has at least `side` pixels.
+    """Return images reduced by the largest integer factor with a longest side of at least `side` pixels.
 
-    A reduced pixel counts if masks keep all pixels that it is made of. Depth images are omitted.
+    A reduced pixel counts if masks keep all of its pixels. Depth images are omitted.
 
     Args:
         dataset: the images.
@@ -165,7 +165,7 @@ def reduced(dataset: Dataset, side: int) -> Dataset:
 
 
 def _box_filtered(image: Tensor, factor: int) -> Tensor:
-    """Return an image (H, W, 3 or 4) reduced by a whole number, as (H' W', 4)."""
+    """Return an image (H, W, 3 or 4) reduced by an integer factor, as (H' W', 4)."""
     rgba = torch.full((*image.shape[:2], 4), 255, dtype=torch.uint8)
     rgba[..., : image.shape[-1]] = image
     return torch.from_numpy(np.ascontiguousarray(reduce_image(rgba.numpy(), factor))).view(-1, 4)
@@ -175,7 +175,7 @@ def _box_filtered(image: Tensor, factor: int) -> Tensor:
 
 
 def as_decoded(pixels: Tensor) -> Tensor:
-    """Return `pixels` (P, 3 or 4) as they are decoded from files: without alpha if it is 255 everywhere."""
+    """Return `pixels` (P, 3 or 4) as decoded from files: without alpha if it is 255 everywhere."""
     opaque = pixels.shape[1] == 4 and bool((pixels[:, 3] == 255).all())
     return pixels[:, :3].contiguous() if opaque else pixels
 
@@ -188,8 +188,8 @@ def with_photographs(
     Args:
         dataset: the data set.
         pixels: (P, 3 or 4) uint8 pixels of all images.
-        cameras: cameras of the images; those of `dataset` if None.
-        kept: pixels that count; all if None.
+        cameras: cameras of the images; if None, those of `dataset`.
+        kept: pixels that count; None for all.
     """
     cameras = dataset.cameras if cameras is None else cameras
     pixels = as_decoded(pixels)
@@ -216,7 +216,7 @@ def with_photographs(
 
 
 def kept_of(dataset: Dataset, images: Iterable[int], change: Callable[[Tensor], Tensor]) -> PixelSet | None:
-    """Return the pixels of some images that changed masks keep.
+    """Return the pixels of some images that masks keep after a change.
 
     Args:
         dataset: the images.
@@ -224,7 +224,7 @@ def kept_of(dataset: Dataset, images: Iterable[int], change: Callable[[Tensor], 
         change: function from a mask (H, W) to the changed one.
 
     Returns:
-        The kept pixels, counted through the given images; None if there are no masks.
+        The kept pixels, counted over the given images; None if there are no masks.
     """
     masks = (dataset.kept_of(index) for index in images)
     changed = [change(mask).reshape(-1) for mask in masks if mask is not None]

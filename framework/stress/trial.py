@@ -1,6 +1,6 @@
-"""A short run under a condition: training, evaluation, and a check that the result is finite.
+"""A short run under a condition: training, evaluation, and a check for finite results.
 
-It runs in this process, so that a crash, as in a compiled kernel, ends the process.
+It runs in this process, so a crash, for example in a compiled kernel, ends the process.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from nerfloom.training.trainer import Trainer
 MOST_RAYS, MOST_SAMPLES = 512, 2**14
 """Maximum number of rays and of samples per step, so that a large network does hundreds of steps in a minute."""
 NEVER = 10**9
-"""Steps or seconds between checkpoints, more than any run has."""
+"""Steps or seconds between checkpoints, more than in any run."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Trial:
     """Result of a run."""
 
     psnr: float | None = None
-    """PSNR of the test views, dB; None if there is no finite one."""
+    """PSNR of the test views, dB; None if it is not finite."""
     steps: int = 0
     """Number of training steps done."""
     skipped: int = 0
@@ -61,7 +61,7 @@ class Trial:
     seconds: float = 0.0
     """Seconds of training."""
     error: str | None = None
-    """Message of the error, or of the value that is not finite, on one line; None without either."""
+    """Message of the error, or about the non-finite value, on one line; None without either."""
     refused: bool = False
     """Whether the error is one for users (NerfloomError)."""
     learnt: float | None = None
@@ -69,7 +69,7 @@ class Trial:
 
 
 class StressedSource(BatchSource):
-    """A source of batches changed by a condition.
+    """A source of batches that a condition changes.
 
     Args:
         source: source of the unchanged batches.
@@ -133,7 +133,7 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     Args:
         config: the run's settings.
         budget: length of the run.
-        method: the method, which fills in the number of samples per step and the learning rate if left open.
+        method: the method; it fills in the number of samples per step and the learning rate if they are open.
         scene: properties of the plain images.
     """
     config = replace(
@@ -158,7 +158,7 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
 
 
 def blank_psnr(model: Model[Any], test: Dataset) -> float:
-    """Return the mean PSNR of images of the background alone, dB; masked-out pixels count too.
+    """Return the mean PSNR of images that show only the background, dB; masked-out pixels count too.
 
     Args:
         model: the model, with its background.
@@ -170,9 +170,9 @@ def blank_psnr(model: Model[Any], test: Dataset) -> float:
 
 
 def unsound(trainer: Trainer, test: Dataset) -> str | None:
-    """Return which parameter, running error or value of the first test view is not finite; None if all are.
+    """Return which parameter, running error or value of the first test view is not finite; None if all are finite.
 
-    The PSNR alone would not show an infinite colour, as it is computed on colours clamped to [0, 1].
+    The PSNR alone would hide an infinite colour, because it is computed on colours clamped to [0, 1].
 
     Args:
         trainer: the trainer, after training.

@@ -56,7 +56,7 @@ def mean_color(image: Tensor) -> Tensor:
 
 
 def chosen(dataset: Dataset, images: list[int]) -> Dataset:
-    """Return `dataset` with the `images` of the given indices, which may be repeated."""
+    """Return `dataset` with the images at the indices `images`, which may repeat."""
     index = torch.tensor(images)
     pixels = torch.cat([dataset.image(image).flatten(0, 1) for image in images])
     changed = with_photographs(dataset, pixels, dataset.cameras[index], kept_of(dataset, images, lambda mask: mask))
@@ -65,7 +65,7 @@ def chosen(dataset: Dataset, images: list[int]) -> Dataset:
 
 
 def first_image(dataset: Dataset) -> Dataset:
-    """Return `dataset` with the first image alone."""
+    """Return `dataset` with the first image only."""
     return chosen(dataset, [0])
 
 
@@ -78,23 +78,23 @@ def twice(dataset: Dataset) -> Dataset:
 
 
 def moved(views: Views, scale: float = 1.0, shift: float = 0.0, placed: bool = False) -> Views:
-    """Return a scene in another unit and at another place: position x becomes scale * x + shift along each axis.
+    """Return a scene with another unit and origin: position x becomes scale * x + shift along each axis.
 
     Formats place such a scene in one of two ways:
 
-    - Not `placed`: with --half-size, --near and --far the blender format takes cameras as they are, and these are in
-      the same unit and with the same centre. Therefore they are transformed like the cameras.
-    - `placed`: formats of captures move the cameras' mean position to the origin and scale positions to [-1, 1]
-      (`nerfloom.cameras.poses.place`), in float64, as text files hold it, and round afterwards. The orientation is
-      kept, so that the box can be transformed exactly. Only rounding errors of scale and shift remain.
+    - Not `placed`: with --half-size, --near and --far the blender format takes cameras unchanged, and these flags are
+      in the same unit and around the same centre. So they are transformed like the cameras.
+    - `placed`: capture formats move the cameras' mean position to the origin and scale positions to [-1, 1]
+      (`nerfloom.cameras.poses.place`), in float64, as in text files, and round afterwards. The orientation is kept, so
+      that the box can be transformed exactly. Only rounding errors of scale and shift remain.
 
-    All is computed in float64 and rounded once.
+    All computations are in float64, rounded once.
 
     Args:
         views: the images.
         scale: new units per old unit.
         shift: displacement along each axis, new units.
-        placed: whether cameras are placed as those of captures.
+        placed: whether cameras are placed like those of captures.
     """
     factor, offset = scale, torch.full((3,), shift, dtype=torch.float64)
     if placed:
@@ -111,7 +111,7 @@ def _mapped(dataset: Dataset, factor: float, offset: Tensor) -> Dataset:
     poses[:, :, 3] = factor * poses[:, :, 3] + offset
     cameras = replace(dataset.cameras, camera_to_worlds=poses.float())
     transform = dataset.transform.clone()
-    transform[:, 3] += offset / (factor * dataset.scale)  # it is applied before the scale
+    transform[:, 3] += offset / (factor * dataset.scale)  # applied before the scale
     return replace(
         dataset,
         cameras=cameras,

@@ -16,9 +16,9 @@ from nerfloom.training.run import Run
 
 Outcome = Literal["pass", "degraded", "refused", "fail", "not applicable"]
 """Outcome of a run. refused: it ended with a clear error, which is as good as a result. not applicable: there was no
-run, as the condition changes nothing of what the method does."""
+run, because the condition changes nothing in what the method does."""
 LEAST_LEARNT = 3.0
-"""Minimum PSNR of the plain run above that of empty images, dB; compared with less, every run would pass."""
+"""Minimum PSNR of the plain run above that of empty images, dB; with a lower one, every run would pass."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Verdict:
     outcome: Outcome
     """Outcome of the run."""
     psnr: float | None
-    """PSNR of the test views, dB; None if there is no finite one."""
+    """PSNR of the test views, dB; None if it is not finite."""
     lost: float | None
     """PSNR of the plain run minus this one's, dB; None if either has none."""
     skipped: int
@@ -40,9 +40,9 @@ class Verdict:
     seconds: float
     """Seconds of training."""
     error: str | None
-    """Message of the error with which it failed or was refused; None if it did not."""
+    """Message of the error of a failed or refused run; None without an error."""
     reason: str | None
-    """Reasons why it is degraded or not applicable; None if it is neither."""
+    """Reasons for degraded or not applicable; None otherwise."""
 
     def line(self) -> str:
         """Return the verdict as a line of text."""
@@ -53,7 +53,7 @@ class Verdict:
         return f"{self.outcome}{psnr}{lost}{steps}{skipped}  " + (self.error or self.reason or "")
 
     def cell(self) -> str:
-        """Return the text of a table's cell: the outcome and the difference of PSNR, or the PSNR of the plain run."""
+        """Return the text of a table cell: the outcome and the difference of PSNR, or the PSNR of the plain run."""
         if self.psnr is None:
             return self.outcome
         if self.lost is None or self.name == PLAIN.name:
@@ -62,12 +62,12 @@ class Verdict:
 
 
 def verdicts(run: Run, views: Views, conditions: Sequence[Condition], budget: Budget) -> Iterator[Verdict]:
-    """Run a method under one condition after the other, and yield a verdict on each; a failure does not stop the rest.
+    """Run a method under each condition in turn, and yield the verdicts; a failure does not stop the rest.
 
     Args:
         run: the method and its settings.
         views: the plain images.
-        conditions: the conditions, `PLAIN` first, with which the others are compared.
+        conditions: the conditions; the first is `PLAIN`, the reference.
         budget: length of each run.
 
     Raises:
@@ -113,9 +113,9 @@ def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdi
 def _weaknesses(condition: Condition, trial: Trial, lost: float | None) -> list[str]:
     weaknesses = []
     if condition is PLAIN and trial.learnt is not None and trial.learnt < LEAST_LEARNT:
-        weaknesses.append(f"only {trial.learnt:.1f} dB better than empty pictures: too little to compare others with")
+        weaknesses.append(f"only {trial.learnt:.1f} dB better than empty images: too little for comparisons")
     if lost is not None and lost > condition.allowed:
-        weaknesses.append(condition.reason or f"not to be expected: at most {condition.allowed:g} dB may be lost")
+        weaknesses.append(condition.reason or f"unexpected: at most {condition.allowed:g} dB may be lost")
     spoiled = 0 if condition.spoil is None else spoiled_batches(trial.steps)
     if trial.skipped < spoiled:
         weaknesses.append(f"{spoiled - trial.skipped} of {spoiled} spoiled batches were learnt from")

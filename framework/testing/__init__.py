@@ -1,4 +1,4 @@
-"""Checks that a method fulfils the requirements of the trainer and the evaluator.
+"""Checks that a method meets the requirements of the trainer and the evaluator.
 
 In a test of your package:
 

@@ -1,4 +1,4 @@
-"""A ball that is rendered in closed form, whose colour depends on the direction of its normal."""
+"""A ball rendered in closed form; its colour depends on the direction of its normal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def trace(origins: Tensor, unit_directions: Tensor, centers: Tensor | None = Non
 
     Args:
         origins, unit_directions: (R, 3) rays.
-        centers: (3,) or (R, 3) centre of the ball for each ray, scene units; the origin if None.
+        centers: (3,) or (R, 3) centre of the ball for each ray, scene units; None for the origin.
 
     Returns:
         Outward unit normals (R, 3) at the first intersection, undefined without one, and whether there is one (R,).
@@ -37,7 +37,7 @@ def cameras_at(positions: Tensor, field_of_view: float, size: int) -> Cameras:
     """Return cameras that look at the origin, with +z up.
 
     Args:
-        positions: (M, 3) their positions, scene units.
+        positions: (M, 3) camera positions, scene units.
         field_of_view: horizontal and vertical angle of view, degrees.
         size: width and height of the images, pixels.
     """

@@ -24,9 +24,9 @@ class Check:
     run: Callable[[Subject], str]
     """Function that returns a line for people; it raises Fault, or any error of the method, if the check fails."""
     needs: tuple[str, ...] = ()
-    """Names of the checks that must pass before this one, if they are run."""
+    """Names of checks that must pass before this one, if they are run."""
     rays_only: bool = False
-    """Whether the check is only for models that are a `RayModel`."""
+    """Whether the check applies only to models that are a `RayModel`."""
 
 
 CHECKS = (
@@ -55,18 +55,18 @@ CHECKS = (
 
 
 def check_method(method: Method, name: str = "the method", config: TrainConfig | None = None) -> list[Finding]:
-    """Check that a method fulfils the requirements of the trainer and the evaluator, on small scenes made in memory.
+    """Check that a method meets the requirements of the trainer and the evaluator, on small scenes made in memory.
 
-    On the CPU it takes seconds if the model is small, so give a config with few layers, levels or cells.
+    On the CPU it takes seconds for small models, so give a config with few layers, levels or cells.
 
     Args:
         method: the method.
-        name: its name in messages.
-        config: settings to check it with; the method's defaults if None.
+        name: the method's name in messages.
+        config: settings for the check; the method's defaults if None.
 
     Returns:
-        A finding for each of `CHECKS` that was run. Checks that need a failed one are omitted. An error that the method
-        raises becomes a finding.
+        A finding for each of `CHECKS` that was run. Checks that depend on a failed check are omitted. An error raised
+        by the method becomes a finding.
     """
     subject, findings = Subject(method, name, config), dict[str, Finding]()
     casts_rays = isinstance(method.model, type) and issubclass(method.model, RayModel)
@@ -91,11 +91,11 @@ def assert_method(method: Method, name: str = "the method", config: TrainConfig 
 
     Args:
         method: the method.
-        name: its name in messages.
-        config: settings to check it with; the method's defaults if None.
+        name: the method's name in messages.
+        config: settings for the check; the method's defaults if None.
 
     Raises:
-        AssertionError: if a check fails; the message has a line for each that does.
+        AssertionError: if a check fails; the message has a line for each failed check.
     """
     failed = [finding for finding in check_method(method, name, config) if not finding.ok]
     if failed:

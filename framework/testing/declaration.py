@@ -21,10 +21,10 @@ def check_config(subject: Subject) -> str:
     config = subject.config
     kind = type(config)
     if not isinstance(config, TrainConfig):
-        raise Fault(f"{kind.__name__} does not derive from nerfloom.TrainConfig, as every method's settings do")
-    # Python itself refuses a dataclass that derives from a frozen one and is not frozen.
+        raise Fault(f"{kind.__name__} must derive from nerfloom.TrainConfig")
+    # Python itself refuses a non-frozen dataclass that derives from a frozen one.
     if "__dataclass_fields__" not in vars(kind) and inspect.get_annotations(kind):
-        raise Fault(f"{kind.__name__} is no dataclass of its own; write @dataclass(frozen=True) above it")
+        raise Fault(f"{kind.__name__} is not itself a dataclass; write @dataclass(frozen=True) above it")
     decided, _ = subject.method.decided(config, subject.still.scene)
     for label, before in (("the settings", config), ("decided settings", decided)):
         written = yaml.safe_dump(to_plain(before))

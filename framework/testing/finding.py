@@ -14,7 +14,7 @@ class Finding:
     ok: bool
     """Whether the method passed it."""
     detail: str
-    """A line for people: the result, and if the check failed, the scene and the remedy."""
+    """A line for people: the result and, if the check failed, the scene and the remedy."""
 
     def line(self) -> str:
         """Return the finding as a line of text."""

@@ -21,11 +21,11 @@ from nerfloom.testing.trial_run import STEPS, Learner, Subject
 from nerfloom.training.optim import first_non_finite
 
 FIRST_STEPS = 3
-"""Steps of which the gradients are checked."""
+"""Number of steps whose gradients are checked."""
 GRADIENT_STEPS = 40
-"""Steps within which each parameter must have had a gradient; proposals have one only where they are too low."""
+"""Number of steps within which each parameter must have a gradient; proposals have one only where they are too low."""
 REPEATED_STEPS = 2
-"""Steps after which two models are compared."""
+"""Number of steps after which two models are compared."""
 RAYS_PER_PIXEL = 4
 """Rays per pixel of the second checked batch."""
 LEARNT = 0.8
@@ -56,7 +56,7 @@ def _require_loss(loss: Loss, batch: Any, of: str) -> None:
         if not bool(torch.isfinite(value)):
             raise Fault(f"the loss{of} '{name}' is {float(value.detach())} in the first step")
     if loss.rgb.shape != batch.rgb.shape or loss.rgb.requires_grad:
-        raise Fault(f"the colours that come with the loss{of} must be shaped as the batch's, and detached")
+        raise Fault(f"the colours returned with the loss{of} must have the batch's shape and be detached")
     if not loss.total.requires_grad:
         raise Fault(f"no loss{of} has a gradient; is something detached, or computed under torch.no_grad()?")
 
@@ -69,7 +69,7 @@ def check_groups(subject: Subject) -> str:
         counts = Counter(id(p) for group in learner.model.groups() for p in group.parameters)
         if others := counts.keys() - names.keys():
             raise Fault(
-                f"groups() holds tensors that are no parameters of the model, {len(others)} of them; "
+                f"groups() has {len(others)} tensors that are not parameters of the model; "
                 "make each an attribute that is a torch.nn.Parameter"
             )
         if twice := [names[key] for key, count in counts.items() if count > 1]:
@@ -116,7 +116,7 @@ def check_unused(subject: Subject) -> str:
 
 
 def _has_gradient(learner: Learner, parameter: Tensor) -> bool:
-    """Return whether any entry has a gradient other than zero; those of sparse tables may be deferred."""
+    """Return whether any entry has a nonzero gradient; gradients of sparse tables may be deferred."""
     deferred = learner.optimizer.deferred.get(parameter)
     if deferred is not None and deferred.pending:
         return True
@@ -135,7 +135,7 @@ def check_repetition(subject: Subject) -> str:
     for learner in learners:
         for _ in range(REPEATED_STEPS):
             learner.step()
-    require_same(learners[0], learners[1], f"after {REPEATED_STEPS} steps by the same seed", "draw with torch only")
+    require_same(learners[0], learners[1], f"after {REPEATED_STEPS} steps with the same seed", "draw with torch only")
     return "two models of one seed are the same after two steps, bit for bit"
 
 
@@ -145,7 +145,7 @@ def require_same(one: Learner, other: Learner, when: str, remedy: str) -> None:
     Args:
         one, other: the models.
         when: start of the message, such as "after 2 steps".
-        remedy: end of the message, what to do.
+        remedy: end of the message with advice.
 
     Raises:
         Fault: if a parameter or buffer differs.
@@ -185,7 +185,7 @@ def check_nan_colors(subject: Subject) -> str:
     rgb.view(-1, 3)[0] = torch.nan
     loss = learner.loss(replace(batch, rgb=rgb))
     if bool(torch.isfinite(loss.total)):
-        raise Fault("a NaN among a batch's colours leaves the loss finite; let it through, the trainer drops the step")
+        raise Fault("a NaN in a batch's colours leaves the loss finite; let it through, the trainer drops the step")
     return "a NaN in a photograph makes the loss NaN, and the trainer drops the step"
 
 

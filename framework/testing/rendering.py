@@ -36,7 +36,7 @@ def check_build(subject: Subject) -> str:
 
     def look(learner: Learner) -> None:
         if not any(parameter.requires_grad for parameter in learner.model.parameters()):
-            raise Fault(f"{subject.name} has nothing to learn: no torch.nn.Parameter, and no module with any")
+            raise Fault(f"{subject.name} has nothing to learn: no torch.nn.Parameter and no module with one")
 
     subject.on_each_scene(look)
     return f"on {', on '.join(subject.scenes)}"
@@ -74,7 +74,7 @@ def require_rendered(rendered: Rendered, count: int, when: str) -> None:
     if rendered.samples is not None and rendered.weights is not None:
         shapes["weights"], values["weights"] = (len(rendered.samples),), rendered.weights
         if rendered.samples.num_rays != count:
-            raise Fault(f"{when}, samples are of {rendered.samples.num_rays} rays, not of {count}")
+            raise Fault(f"{when}, samples have {rendered.samples.num_rays} rays, not {count}")
     for name, shape in shapes.items():
         _require(values[name], shape, f"{when}, {name} of {count} rays")
     opacity = rendered.accumulation.detach()
@@ -94,7 +94,7 @@ def _require(value: Tensor, shape: tuple[int, ...], what: str) -> None:
     if value.dtype != torch.float32:
         raise Fault(f"{what} is {value.dtype}; make it torch.float32, with .float()")
     if not bool(torch.isfinite(value).all()):
-        raise Fault(f"{what} holds a value that is not finite (NaN or infinity)")
+        raise Fault(f"{what} has a value that is not finite (NaN or infinity)")
 
 
 def check_view(subject: Subject) -> str:
@@ -116,7 +116,7 @@ def check_view(subject: Subject) -> str:
         if not torch.allclose(colors, picture.rgb, atol=1e-4):
             raise Fault("render_rgb returns other colours than render_view")
         if not learner.model.training:
-            raise Fault("render_view leaves the model in evaluation mode; put it back as it was")
+            raise Fault("render_view leaves the model in evaluation mode; restore its mode")
 
     subject.on_each_scene(look)
     return "every field of Picture has its shape and is finite"
@@ -142,7 +142,7 @@ def check_few_rays(subject: Subject) -> str:
 
 
 def check_background(subject: Subject) -> str:
-    """Check that `subject` shows the background as far as rays are not opaque, and wherever they miss the box."""
+    """Check that `subject` shows the background where rays are not opaque, and where they miss the box."""
     learner = subject.learner()
     if not isinstance(learner.model, RayModel):
         dark, light = (learner.picture(background=value) for value in (0.0, 1.0))
@@ -153,24 +153,24 @@ def check_background(subject: Subject) -> str:
     _require_background(learner, rays, "rays through the box")
     opaque = float(_require_background(learner, away, "rays that miss the box").max())
     if _ends_at_the_box(learner.model) and opaque > TOLERANCE:
-        raise Fault(f"rays that miss the box are up to {opaque:.3g} opaque; nothing is there to stop light")
+        raise Fault(f"rays that miss the box are up to {opaque:.3g} opaque, although nothing is there")
     return "it shows as far as rays are not opaque"
 
 
 def _require_background(learner: Learner, rays: Rays, what: str) -> Tensor:
-    """Return the opacity (R,) of rays; raise Fault if colours do not contain the background accordingly."""
+    """Return the opacity (R,) of rays; raise Fault unless colours contain the background accordingly."""
     dark, light = (learner.show(rays, torch.full((3,), value)) for value in (0.0, 1.0))
     _require_change(light.rgb - dark.rgb, light.accumulation[:, None], what)
     return light.accumulation
 
 
 def _require_change(change: Tensor, accumulation: Tensor, what: str) -> None:
-    """Raise Fault if the change of colours from a black to a white background is not 1 - opacity."""
+    """Raise Fault unless the change of colours from a black to a white background is 1 - opacity."""
     transparency = 1 - accumulation
     if not bool(((change - transparency).abs() <= TOLERANCE).all()):
         raise Fault(
-            f"{what}: from a black to a white background colours change by {float(change.mean()):.3g} in the mean, and "
-            f"1 - accumulation is {float(transparency.mean()):.3g}; rgb must hold (1 - accumulation) * background"
+            f"{what}: from a black to a white background colours change by {float(change.mean()):.3g} on average, and "
+            f"1 - accumulation is {float(transparency.mean()):.3g}; rgb must include (1 - accumulation) * background"
         )
 
 
@@ -188,8 +188,8 @@ def check_evaluation(subject: Subject) -> str:
     first, second = (learner.picture(seed=seed).rgb for seed in (1, 2))
     if not torch.equal(first, second):
         raise Fault(
-            f"the same picture differs by up to {float((first - second).abs().max()):.3g} when it is rendered again; "
-            "sample at fixed places unless self.training"
+            f"the same picture differs by up to {float((first - second).abs().max()):.3g} when rendered again; "
+            "use fixed positions unless self.training"
         )
     return "a picture is the same each time"
 
@@ -205,14 +205,14 @@ def check_chunks(subject: Subject) -> str:
         worst = float((torch.cat([getattr(part, name) for part in parts]) - getattr(whole, name)).abs().max())
         if not worst <= TOLERANCE:
             raise Fault(
-                f"rendered {CHUNK} rays at a time, {name} differs by up to {worst:.3g}; a ray must not look at the "
+                f"rendered {CHUNK} rays at a time, {name} differs by up to {worst:.3g}; a ray must not depend on the "
                 "others of its batch"
             )
     return f"{len(view.rays)} rays at once and {CHUNK} at a time give the same picture"
 
 
 def check_nan_rays(subject: Subject) -> str:
-    """Check that a ray that is not finite does not change the colours of other rays of `subject`."""
+    """Check that a non-finite ray does not change the colours of other rays of `subject`."""
     learner = subject.trained
     view = learner.view()
     whole = learner.show(view.rays, view.background).rgb

@@ -1,4 +1,4 @@
-"""Scenes for checks: a ball that is coloured by its normals and rendered in closed form."""
+"""Scenes for checks: a ball coloured by its normals and rendered in closed form."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.testing.ball import cameras_at, trace
 
 COUNT, SIZE = 8, 24
-"""Number of images, and their usual width and height, pixels."""
+"""Number of images, and their default width and height, pixels."""
 DISTANCE = 3.0
 """Distance of the cameras from the origin, scene units. The box is [-1, 1]^3."""
 FIELD_OF_VIEW = 40.0

@@ -1,4 +1,4 @@
-"""The check of checkpoints, which returns a line for people and raises Fault if it fails."""
+"""The check of checkpoints; it returns a line for people and raises Fault if it fails."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from nerfloom.training.trained import restore_model
 
 
 def check_checkpoint(subject: Subject) -> str:
-    """Check that a model of `subject`, loaded from a checkpoint, renders and trains as the saved one, to the bit."""
+    """Check that a model of `subject` loaded from a checkpoint renders and trains like the saved one, to the bit."""
     trained, loaded = subject.trained, subject.learner(seed=SEED + 1)
     _load_saved(trained, loaded)
     before, after = (learner.picture() for learner in (trained, loaded))
-    remedy = "what a model remembers must be a parameter or a buffer (register_buffer), so that state_dict() holds it"
+    remedy = "all state must be a parameter or a buffer (register_buffer), so that state_dict() includes it"
     for name in ("rgb", "median_depth", "accumulation"):
         if not torch.equal(getattr(before, name), getattr(after, name)):
-            raise Fault(f"loaded into a new model, a checkpoint renders another picture ({name}); {remedy}")
+            raise Fault(f"a new model renders another picture ({name}) after loading the checkpoint; {remedy}")
     for learner in (trained, loaded):
         learner.step()
     require_same(trained, loaded, "a step after a checkpoint was loaded", remedy)

@@ -1,4 +1,4 @@
-"""The method under test: functions with which checks build, train and render it."""
+"""The method under test, with functions to build, train and render it."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from nerfloom.training.step import backward, forward
 RAYS = 256
 """Maximum number of pixels in a step."""
 STEPS = 60
-"""Training steps of the model that several checks share."""
+"""Number of training steps of the model shared by several checks."""
 BUDGET = 200
-"""Number of steps for which schedules are computed; checks take the first of them."""
+"""Number of steps for which schedules are computed; checks run the first of them."""
 SEED = 42
 STRIDE = 3
 """Distance between the rendered rows and columns of an image."""
 SHOWN_EVERY = 9
-"""Distance between rendered pixels, counted through all images, if rays are rendered."""
+"""Distance between rendered pixels, counted over all images, if rays are rendered."""
 
 
 class Learner:
-    """A model that is trained on one scene, with the trainer's steps.
+    """A model in training on one scene, with the trainer's steps.
 
     Args:
         method: the method.
@@ -66,7 +66,7 @@ class Learner:
         self.history: list[float] = []
         """Loss before each step."""
         self.has_gradient = False
-        """Whether the last loss has a graph; it has none if no ray has a sample."""
+        """Whether the last loss has a graph; it has none if no ray has samples."""
 
     @cached_property
     def optimizer(self) -> Adam:
@@ -106,7 +106,7 @@ class Learner:
         """Return the loss of a batch in the next step.
 
         Args:
-            batch: pixels or views, as the model's loss takes them.
+            batch: pixels or views, as required by the model's loss.
             bfloat16: whether networks run in bfloat16.
         """
         return forward(self.model, batch, self.done, self.done / BUDGET, bfloat16)
@@ -151,7 +151,7 @@ class Learner:
 
     @torch.no_grad()
     def show(self, rays: Rays, background: Tensor, seed: int = SEED) -> Rendered:
-        """Render rays as in an evaluation, as those of no training camera.
+        """Render rays as in an evaluation, without a training camera.
 
         Args:
             rays: R rays.
@@ -174,7 +174,7 @@ class Learner:
         return self.model.render_view(self.dataset.view(index, STRIDE), torch.full((3,), background))
 
     def colors(self, index: int = 0, background: float = 1.0, seed: int = SEED) -> Tensor:
-        """Render the colours of the same rows and columns alone.
+        """Render only the colours of the same rows and columns.
 
         `index`, `background` and `seed` are as in `picture`.
         """
@@ -195,8 +195,8 @@ class Subject:
 
     Args:
         method: the method.
-        name: its name in messages.
-        config: its settings; the method's defaults if None.
+        name: the method's name in messages.
+        config: the method's settings; its defaults if None.
     """
 
     def __init__(self, method: Method, name: str, config: TrainConfig | None) -> None:
@@ -205,12 +205,12 @@ class Subject:
 
     @cached_property
     def still(self) -> Dataset:
-        """Images with alpha of a still scene in a box."""
+        """Images with alpha of a static scene in a box."""
         return ball_in_a_box()
 
     @cached_property
     def scenes(self) -> dict[str, Dataset]:
-        """Data sets of all scenes for the method, by their names in messages."""
+        """Data sets of all scenes for the method, by the scenes' names in messages."""
         scenes = {"a still scene in a box": self.still, "photographs without alpha or box": ball_under_a_sky()}
         if issubclass(self.method.model, LearnsMotion):
             scenes["a scene that moves"] = moving_ball()
@@ -220,14 +220,14 @@ class Subject:
         """Return a fresh model on a scene.
 
         Args:
-            dataset: images of the scene; of the still one if None.
+            dataset: images of the scene; None for the static scene.
             seed: random seed of the initial parameters.
         """
         return Learner(self.method, self.config, dataset or self.still, seed)
 
     @cached_property
     def trained(self) -> Learner:
-        """A model trained for STEPS steps on the still scene."""
+        """A model trained for STEPS steps on the static scene."""
         learner = self.learner()
         for _ in range(STEPS):
             learner.step()

@@ -22,25 +22,25 @@ PARTS = re.compile(
     r"transforms(_train|_val|_test)?\.json|poses_bounds\.npy|(cameras|frames|images|points3D|rigs)\.(bin|txt)"
     r"|metadata\.json|.+\.tsv|(images|masks)(_\d+)?|sparse|colmap|[0-9]|train|val|test|rgb|EXR_RGBD|keyframes"
 )
-"""Names of files and folders in a data folder that users may pass instead of the folder itself."""
+"""Names of files and folders inside a data folder that users may pass instead of the folder itself."""
 MAX_LEVELS = 3
 """Maximum number of levels between such a part and the data folder."""
 MAX_FILES = 5000
-"""Maximum number of files examined to give advice."""
+"""Maximum number of files examined for advice."""
 
 
 def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None, str]:
     """Return the data folder and its format; for None, no folder and the format of the embedded scene.
 
-    A part of a data folder, such as transforms.json or sparse/0, stands for the folder. Formats that cannot be loaded
-    are reported and ignored.
+    A path inside a data folder, such as transforms.json or sparse/0, stands for the folder. Formats that cannot be
+    loaded are reported and ignored.
 
     Args:
-        path: the path that the user gave, or None.
+        path: the user's path, or None.
         named: the format that the user named, or None; a named format need not recognise the folder.
 
     Raises:
-        DataError: if the folder does not exist, or no format or several recognise it.
+        DataError: if the folder does not exist, if no format recognises it, or if several do.
     """
     if path is None:
         return None, named or "procedural"
@@ -52,7 +52,7 @@ def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None,
         if matches:
             several = " or ".join(matches)
             raise DataError(
-                f"--data {folder}: the format may be {several}; name it after the flags, as in '{matches[0]}'"
+                f"--data {folder}: the format may be {several}; name it after the flags, such as '{matches[0]}'"
             )
     if named is not None:
         return path, named
@@ -60,7 +60,7 @@ def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None,
 
 
 def _candidates(path: Path) -> Iterator[Path]:
-    """Yield the folder itself, and its parents as long as it is named like a part of a data folder."""
+    """Yield the folder itself, and its parents as long as its name is that of a part of a data folder."""
     if os.path.isdir(path):  # `Path.is_dir` raises for names that no file can have
         yield path
     elif not os.path.isfile(path):
@@ -73,7 +73,7 @@ def _candidates(path: Path) -> Iterator[Path]:
 
 
 def _formats(names: list[str]) -> dict[str, type[DataParser]]:
-    """Load the formats that can be loaded; a single one was named by the user, and it must load."""
+    """Load the formats, skipping broken ones with a warning; a single format was named by the user and must load."""
     formats = {}
     for name in names:
         try:
@@ -81,20 +81,20 @@ def _formats(names: list[str]) -> dict[str, type[DataParser]]:
         except ConfigError as error:
             if len(names) == 1:
                 raise
-            say(f"warning: {error}; it is ignored")
+            say(f"warning: {error}; the format is ignored")
     return formats
 
 
 def _recognizes(name: str, parser: type[DataParser], path: Path) -> bool:
     try:
         return parser.recognizes(path)
-    except Exception as error:  # it should not raise, but an error in one plugin must not affect other formats
+    except Exception as error:  # an error in one plugin must not affect other formats
         say(f"warning: data format '{name}' failed to examine {path}: {type(error).__name__}: {error}; it is ignored")
         return False
 
 
 def _advice(path: Path) -> str:
-    """Say what to do about a path that is not a data folder."""
+    """Return advice about a path that is not a data folder."""
     if not os.path.exists(path):
         return "there is no such folder"
     if os.path.isfile(path):
@@ -109,11 +109,11 @@ def _advice(path: Path) -> str:
         return f"there are {number}, but no camera poses. {_processing('images', path)}"
     if videos := sorted(file for file in files if file.suffix.lower() in VIDEO_SUFFIXES):
         return f"a video has no camera poses yet. {_processing('video', videos[0])}"
-    return f"the folder is in no known data format. Known: {', '.join(registered('dataparsers'))}"
+    return f"the folder's format is unknown. Known: {', '.join(registered('dataparsers'))}"
 
 
 def _files(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield directory and name of every file below a folder, hidden ones excepted."""
+    """Yield directory and name of every file below a folder, except hidden ones."""
     for folder, below, names in os.walk(path):
         below[:] = sorted(name for name in below if not name.startswith("."))
         yield from ((folder, name) for name in names if not name.startswith("."))
@@ -127,7 +127,7 @@ def _processing(kind: str, path: Path) -> str:
 
 
 def processed_folder(path: Path) -> Path:
-    """Return the default output folder for processing a folder of images or a video, beside it.
+    """Return the default output folder for processing a folder of images or a video: beside it.
 
     Args:
         path: folder of images, or video file.

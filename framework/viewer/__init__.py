@@ -1,1 +1,1 @@
-"""The viewer in a browser: what is asked for, in which order it is drawn, and the page."""
+"""The viewer in a browser: requests, order of drawing, and the page."""

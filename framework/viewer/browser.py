@@ -1,4 +1,4 @@
-"""One browser's picture: what it asks for, and how much of that is drawn."""
+"""State of one browser: its request, and the progress of its picture."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from nerfloom.viewer.pace import Piece, Rays, Speed, Waiting, refinement
 from nerfloom.viewer.request import Request
 
 ROUGH_QUALITY, FINE_QUALITY = 70, 95
-"""Quality of JPEG files while a picture is coarse, and when it is finished."""
+"""JPEG quality of coarse and of finished pictures."""
 RENEWAL = 1.0
-"""Seconds after which a finished picture of a model that has changed is drawn again."""
+"""Seconds after which a finished picture is redrawn if the model has changed."""
 Show = Callable[[np.ndarray, int], None]
-"""Function that sends a picture (H, W, 3) uint8 to the browser, as a JPEG of a quality."""
+"""Function that sends a picture (H, W, 3) uint8 to the browser, as a JPEG of a given quality."""
 
 
 @dataclass
 class Browser:
-    """A connected browser: its request, which any thread may replace, and its picture, which one thread draws."""
+    """A connected browser. Any thread may replace its request; one thread draws its picture."""
 
     show: Show
     """Sends a picture to the browser."""
     wanted: Request | None = None
-    """What it asks for; None before its first camera is known."""
+    """Current request; None before the first camera is known."""
     asked_at: float = 0.0
     """Time of the last request, `time.monotonic`."""
     drawn: Request | None = None
-    """What is shown, at least coarsely."""
+    """Request of the picture shown, at least coarsely."""
     stride: int | None = None
     """Stride of the last coarse picture, pixels."""
     step: int = -1
-    """Training step of the picture, when its last pass began."""
+    """Training step at the beginning of the picture's last pass."""
     served_at: float = 0.0
-    """Time at which something was last drawn."""
+    """Time of the last drawing."""
     pieces: list[Piece] = field(default_factory=list)
-    """What is left to be drawn."""
+    """Pieces still to be drawn."""
     _canvas: dict[str, np.ndarray] = field(default_factory=dict)
     _range: tuple[float, float] | None = None
 
     def ask(self, request: Request) -> bool:
-        """Take a new `request` in place of the last, and return whether it differs."""
+        """Replace the request by a new `request`, and return whether it differs."""
         if request == self.wanted:
             return False
         self.asked_at, self.wanted = time.monotonic(), request
         return True
 
     def waiting(self, step: int, now: float) -> Waiting:
-        """Return what the browser waits for.
+        """Return the browser's claim to be served.
 
         Args:
             step: training step of the model.
@@ -64,14 +64,14 @@ class Browser:
         return Waiting(new, self.drawn is not None and (bool(self.pieces) or old), self.asked_at, self.served_at)
 
     def begin(self, request: Request, stride: int, step: int, kept: Arrays, left: list[Piece]) -> None:
-        """Show a coarse picture of a new request.
+        """Show a coarse picture for a new request.
 
         Args:
-            request: what was asked for.
+            request: the request.
             stride: stride of the picture.
             step: training step of the model.
-            kept: what was kept of the picture.
-            left: pieces that finish it.
+            kept: arrays of the picture.
+            left: pieces that complete it.
         """
         self.drawn, self.stride, self.step, self.pieces = request, stride, step, left
         self._canvas = dict(kept)
@@ -79,13 +79,13 @@ class Browser:
         self.show(colored(kept, self._range), ROUGH_QUALITY if left else FINE_QUALITY)
 
     def renew(self, speed: Speed, rays: Rays, step: int, seconds: float) -> None:
-        """Begin to draw the finished picture again, for a model that has changed.
+        """Start to redraw the finished picture for a changed model.
 
         Args:
-            speed: what was measured.
+            speed: measured speed.
             rays: rays per pixel.
             step: training step of the model.
-            seconds: time that a piece may take.
+            seconds: time limit for a piece.
         """
         assert self.drawn is not None
         self.step = step
@@ -95,13 +95,13 @@ class Browser:
         """Show the next piece of `pieces`.
 
         Args:
-            kept: what was kept of the piece.
+            kept: arrays of the piece.
         """
         assert self.drawn is not None
         piece = self.pieces.pop(0)
         width, height = self.drawn.width, self.drawn.height
         same = self._canvas.keys() == kept.keys()
-        if not same:  # a photograph was found, or lost, on the way
+        if not same:  # a photograph appeared or disappeared meanwhile
             self._canvas, self.drawn = {}, None
             return
         if next(iter(self._canvas.values())).shape[:2] != (height, width):

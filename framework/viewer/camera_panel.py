@@ -1,4 +1,4 @@
-"""The cameras of the photographs in the scene of one browser, with small pictures that are read when they are shown."""
+"""The photographs' cameras in the scene of one browser, with thumbnails that are read when shown."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class CameraPanel:
         self._client, self._photographs = client, photographs
         self._generation = 0
         self._shown = client.gui.add_checkbox(
-            "Show cameras", False, hint="Cameras of the training images; a click on one of them goes there."
+            "Show cameras", False, hint="Cameras of the training images; click on one to go there."
         )
         self._number = client.gui.add_number(
-            "Photograph", 0, min=0, step=1, hint="Number of a training image, from 0; its name is shown below."
+            "Photograph", 0, min=0, step=1, hint="Index of a training image, from 0; its name is shown below."
         )
         self._go = client.gui.add_button("Go to the photograph")
         self._note = client.gui.add_markdown("")
@@ -41,7 +41,7 @@ class CameraPanel:
         self._go.on_click(lambda _: self._visit())
 
     def _show(self) -> None:
-        """Add or remove the cameras; their pictures follow one by one."""
+        """Add or remove the cameras; their thumbnails follow one by one."""
         self._generation += 1
         generation = self._generation
         if self._shown.value is not True:
@@ -70,13 +70,13 @@ class CameraPanel:
             handles[index].on_click(lambda _, index=index: self.visit(index))
         self._note.content = f"{len(chosen)} of {len(cameras)} cameras"
         for index, handle in handles.items():
-            if generation != self._generation:  # hidden meanwhile, or the browser has left
+            if generation != self._generation:  # cameras hidden meanwhile, or browser gone
                 return
             if (small := self._photographs.thumbnail(index)) is not None:
                 handle.image = small
 
     def close(self) -> None:
-        """Stop reading pictures: the browser has left."""
+        """Stop reading thumbnails when the browser has left."""
         self._generation += 1
 
     def _visit(self) -> None:
@@ -87,7 +87,7 @@ class CameraPanel:
         self.visit(int(number_in(self._number.value, 0, len(cameras) - 1, 0)))
 
     def visit(self, index: int) -> None:
-        """Move the browser's camera to that of a photograph, by its `index`."""
+        """Move the browser's camera to the photograph `index`."""
         move_camera(self._client, self._photographs.pose(index), self._photographs.fov(index))
         self._note.content = f"photograph {index}: {plain(self._photographs.name(index))}"
 
@@ -102,10 +102,10 @@ def move_camera(client: Any, pose: Tensor, fov: float) -> None:
     """
     with client.atomic():
         client.camera.position = tuple(pose[:, 3].tolist())
-        client.camera.wxyz = quaternion_of(pose.detach().cpu())  # keeps the axis of turning as close as it can
+        client.camera.wxyz = quaternion_of(pose.detach().cpu())  # keeps the orbit axis as close as possible
         client.camera.fov = float(fov)
 
 
 def plain(text: str) -> str:
-    """Return a `text` without marks of Markdown, which the panel would show."""
+    """Return `text` without Markdown marks, which the panel would interpret."""
     return "".join(letter if letter.isalnum() or letter in "-. " else "-" for letter in text)

@@ -1,4 +1,4 @@
-"""A picture at full size that is made finer piece by piece."""
+"""A full-size picture that is refined piece by piece."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from nerfloom.viewer.request import smaller
 
 
 def enlarged(kept: Arrays, width: int, height: int) -> dict[str, np.ndarray]:
-    """Return a coarse picture at full size, each pixel a block.
+    """Return a coarse picture at full size; each pixel becomes a block.
 
     Args:
-        kept: what was kept of the coarse picture.
+        kept: arrays of the coarse picture.
         width, height: size of the whole picture, pixels.
     """
     found = {}
@@ -26,11 +26,11 @@ def enlarged(kept: Arrays, width: int, height: int) -> dict[str, np.ndarray]:
 
 
 def paste(canvas: Mapping[str, np.ndarray], kept: Arrays, piece: Piece) -> None:
-    """Write a piece into a picture at full size.
+    """Write a piece into a full-size picture.
 
     Args:
-        canvas: the picture, which is changed.
-        kept: what was kept of the piece, with the names of the canvas.
+        canvas: the picture, changed in place.
+        kept: arrays of the piece, with the names of the canvas.
         piece: rows at a stride.
     """
     for name, whole in canvas.items():

@@ -1,4 +1,4 @@
-"""Crop boxes of views: pictures of what lies within a box, and between two distances from the camera."""
+"""Crop boxes of views: pictures of the scene within a box, and between two distances from the camera."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import RendersGaussians
 from nerfloom.viewer.request import Crop
 
-BY_RAYS = "Only what is inside the box is rendered, so that what lies behind its walls is seen."
-BY_CENTERS = "Only Gaussians whose centre is inside the box are drawn, so that what lies behind its walls is seen."
-BY_DEPTH = "Pixels whose surface lies outside of the box are hidden; what lies behind them is not seen."
+BY_RAYS = "Only what is inside the box is rendered, so its walls hide nothing."
+BY_CENTERS = "Only Gaussians whose centre is inside the box are drawn, so its walls hide nothing."
+BY_DEPTH = "Pixels whose surface is outside the box are hidden, with everything behind them."
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class CroppedCameras(Cameras):
 
 
 def cropped(rays: Rays, crop: Crop) -> Rays:
-    """Return rays that start and end within a crop; those that miss it have length 0.
+    """Return rays that start and end within a crop; rays that miss it have length 0.
 
     Args:
         rays: R rays.
@@ -63,8 +63,8 @@ def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor
         rays: H * W whole rays of the pixels' centres.
         crop: the box and the distances.
         background: (3,) colour.
-        by_depth: also hide pixels whose surface, at the median depth, lies outside: for methods that cast no rays, of
-            which what lies behind is then not seen either.
+        by_depth: whether to hide pixels whose surface, at the median depth, lies outside, with everything behind it.
+            For methods that cast no rays.
     """
     inside = cropped(rays, crop)
     hidden = inside.fars <= inside.nears
@@ -86,7 +86,7 @@ def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor
         model: the model in evaluation mode.
         view: the view, whose stride is 1.
         crop: the box and the distances.
-        background: (3,) colour behind it.
+        background: (3,) colour behind the scene.
     """
     camera = view.camera
     if isinstance(model, RendersGaussians):
@@ -111,11 +111,11 @@ def meaning(model: Renderable) -> str:
 
 
 def within(points: Tensor, camera: Cameras, crop: Crop) -> Tensor:
-    """Return which points (N, 3) lie within a crop, (N,) bool.
+    """Return whether points (N, 3) lie within a crop, (N,) bool.
 
     Args:
         points: scene coordinates.
-        camera: one camera, from which the crop's distances are.
+        camera: one camera, from which the crop's distances are measured.
         crop: the box and the distances.
     """
     low, high = points.new_tensor(crop.corners)

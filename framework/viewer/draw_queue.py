@@ -19,22 +19,23 @@ from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser
 from nerfloom.viewer.request import Request, smaller
 
 REST = 0.15
-"""Seconds without a new request after which a picture is refined."""
+"""Seconds without a new request before a picture is refined."""
 WHOLE = 1e6
-"""Seconds that a piece may take of a method that casts no rays, so that it is the whole picture. Gaussians beside an
-image are drawn by the size of that image, so that strips of it differ from the whole: on fox they came to 28 dB."""
+"""Time limit for a piece of a method that casts no rays, seconds, so large that a piece is the whole picture. Gaussians
+near an image's border depend on the image's size, so strips of it would differ from the whole: on fox they had 28
+dB."""
 
 
 class Studio:
     """Pictures of one subject for several browsers.
 
-    Browsers come, go and ask in any thread. Everything is drawn where `work` is called, so that a model in training is
-    never read and changed at once.
+    Browsers come, go and send requests in any thread. Everything is drawn by `work`, in the calling thread, so that a
+    model in training is never read while it changes.
 
     Args:
-        subject: what is looked at.
-        coarse_seconds: time that the picture of a moving camera may take.
-        piece_seconds: time that a piece of a refinement may take.
+        subject: the model and its run.
+        coarse_seconds: time limit for a picture while the camera moves.
+        piece_seconds: time limit for a piece of a refinement.
         ndc: function that returns the normalised device coordinates of the scene; None if it has none.
         truth: true images for the output `error`.
     """
@@ -64,7 +65,7 @@ class Studio:
             self._browsers[number] = browser
 
     def leave(self, number: int) -> None:
-        """Remove the browser with a `number`, if it is there."""
+        """Remove the browser with a `number`, if it exists."""
         with self._lock:
             self._browsers.pop(number, None)
 
@@ -72,8 +73,8 @@ class Studio:
         """Replace a browser's request.
 
         Args:
-            number: the browser's.
-            change: function from its last request to the new one; None for none yet.
+            number: number of the browser.
+            change: function from its last request, None if there is none, to the new one.
         """
         with self._lock:
             browser = self._browsers.get(number)
@@ -84,18 +85,18 @@ class Studio:
 
     @property
     def is_empty(self) -> bool:
-        """True if no browser is there."""
+        """True if there are no browsers."""
         return not self._browsers
 
     # -- the drawing thread -----------------------------------------------------------------------------------
 
     def wait(self, seconds: float) -> None:
-        """Wait for a request, at most so many `seconds`."""
+        """Wait for a request, at most `seconds` seconds."""
         self._asked.wait(seconds)
         self._asked.clear()
 
     def work(self) -> float | None:
-        """Draw the next piece for one of the browsers, and return its seconds; None if there is nothing to draw."""
+        """Draw the next piece for one of the browsers, and return the seconds it took; None if there is none."""
         with self._lock:
             browsers = list(self._browsers.values())
         now = time.monotonic()
@@ -136,11 +137,11 @@ class Studio:
 
     @property
     def _rays(self) -> Rays:
-        """Rays per pixel of a finished picture: one while something else has to be done."""
+        """Rays per pixel of a finished picture; one while there is other work."""
         return 1 if self.hurried else cast("Rays", self.subject.model.rays_per_pixel)
 
     def _timed(self, request: Request, piece: Piece) -> Arrays:
-        """Draw a piece, and measure it."""
+        """Draw a piece and measure its time."""
         start = time.perf_counter()
         kept = draw(self.subject, request, piece, self._ndc, self._truth)
         pixels = smaller(request.width, request.height, piece.stride)[0] * (piece.bottom - piece.top)

@@ -1,4 +1,4 @@
-"""Pictures of what a browser asks for: a piece of a view is rendered, and shown in the colours of an output."""
+"""Drawing of requested pictures: a piece of a view is rendered, and shown in the colours of an output."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from nerfloom.viewer.pace import Piece
 from nerfloom.viewer.request import Request
 
 DEPTH, FLAWS = "depth", "error"
-"""Outputs with a meaning of their own here: the median depth, and the difference from a photograph."""
+"""Outputs with a special meaning in the viewer: the median depth, and the difference from a photograph."""
 Truth = Callable[[View, Tensor, Tensor], "Tensor | None"]
-"""Function from a view, its picture (H, W, 3) and the background (3,) to the true image; None where it is unknown."""
+"""Function from a view, its picture (H, W, 3) and the background (3,) to the true image; None if unknown."""
 
 
 def draw(subject: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None) -> Arrays:
     """Return what is kept of a piece of a view for the output that is asked for.
 
     Args:
-        subject: what is looked at.
-        request: what is asked for.
+        subject: the model and its run.
+        request: the request.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
-        truth: for the output `error`; where it is unknown, the rendered colours are kept.
+        truth: true images for the output `error`; where unknown, the rendered colours are returned.
     """
     model = subject.model
     camera = request.camera(piece.stride, (piece.top, piece.bottom), ndc).to(model.device)
@@ -83,16 +83,16 @@ def _appearance(subject: Loaded, image: int | None) -> AbstractContextManager[No
 
 
 def number_kept(kept: Arrays) -> str | None:
-    """Return the name of the number in `kept`, what was kept for an output; None if the output is no number."""
+    """Return the name of the number in the arrays `kept`; None if the output is not a number."""
     return next((name for name, values in kept.items() if is_number(values)), None)
 
 
 def colored(kept: Arrays, ends: tuple[float, float] | None = None) -> np.ndarray:
-    """Return the picture (H, W, 3) uint8 of what was kept for one output.
+    """Return the picture (H, W, 3) uint8 of an output's arrays.
 
     Args:
-        kept: what was kept.
-        ends: numbers at the ends of the colours, if the output is a number; found in `kept` if None.
+        kept: arrays of the piece.
+        ends: numbers at the ends of the colours, if the output is a number; found from `kept` if None.
     """
     name = number_kept(kept)
     if name is None:

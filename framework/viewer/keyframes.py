@@ -1,4 +1,4 @@
-"""The path editor: cameras that were added, the smooth path through them, and its file in the run's folder."""
+"""The path editor: added cameras, the smooth path through them, and its file in the run's folder."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.alignment import nearest_rotations
 
 MOST_KEYFRAMES = 500
-"""Maximum number of cameras of a path."""
+"""Maximum number of cameras on a path."""
 MOST_FRAMES = 20_000
-"""Maximum number of frames of a path."""
+"""Maximum number of frames on a path."""
 LONGEST_NAME = 40
-"""Maximum number of characters of a path's name."""
+"""Maximum length of a path's name, characters."""
 
 
 @dataclass(frozen=True)
 class Editor:
-    """Cameras of a path, and how a video passes them."""
+    """Cameras of a path, and the timing of its video."""
 
     keyframes: tuple[Keyframe, ...] = ()
-    """Cameras in the order in which they are passed."""
+    """Cameras in path order."""
     seconds: float = 2.0
     """Seconds from one camera to the next."""
     fps: float = 24.0
@@ -36,19 +36,19 @@ class Editor:
     """Whether the path returns to the first camera."""
 
     def added(self, keyframe: Keyframe) -> Editor:
-        """Return the path with a `keyframe` at its end; the same if it is full."""
+        """Return the path with a `keyframe` appended; unchanged if it is full."""
         if len(self.keyframes) >= MOST_KEYFRAMES:
             return self
         return replace(self, keyframes=(*self.keyframes, keyframe))
 
     def without(self, index: int) -> Editor:
-        """Return the path without the camera of an `index`; the same if there is none."""
+        """Return the path without camera `index`; unchanged if there is none."""
         if not 0 <= index < len(self.keyframes):
             return self
         return replace(self, keyframes=self.keyframes[:index] + self.keyframes[index + 1 :])
 
     def moved(self, index: int, keyframe: Keyframe) -> Editor:
-        """Return the path with the camera of an `index` replaced by a `keyframe`; the same if there is none."""
+        """Return the path with camera `index` replaced by a `keyframe`; unchanged if there is none."""
         if not 0 <= index < len(self.keyframes):
             return self
         return replace(self, keyframes=(*self.keyframes[:index], keyframe, *self.keyframes[index + 1 :]))
@@ -86,12 +86,12 @@ class Editor:
 
 
 def through(values: Tensor, places: Tensor, closed: bool) -> Tensor:
-    """Return values on the Catmull-Rom spline through given ones (Catmull and Rom 1974), which it meets at integers.
+    """Return values on the Catmull-Rom spline through given values (Catmull and Rom 1974).
 
     Args:
-        values: (K, ...) values to pass.
-        places: (F,) places along the curve: 0 for the first value, 1 for the second.
-        closed: whether the last is followed by the first; if not, the ends are repeated.
+        values: (K, ...) given values.
+        places: (F,) positions along the curve: 0 at the first value, 1 at the second.
+        closed: whether the first value follows the last; otherwise the ends are repeated.
 
     Returns:
         (F, ...) values.
@@ -114,15 +114,15 @@ def through(values: Tensor, places: Tensor, closed: bool) -> Tensor:
 
 
 def poses_through(poses: Tensor, places: Tensor, closed: bool) -> Tensor:
-    """Return poses on a smooth path through given ones.
+    """Return poses on a smooth path through given poses.
 
-    Positions and rotation matrices are on splines; a rotation is the one closest to its matrix. Two neighbours that
-    look in opposite directions have no path between them that is preferred, and some path is taken.
+    Positions and rotation matrices are on splines; a rotation is the one closest to its matrix. Between two neighbours
+    that look in opposite directions, the path is arbitrary.
 
     Args:
         poses: (K, 3, 4) float64, camera-to-scene.
-        places: (F,) as for `through`.
-        closed: as for `through`.
+        places: (F,) as in `through`.
+        closed: as in `through`.
     """
     matrices = through(poses, places, closed)
     return torch.cat([nearest_rotations(matrices[:, :, :3]), matrices[:, :, 3:]], dim=-1)
@@ -131,11 +131,11 @@ def poses_through(poses: Tensor, places: Tensor, closed: bool) -> Tensor:
 def path_file(folder: Path, name: object) -> Path:
     """Return the file of a camera path in a run's folder: camera_path.json, or camera_path-NAME.json.
 
-    Of the name only letters of ASCII, digits, - and _ are taken, so that it cannot name another file or folder.
+    Only ASCII letters, digits, - and _ of the name are used, so that it cannot refer to another file or folder.
 
     Args:
         folder: the run's folder.
-        name: what a browser sent.
+        name: name sent by a browser.
     """
     kept = re.sub(r"[^A-Za-z0-9_-]", "", name)[:LONGEST_NAME] if isinstance(name, str) else ""
     return folder / (f"camera_path-{kept}.json" if kept and kept != "camera_path" else "camera_path.json")

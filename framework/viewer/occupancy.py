@@ -9,21 +9,21 @@ from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import SkipsCells
 
 MOST_CELLS = 40_000
-"""Maximum number of cells that are shown."""
+"""Maximum number of cells shown."""
 
 
 def shown_cells(model: Renderable, most: int = MOST_CELLS) -> tuple[Tensor, float] | None:
     """Return the centres (N, 3) of occupied cells that have an empty neighbour, and the mean edge of a cell.
 
-    What is inside would not be seen. Of nested boxes, the cells of the smallest are shown. Of more than `most` cells,
-    evenly spaced ones are returned.
+    Inner cells would not be visible. With nested boxes, the cells of the smallest box are shown. If there are more than
+    `most` cells, evenly spaced ones are returned.
 
     Args:
         model: the model.
         most: maximum number N.
 
     Returns:
-        Positions in scene coordinates and a length; None if the method skips no cells.
+        Positions in scene coordinates, and the edge length; None if the method skips no cells.
     """
     samplers = parts(model, SkipsCells)
     if not samplers:

@@ -1,8 +1,7 @@
-"""The size of the next piece of a picture, by measured times: pure functions, with no clock of their own.
+"""The size of the next piece of a picture, from measured times: pure functions that read no clock.
 
-The stride of the coarse picture is chosen from a model of the time that a picture takes, a line fitted to the last
-measurements, with hysteresis. So no loop goes from a slow picture to a coarse one, which is fast, to a fine one and
-back.
+The stride of the coarse picture comes from a model of drawing time, a line fitted to the last measurements, with
+hysteresis. This avoids a loop from a slow picture to a coarse, fast one, to a fine one and back.
 """
 
 from __future__ import annotations
@@ -17,23 +16,23 @@ from nerfloom.viewer.request import smaller
 STRIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Strides of coarse pictures, pixels."""
 FIRST_PIXELS = 6_000
-"""Number of pixels of a first picture, before anything was measured."""
+"""Number of pixels of the first picture, before any measurement."""
 KEPT_MEASUREMENTS = 16
-"""Number of pictures from which the speed is estimated."""
+"""Number of pictures used to estimate the speed."""
 KEEP = (0.5, 1.4)
-"""A stride is kept while its picture takes at most the second times the budget, and the next finer one at least the
-first."""
+"""A stride is kept while its picture takes at most the second value times the budget, and that of the next finer stride
+at least the first value times the budget."""
 JUMP = 4
-"""Ratio of the strides of one pass and the next, at most."""
+"""Maximum ratio of the strides of consecutive passes."""
 LEAST_ROWS = 4
 """Minimum number of rows of a piece."""
 Rays = Literal[1, 4, 9, 16]
-"""Number of rays that are averaged for a pixel."""
+"""Number of rays averaged per pixel."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Time of a picture as a function of its number of rays, fitted to the last measurements."""
+    """Drawing time as a function of the number of rays, fitted to the last measurements."""
 
     measured: tuple[tuple[int, float], ...] = ()
     """Number of rays, and seconds."""
@@ -42,19 +41,19 @@ class Speed:
         """Return the speed with one more measurement.
 
         Args:
-            rays: number of rays of a picture; that of its pixels for methods that cast none.
-            seconds: time that it took.
+            rays: number of rays of a picture; its number of pixels for methods that cast none.
+            seconds: drawing time.
         """
         return Speed((*self.measured, (max(rays, 1), max(seconds, 1e-6)))[-KEPT_MEASUREMENTS:])
 
     def line(self) -> tuple[float, float]:
-        """Return seconds of any picture, and seconds per ray: a line with least squared relative errors."""
+        """Return the seconds per picture and per ray, a line with least squared relative errors."""
         weights = [seconds**-2 for _, seconds in self.measured]
         total = sum(weights)
         x = sum(w * rays for w, (rays, _) in zip(weights, self.measured, strict=True)) / total
         y = sum(w * seconds for w, (_, seconds) in zip(weights, self.measured, strict=True)) / total
         spread = sum(w * (rays - x) ** 2 for w, (rays, _) in zip(weights, self.measured, strict=True)) / total
-        if spread < (0.05 * x) ** 2:  # pictures of one size say nothing about others: proportional
+        if spread < (0.05 * x) ** 2:  # with pictures of one size only, time is taken as proportional
             return 0.0, y / x
         both = [w * (rays - x) * (seconds - y) for w, (rays, seconds) in zip(weights, self.measured, strict=True)]
         slope = sum(both) / total / spread
@@ -63,24 +62,24 @@ class Speed:
         return (y - slope * x, slope) if slope * x < y else (0.0, y / x)
 
     def seconds(self, rays: int) -> float:
-        """Return the estimated time of a picture of so many `rays`."""
+        """Return the estimated time of a picture with `rays` rays."""
         fixed, each = self.line()
         return fixed + each * rays
 
     def rays(self, seconds: float) -> float:
-        """Return the number of rays of a picture that takes so many `seconds`, at least as long as the fixed part."""
+        """Return the number of rays of a picture that takes `seconds`, at least as long as the fixed part."""
         fixed, each = self.line()
         return max(seconds - fixed, fixed, 0.2 * seconds) / max(each, 1e-12)
 
 
 def coarse_stride(speed: Speed, width: int, height: int, budget: float, before: int | None) -> int:
-    """Return the stride of the picture that is shown while the camera moves.
+    """Return the stride of pictures shown while the camera moves.
 
     Args:
-        speed: what was measured.
+        speed: measured speed.
         width, height: size of the whole picture, pixels.
-        budget: seconds that the picture may take.
-        before: stride of the picture before; None for the first.
+        budget: time limit for the picture, seconds.
+        before: stride of the previous picture; None for the first.
     """
 
     def rays(stride: int) -> int:
@@ -100,12 +99,12 @@ def coarse_stride(speed: Speed, width: int, height: int, budget: float, before: 
 
 @dataclass(frozen=True)
 class Piece:
-    """Rows of a picture at a stride, which are drawn without a break."""
+    """Rows of a picture at a stride, drawn together."""
 
     stride: int
     """Stride of the picture, pixels."""
     rays: Rays
-    """Number of rays that are averaged for a pixel."""
+    """Number of rays averaged per pixel."""
     top: int
     """First row, at this stride."""
     bottom: int
@@ -113,16 +112,16 @@ class Piece:
 
 
 def refinement(speed: Speed, width: int, height: int, shown: int, rays: Rays, seconds: float) -> list[Piece]:
-    """Return the pieces that turn a coarse picture into the finished one, in the order in which they are drawn.
+    """Return the pieces that turn a coarse picture into the finished one, in drawing order.
 
     Each pass is finer than the one before, and starts in the middle of the picture.
 
     Args:
-        speed: what was measured.
+        speed: measured speed.
         width, height: size of the whole picture, pixels.
-        shown: stride of the picture that is shown; 1 if only its pixels' colours are to be replaced.
+        shown: stride of the current picture; 1 to replace only its pixels' colours.
         rays: rays per pixel of the finished picture.
-        seconds: time that a piece may take.
+        seconds: time limit for a piece.
     """
     pieces: list[Piece] = []
     stride = shown
@@ -148,50 +147,50 @@ def _bands(speed: Speed, width: int, height: int, stride: int, rays: Rays, secon
 
 @dataclass(frozen=True)
 class Share:
-    """Time that pictures may take beside something else that has to be done."""
+    """Share of time for pictures beside other work."""
 
     share: float
-    """Pictures' fraction of the whole time, 0 to 1."""
+    """Fraction of the total time for pictures, 0 to 1."""
     most: float = 0.2
-    """Maximum credit, seconds: what was not used is lost beyond it."""
+    """Maximum credit, seconds; unused time beyond it is lost."""
     credit: float = 0.0
-    """Seconds that pictures may take now; negative if the last one took longer than it might."""
+    """Seconds available for pictures now; negative after a picture that took too long."""
 
     def earned(self, seconds: float) -> Share:
-        """Return the share after so many `seconds` of the other work."""
+        """Return the share after `seconds` of other work."""
         if self.share >= 1:
             return replace(self, credit=self.most)
         return replace(self, credit=min(self.credit + seconds * self.share / (1 - self.share), self.most))
 
     def spent(self, seconds: float) -> Share:
-        """Return the share after a picture that took so many `seconds`."""
+        """Return the share after a picture that took `seconds`."""
         return replace(self, credit=self.credit - seconds)
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """A browser's claim to be served, as far as the order of work depends on it."""
+    """A browser's claim to be served, as used for the drawing order."""
 
     new: bool
-    """Whether it has asked for something of which nothing is drawn."""
+    """Whether its current request has no picture yet."""
     rough: bool
     """Whether its picture is unfinished, or older than the model."""
     asked_at: float
     """Time of its last request, seconds."""
     served_at: float
-    """Time at which something was last drawn for it, seconds."""
+    """Time of the last drawing for it, seconds."""
 
 
 def next_browser(waiting: Sequence[Waiting], now: float, rest: float) -> int | None:
-    """Return the browser for which something is drawn next; None if all are served.
+    """Return the browser to draw for next; None if all are served.
 
-    New requests come first, and of these the one that was served least recently. A picture is refined when its camera
-    has rested for a while.
+    New requests come first; among these, the browser served least recently. A picture is refined when its camera has
+    rested for a while.
 
     Args:
-        waiting: what the browsers wait for.
+        waiting: claims of the browsers.
         now: time, seconds.
-        rest: seconds without a new request after which a picture is refined.
+        rest: seconds without a new request before a picture is refined.
     """
     new = [index for index, one in enumerate(waiting) if one.new]
     rough = [index for index, one in enumerate(waiting) if one.rough and now - one.asked_at >= rest]

@@ -1,4 +1,4 @@
-"""The page: what all browsers share, and a panel for each of them."""
+"""The page: parts shared by all browsers, and a panel for each browser."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Page:
                     parts.append(CameraPanel(client, self._photographs))
             with tabs.add_tab("Path"):
                 parts.append(PathPanel(client, lambda: studio.subject, panel.request, self._renders))
-        if number not in self._server.get_clients():  # it has left before it was welcomed
+        if number not in self._server.get_clients():  # the browser left before it was set up
             self._farewell(client)
 
     def _farewell(self, client: viser.ClientHandle) -> None:
@@ -76,7 +76,7 @@ class Page:
             part.close()
 
     def refresh(self) -> None:
-        """Show the run's step, PSNR and learning curve as they are now."""
+        """Update the run's step, PSNR and learning curve."""
         subject = self._studio.subject
         content = heading(subject)
         if content != self._heading.content:
@@ -89,7 +89,7 @@ class Page:
 
         Args:
             seconds: seconds of training of each point.
-            psnr: PSNR of held-out images there, dB.
+            psnr: PSNR of held-out images at each point, dB.
         """
         if len(seconds) < 2:
             return
@@ -103,7 +103,7 @@ class Page:
             self._curve.data = data
 
     def _place_camera(self) -> None:
-        """Let browsers begin at the first training camera, looking at what lies in front of it."""
+        """Place the initial camera at the first training camera, looking at what lies in front of it."""
         scene = self._studio.subject.model.scene
         poses = scene.camera_to_worlds
         if poses is None or not len(poses) or scene.warped:
@@ -115,7 +115,7 @@ class Page:
         else:
             pose, mean = poses[0].cpu(), poses[:, :, 1].mean(0).cpu()
             up = torch.tensor([0.0, 0.0, 1.0]) if float(mean[2]) > 0.5 * float(mean.norm()) else mean
-            seen = looked_at(poses) if scene.unbounded else None  # a capture turns about what it looks at
+            seen = looked_at(poses) if scene.unbounded else None  # a capture orbits what its cameras look at
             middle = (scene.box.mean(0).cpu() if seen is None else seen.float()) - pose[:, 3]
             distance = max(float(-(middle @ pose[:, 2])), 0.1 * float(middle.norm()), 1e-3)
             position, center = pose[:, 3], pose[:, 3] - distance * pose[:, 2]
@@ -125,11 +125,11 @@ class Page:
         camera.fov = math.radians(50)
 
     def close(self) -> None:
-        """End what the browsers have started."""
+        """End everything that browsers have started."""
         for number in list(self._panels):
             for part in self._panels.pop(number, ()):
                 part.close()
         for process in self._renders or ():
             if process.poll() is None:
                 process.terminate()
-                say("viewer: the render was stopped; the same ns-render command goes on with it")
+                say("viewer: the render was stopped; repeat the ns-render command to continue it")

@@ -1,4 +1,4 @@
-"""The panel of one browser: its controls, and the request that they and the browser's camera make."""
+"""The panel of one browser: its controls, and the request made from them and the browser's camera."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     import viser
 
 SIZES = ("1024", "256", "512", "2048")
-"""Longest sides of pictures, pixels; the first is what a browser begins with."""
+"""Longest sides of pictures, pixels; the first is the initial one."""
 MEAN = "mean of all images"
 
 
 class Panel:
-    """Controls of one browser for what it sees.
+    """Controls of one browser for its picture.
 
     Args:
         client: the browser.
@@ -60,7 +60,7 @@ class Panel:
         if not scene.warped:
             self._add_crop()
         if shown_cells(studio.subject.model, 1) is not None:
-            self._cells = gui.add_checkbox("Occupied cells", False, hint="Cells that are sampled, without those inside")
+            self._cells = gui.add_checkbox("Occupied cells", False, hint="Outer cells of the sampled region")
             self._cells.on_update(lambda _: self._show_cells())
         handles = [self._output, self._size, self._time, self._appearance, self._own_background, self._background]
         for handle in [*handles, *self._crop_values]:
@@ -95,11 +95,11 @@ class Panel:
     def _changed(self, _: Any) -> None:
         self._studio.ask(self._client.client_id, self.request)
 
-    async def _moved(self, _: Any) -> None:  # in the server's own thread, so that cameras stay in their order
+    async def _moved(self, _: Any) -> None:  # in the server's own thread, so that cameras stay in order
         self._studio.ask(self._client.client_id, self.request)
 
     def request(self, last: Request | None = None) -> Request | None:
-        """Return what the browser asks for now; the `last` request if its camera makes no sense."""
+        """Return the browser's current request; the `last` request if its camera is invalid."""
         camera = self._client.camera
         pose = pose_of(camera.wxyz, camera.position, camera.fov)
         if pose is None:
@@ -132,7 +132,7 @@ class Panel:
         return Crop((first, second), begin, end if end > begin else math.inf)
 
     def time(self) -> float | None:
-        """Return the time that is shown; None for a static scene."""
+        """Return the displayed time; None for a static scene."""
         return None if self._time is None else number_in(self._time.value, 0, 1, 0)
 
     # -- the scene --------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The path editor of one browser: cameras are added, passed in a preview, saved, and rendered."""
+"""The path editor of one browser: add cameras, preview, save and render a path."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 LINE = "/camera_path"
 """Name of the path in the scene."""
 PREVIEW_FPS = 20.0
-"""Maximum number of cameras per second of a preview."""
+"""Maximum number of cameras per second in a preview."""
 NOTHING = "-"
-"""Entry of the list of cameras while there is none."""
+"""Entry in the list of cameras while it is empty."""
 
 
 class PathPanel:
@@ -38,9 +38,9 @@ class PathPanel:
 
     Args:
         client: the browser.
-        subject: function that returns what is looked at.
-        request: function that returns what the browser sees; None if its camera makes no sense.
-        renders: processes that render paths, of which one may run at a time; None if none may.
+        subject: function that returns the model and its run.
+        request: function that returns the browser's request; None if its camera is invalid.
+        renders: processes that render paths, at most one at a time; None if rendering is not allowed.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class PathPanel:
         self._note = gui.add_markdown("")
 
     def close(self) -> None:
-        """Stop the preview: the browser has left."""
+        """Stop the preview when the browser has left."""
         self._playing = False
 
     # -- editing ----------------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ class PathPanel:
             self._edit(lambda editor: editor.moved(index, keyframe))
 
     def _edit(self, change: Callable[[Editor], Editor]) -> None:
-        """Change the path, and show it."""
+        """Change the path and show it."""
         before = len(self._editor.keyframes)
         self._editor = replace(
             change(self._editor),
@@ -183,7 +183,7 @@ class PathPanel:
         """Start ns-render on the path in another process."""
         assert self._renders is not None
         if any(process.poll() is None for process in self._renders):
-            self._note.content = "A path is being rendered; wait for its end."
+            self._note.content = "A path is being rendered; wait until it is finished."
             return
         file = self._save()
         if file is None:
@@ -195,13 +195,11 @@ class PathPanel:
         self._renders[:] = [process]
         self._note.content = f"Rendering {output.name} ..."
         status = process.wait()
-        self._note.content = (
-            f"Rendered {output.name}." if status == 0 else "It could not be rendered; see the terminal."
-        )
+        self._note.content = f"Rendered {output.name}." if status == 0 else "Rendering failed; see the terminal."
 
 
 def video_suffix(stem: str) -> str:
-    """Return a video's file name with the `stem`: MP4 if it can be written, else GIF."""
+    """Return a video's file name with the `stem`: MP4 if it can be written, otherwise GIF."""
     return f"{stem}.mp4" if find_spec("imageio_ffmpeg") is not None else f"{stem}.gif"
 
 

@@ -1,4 +1,4 @@
-"""The training images beside the scene: cameras, small pictures, and errors against them."""
+"""The training images in the viewer: cameras, thumbnails, and errors against them."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose
 
 MOST = 200
-"""Maximum number of cameras that are shown."""
+"""Maximum number of cameras shown."""
 THUMBNAIL = 96
-"""Longer side of a small picture, pixels."""
+"""Longer side of a thumbnail, pixels."""
 SAME_PLACE, SAME_WAY = 1e-3, 0.02
-"""Distance, as a fraction of the spread of the cameras, and angle in radians within which a view is at a photograph."""
+"""Maximum distance, relative to the spread of the cameras, and angle in radians between a view and its photograph."""
 
 
 class Photographs:
-    """Training images of a run, of which nothing is read before it is needed, and no file twice at a time.
+    """Training images of a run. Nothing is read before it is needed, and no file twice at a time.
 
     Args:
         run: the run, with the folder and the format of its data; None for none.
@@ -48,7 +48,7 @@ class Photographs:
 
     @property
     def parsed(self) -> ParsedScene | None:
-        """The training split, not decoded; None if it cannot be read, which is said once."""
+        """The training split, not decoded; None if it cannot be read, which is reported once."""
         with self._lock:
             return self._parsed
 
@@ -72,7 +72,7 @@ class Photographs:
         return self.cameras.ndc if isinstance(self.cameras, NdcCameras) else None
 
     def chosen(self) -> list[int]:
-        """Return the indices of the images whose cameras are shown, evenly spaced, at most `MOST`."""
+        """Return the indices of the images whose cameras are shown, at most `MOST`, evenly spaced."""
         return [] if self.cameras is None else spread(len(self.cameras), MOST)
 
     def name(self, index: int) -> str:
@@ -85,14 +85,14 @@ class Photographs:
         return self.cameras.camera_to_worlds[index]
 
     def fov(self, index: int) -> float:
-        """Return the vertical field of view of image `index`, radians; 60 degrees for one that is no pinhole's."""
+        """Return the vertical field of view of image `index`, radians; 60 degrees for lenses other than pinhole."""
         assert self.cameras is not None
         if self.cameras.model not in ("pinhole", "opencv"):
             return math.radians(60)
         return 2 * math.atan(0.5 * float(self.cameras.heights[index]) / float(self.cameras.fy[index]))
 
     def thumbnail(self, index: int) -> np.ndarray | None:
-        """Return a small picture (H, W, 3) uint8 of image `index`, over white; None if the file cannot be read."""
+        """Return a thumbnail (H, W, 3) uint8 of image `index`, over white; None if the file cannot be read."""
         with self._lock:
             return self._small(index)
 
@@ -111,7 +111,7 @@ class Photographs:
     # -- errors -----------------------------------------------------------------------------------------------
 
     def at(self, pose: Pose) -> int | None:
-        """Return the image whose camera has a given place and direction; None if there is none.
+        """Return the image whose camera has a given position and direction; None if there is none.
 
         Args:
             pose: camera of a view.
@@ -127,18 +127,18 @@ class Photographs:
         return int(torch.where(close, distances, torch.inf).argmin()) if bool(close.any()) else None
 
     def truth(self, view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
-        """Return what the photograph at a view's camera shows in the view's pixels.
+        """Return the photograph's colours in the pixels of a view from the photograph's position.
 
-        From one place, a direction has the same colour in every picture, whatever its distance. So the pixels of the
-        view are projected into the photograph, through its lens. Pixels outside of it keep the rendered colour.
+        Seen from one position, a direction has the same colour in every picture, whatever its distance. So the view's
+        pixels are projected into the photograph, through its lens. Pixels outside it keep the rendered colour.
 
         Args:
-            view: a view from the place of a photograph.
-            rgb: (H, W, 3) its rendered colours in [0, 1].
+            view: a view from a photograph's position.
+            rgb: (H, W, 3) rendered colours of the view in [0, 1].
             background: (3,) colour behind transparent pixels.
 
         Returns:
-            (H, W, 3) colours; None if there is no photograph from there.
+            (H, W, 3) colours; None if there is no photograph from that position.
         """
         matrix = view.camera.camera_to_worlds[0].double().cpu().flatten().tolist()
         with self._lock:
@@ -160,7 +160,7 @@ class Photographs:
 def small_picture(path: Path) -> np.ndarray | None:
     """Return an image reduced to `THUMBNAIL` pixels over white, (H, W, 3) uint8; None if it cannot be read.
 
-    A JPEG is decoded at an eighth of its size, if that is enough.
+    A JPEG is decoded at an eighth of its size if that suffices.
 
     Args:
         path: the file.

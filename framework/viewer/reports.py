@@ -31,7 +31,7 @@ def heading(loaded: Loaded) -> str:
 
 
 def curve(folder: Path) -> tuple[list[float], list[float]]:
-    """Return seconds of training and PSNR of held-out images, dB, in the order of time; empty if there are none.
+    """Return training seconds and PSNR of held-out images, dB, in order of time; empty if there are none.
 
     Args:
         folder: the run's folder.
@@ -62,5 +62,5 @@ def _finite(value: Any) -> float | None:
 
 
 def _plain(text: str) -> str:
-    """Return text without what Markdown and HTML would take for a mark."""
+    """Return text without characters that Markdown or HTML would interpret."""
     return "".join(letter if letter.isalnum() or letter in "-_. :" else "?" for letter in text).replace("_", r"\_")

@@ -1,4 +1,4 @@
-"""Requests of browsers: a camera, an output, and how the scene is shown. Nothing in them is believed unchecked."""
+"""Requests of browsers: a camera, an output, and display options. All values are validated."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ FARTHEST = 1e6
 ANGLES = (0.5, 170.0)
 """Range of the vertical field of view, degrees."""
 LARGEST_SIDE, SMALLEST_SIDE = 4096, 8
-"""Range of the width and the height of a picture, pixels."""
+"""Range of the width and height of a picture, pixels."""
 OUTPUTS = ("rgb", "depth", "accumulation", "error")
-"""Outputs that a browser can ask for of every method; a method may declare others."""
+"""Outputs available for every method; a method may declare others."""
 
 
 @dataclass(frozen=True)
@@ -39,19 +39,19 @@ class Pose:
 
 @dataclass(frozen=True)
 class Crop:
-    """Part of space that is shown."""
+    """Visible part of space."""
 
     corners: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Minimum and maximum corner of a box, scene units."""
     near: float = 0.0
-    """Distance from the camera before which nothing is shown, scene units."""
+    """Distance from the camera up to which nothing is shown, scene units."""
     far: float = math.inf
     """Distance from the camera beyond which nothing is shown, scene units."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """A view that a browser asks to see."""
+    """A view requested by a browser."""
 
     pose: Pose
     """Camera."""
@@ -60,22 +60,22 @@ class Request:
     height: int
     """Height of the finished picture, pixels."""
     output: str = "rgb"
-    """Name of the output: one of `OUTPUTS`, or of those that the method declares."""
+    """Name of the output: one of `OUTPUTS`, or one declared by the method."""
     time: float | None = None
     """Time in [0, 1]; None for a static scene."""
     appearance: int | None = None
-    """Training image whose appearance is shown; None for the mean."""
+    """Training image whose appearance to use; None for the mean."""
     background: tuple[float, float, float] | None = None
-    """Colour behind the scene, 0 to 1; None for that of evaluations."""
+    """Colour behind the scene, 0 to 1; None for the evaluation background."""
     crop: Crop | None = None
-    """Part of space that is shown; None for all."""
+    """Visible part of space; None for all."""
 
     def camera(self, stride: int = 1, rows: tuple[int, int] | None = None, ndc: Ndc | None = None) -> Cameras:
         """Return the camera of a smaller picture of the same view, or of some of its rows.
 
         Args:
             stride: width and height are divided by it and rounded up.
-            rows: first row and the one after the last; all if None.
+            rows: first row and the one after the last; None for all.
             ndc: normalised device coordinates of the scene; None if it has none.
         """
         width, height = smaller(self.width, self.height, stride)
@@ -106,7 +106,7 @@ def smaller(width: int, height: int, stride: int) -> tuple[int, int]:
 
 
 def pose_of(wxyz: Any, position: Any, fov: Any) -> Pose | None:
-    """Return the camera that a browser reports; None if the numbers make no camera.
+    """Return the camera reported by a browser; None if the numbers are invalid.
 
     Args:
         wxyz: quaternion from the camera's axes (x right, y down, z forward) to the scene.
@@ -140,7 +140,7 @@ def quaternion_of(pose: Tensor) -> tuple[float, float, float, float]:
     """
     m = (pose[:, :3].double() * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)).tolist()
     trace = m[0][0] + m[1][1] + m[2][2]
-    # The largest of the four squares is divided by, so that nothing is divided by zero.
+    # Divide by the largest of the four squares, so that nothing is divided by zero.
     squares = [1 + trace, *(1 - trace + 2 * m[i][i] for i in range(3))]
     largest = squares.index(max(squares))
     twice = math.sqrt(squares[largest])
@@ -160,7 +160,7 @@ def size_of(width: Any, height: Any, longest: int) -> tuple[int, int]:
     """Return the size of the finished picture in a browser's window.
 
     Args:
-        width, height: size of the window, pixels; anything else counts as 4:3.
+        width, height: size of the window, pixels; invalid values count as 4:3.
         longest: maximum of width and height, pixels.
     """
     numbers = _numbers([width, height], 2)
@@ -170,32 +170,32 @@ def size_of(width: Any, height: Any, longest: int) -> tuple[int, int]:
 
 
 def number_in(value: Any, least: float, most: float, default: float) -> float:
-    """Return a number from a browser, clamped; the default for anything that is no finite number.
+    """Return a number from a browser, clamped; the default if it is not a finite number.
 
     Args:
-        value: what the browser sent.
+        value: value sent by the browser.
         least, most: range.
-        default: the number to take instead.
+        default: the default.
     """
     found = _numbers([value], 1)
     return default if found is None else min(max(found[0], least), most)
 
 
 def one_of(value: Any, choices: Sequence[str]) -> str:
-    """Return a word from a browser if it is among the choices, else the first of them.
+    """Return a word from a browser if it is among the choices, otherwise the first choice.
 
     Args:
-        value: what the browser sent.
+        value: value sent by the browser.
         choices: allowed words.
     """
     return value if isinstance(value, str) and value in choices else choices[0]
 
 
 def color_of(value: Any) -> tuple[float, float, float]:
-    """Return a colour in [0, 1] of a browser's, three numbers from 0 to 255; white for anything else.
+    """Return a browser's colour in [0, 1], from three numbers from 0 to 255; white if they are invalid.
 
     Args:
-        value: what the browser sent.
+        value: value sent by the browser.
     """
     found = _numbers(value, 3)
     red, green, blue = (1.0, 1.0, 1.0) if found is None else (min(max(part / 255, 0.0), 1.0) for part in found)
@@ -203,10 +203,10 @@ def color_of(value: Any) -> tuple[float, float, float]:
 
 
 def corner_of(value: Any, default: Sequence[float]) -> tuple[float, float, float]:
-    """Return a point from a browser; the default for anything else.
+    """Return a point from a browser; the default if it is invalid.
 
     Args:
-        value: what the browser sent.
+        value: value sent by the browser.
         default: three coordinates.
     """
     found = _numbers(value, 3)

@@ -1,4 +1,4 @@
-"""The web server of the viewer: its address, and what it refuses."""
+"""The web server of the viewer: its address, and refused connections."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ if TYPE_CHECKING:
     import viser
 
 PORTS_TRIED = 100
-"""Number of ports that are tried, from the one that is asked for."""
+"""Number of ports tried, starting at the requested one."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-"""Names of this machine that no other machine reaches."""
+"""Names of the loopback interface, which other machines cannot reach."""
 
 
 def check_installed() -> None:
-    """Raise ConfigError, with the command to install it, if viser is missing; before anything that takes long."""
+    """Raise ConfigError, with the install command, if viser is missing; call it before anything slow."""
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the first port from a given one on that nobody listens at.
+    """Return the first free port, starting at a given one.
 
     Args:
         host: name or address of a network interface of this machine.
-        port: the port to begin with.
+        port: first port to try.
 
     Raises:
-        ConfigError: if the host is none of this machine, or no port is free.
+        ConfigError: if the host is not a local address, or no port is free.
     """
     if not 1 <= port <= 65535:
         raise FlagError(f"--websocket-port is {port}; it must be from 1 to 65535")
@@ -52,16 +52,16 @@ def free_port(host: str, port: int) -> int:
                 probe.bind(address)
                 return candidate
         except UnicodeError:
-            raise ConfigError(f"--websocket-host {host}: this is no name of a host") from None
+            raise ConfigError(f"--websocket-host {host}: this is not a host name") from None
         except OSError as error:
             if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
                 raise ConfigError(f"--websocket-host {host}: {error.strerror or error}") from error
             reason = error.strerror or str(error)
-    raise ConfigError(f"--websocket-port {port}: no port from there on can be used ({reason})")
+    raise ConfigError(f"--websocket-port {port}: no port from this one on is usable ({reason})")
 
 
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:
-    """Start the server, and say its address.
+    """Start the server and report its address.
 
     Args:
         host: interface to listen on.
@@ -76,7 +76,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     import viser
 
     _shorten_log()
-    # Browsers leave while a picture is made for them.
+    # Browsers may leave while a picture is drawn for them.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     with redirect_stdout(io.StringIO()):  # viser prints a table of addresses
         server = viser.ViserServer(host=host, port=chosen, label=label, verbose=False)
@@ -91,13 +91,13 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
 
 
 def close_server(server: viser.ViserServer) -> None:
-    """Stop a `server`; its browsers keep what they show."""
-    with redirect_stdout(io.StringIO()):  # viser prints that it has stopped
+    """Stop a `server`; browsers keep their last picture."""
+    with redirect_stdout(io.StringIO()):  # viser prints a message
         server.stop()
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches a `host`."""
+    """Return whether only this machine can reach a `host`."""
     try:
         return host in LOOPBACK or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -105,10 +105,10 @@ def is_loopback(host: str) -> bool:
 
 
 def is_allowed(origin: str | None, host: str | None, is_local: bool) -> bool:
-    """Return whether a page may connect: the viewer's own may, and programs that are no browsers.
+    """Return whether a page may connect: the viewer's own page, and programs other than browsers.
 
-    A browser lets any page open a connection to any address, and says which page it is. On the loopback the page must
-    be from the loopback too, so that no foreign name can be made to stand for it.
+    A browser lets any page connect to any address, and states which page it is. On the loopback interface the page must
+    be from the loopback interface too, so that a foreign name cannot pretend to be it.
 
     Args:
         origin: header Origin of the connection; None if there is none.
@@ -127,7 +127,7 @@ def is_allowed(origin: str | None, host: str | None, is_local: bool) -> bool:
 
 
 def _refuse(server: Any, is_local: bool) -> None:
-    """Refuse connections of other pages, and requests to make the viewer public through viser's relay."""
+    """Refuse connections from other pages, and requests to make the viewer public through viser's relay."""
     from viser import _messages
 
     infra = server._websock_server
@@ -137,7 +137,7 @@ def _refuse(server: Any, is_local: bool) -> None:
         headers = live.request.headers
         if not is_allowed(headers.get("Origin"), headers.get("Host"), is_local):
             say(f"viewer: refused a connection of the page {headers.get('Origin')!r:.100}")
-            await live.close(1008, "this page is not the viewer's")
+            await live.close(1008, "only the viewer's own page may connect")
 
     infra._client_connect_cb.insert(0, check)
     infra.unregister_handler(_messages.ShareUrlRequest)
@@ -145,14 +145,14 @@ def _refuse(server: Any, is_local: bool) -> None:
 
 
 class _OneLine(logging.Handler):
-    """A log of one line for each problem, where the libraries below would print a traceback."""
+    """A log of one line per problem, where the libraries would print a traceback."""
 
     def emit(self, record: logging.LogRecord) -> None:
         error = record.exc_info[1] if record.exc_info else None
         reason = f": {type(error).__name__}" if error is not None else ""
-        # Browsers open connections ahead that they do not use.
+        # Browsers open connections in advance that they do not use.
         if record.levelno >= logging.ERROR and record.getMessage() != "opening handshake failed":
-            say(f"viewer: a connection sent something that was not understood, and is ignored{reason}")
+            say(f"viewer: ignoring a connection with invalid data{reason}")
 
 
 def _shorten_log() -> None:

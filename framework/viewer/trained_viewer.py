@@ -16,7 +16,7 @@ from nerfloom.viewer.server import close_server, open_server
 from nerfloom.viewer.viewed import newer_checkpoint, reloaded
 
 SECONDS_PER_LOOK = 2.0
-"""Seconds between looks for a newer checkpoint."""
+"""Seconds between checks for a newer checkpoint."""
 
 
 def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
@@ -26,11 +26,11 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
         loaded: what is looked at.
         host: interface to listen on.
         port: port to listen on; the next free one if it is taken.
-        follow: whether newer checkpoints of the run are shown as they are written.
+        follow: whether to show newer checkpoints of the run as they are written.
 
     Raises:
         ConfigError: if viser is missing, or the address cannot be used.
-        KeyboardInterrupt: on Ctrl-C, after the server has ended.
+        KeyboardInterrupt: on Ctrl-C, after the server has stopped.
     """
     photographs = Photographs(loaded.source)
     studio = Studio(loaded, ndc=_ndc(loaded.model.scene.warped, photographs), truth=photographs.truth)
@@ -59,7 +59,7 @@ def _follow(studio: Studio, page: Page, seen: Path) -> Path:
         return seen
     found = reloaded(studio.subject, newer)
     if isinstance(found, str):
-        if os.path.exists(newer):  # not one that has been replaced by a newer one meanwhile
+        if os.path.exists(newer):  # it may have been replaced by a newer one meanwhile
             say(f"viewer: {found}")
     else:
         studio.subject = found

@@ -1,7 +1,7 @@
 """A viewer of a run in training: `ns-train --vis viewer`.
 
-Pictures are drawn between two steps, in the thread that trains, so that no lock is needed and nothing that is learnt
-can depend on them: each step draws its random numbers anew from (seed, step). They take a fixed share of the time.
+Pictures are drawn between steps, in the training thread. So no lock is needed, and training cannot depend on them: each
+step seeds its random numbers from (seed, step). Drawing takes a fixed share of the time.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
     import viser
 
 PIECE = 0.04
-"""Seconds of a picture, or of a piece of it, between two steps."""
+"""Time limit for a picture, or a piece of it, between two steps, seconds."""
 SECONDS_PER_REPORT = 0.5
 """Seconds between updates of the numbers in the panel."""
 PAUSE = 0.05
-"""Seconds between looks at the button while training is paused."""
+"""Seconds between checks of the button while training is paused."""
 
 
 class Turns:
-    """Turns of the viewer between the steps of a run.
+    """The viewer's turns between the steps of a run.
 
     Args:
         trainer: the run's trainer.
         studio: draws the pictures.
-        share: the pictures' fraction of the time.
+        share: fraction of the time for pictures.
     """
 
     def __init__(self, trainer: Trainer, studio: Studio, share: float) -> None:
@@ -52,14 +52,14 @@ class Turns:
         self.waited = 0.0
 
     def take(self, report: StepReport, stopped: Sequence[int]) -> None:
-        """Draw for as long as the share of the time allows; while training is paused, until it goes on.
+        """Draw within the share of time; while training is paused, draw until it continues.
 
         Args:
             report: report of the last step.
-            stopped: signals received so far; any ends a pause.
+            stopped: signals received so far; any signal ends a pause.
         """
         start = time.perf_counter()
-        if self._studio.is_empty and not self.paused:  # nobody looks: nothing to do
+        if self._studio.is_empty and not self.paused:  # no browsers
             self._ended = start
             return
         self._share = self._share.earned(start - self._ended)
@@ -76,7 +76,7 @@ class Turns:
 
 
 class Status:
-    """Numbers of a run in training, and the button that pauses it, in the panel of all browsers.
+    """Numbers of a run in training, and its pause button, in the panel of all browsers.
 
     Args:
         server: the server.
@@ -94,10 +94,10 @@ class Status:
 
     def _press(self, _: Any) -> None:
         self._turns.paused = not self._turns.paused
-        self._button.label = "Go on training" if self._turns.paused else "Pause training"
+        self._button.label = "Continue training" if self._turns.paused else "Pause training"
 
     def show(self, report: StepReport) -> None:
-        """Show the numbers of a step, unless those of another were shown a moment ago.
+        """Show the numbers of a step, unless others were shown a moment ago.
 
         Args:
             report: report of the step.

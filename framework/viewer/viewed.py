@@ -11,11 +11,11 @@ from nerfloom.training.trained import load_trained
 
 
 def newer_checkpoint(folder: Path, seen: Path | None) -> Path | None:
-    """Return the newest checkpoint in a run's folder if it is not the one that was seen.
+    """Return the newest checkpoint in a run's folder, unless it is the one already seen.
 
     Args:
         folder: the run's folder.
-        seen: path of the checkpoint that was loaded or tried last; None if none was.
+        seen: checkpoint loaded or tried last; None if there was none.
     """
     try:
         newest = list_checkpoints(folder / FOLDER)[-1:]

@@ -40,7 +40,7 @@ def test_bad_input_is_refused_in_a_line(shared_tiny: Path, tmp_path: Path, refus
     output = ("--output", tmp_path / "c.json")
     assert "there is no benchmark 'contenton'. Did you mean 'contention'?" in refused(ours.main, "contenton")
     assert "no such folder" in refused(ours.main, "contention", "--data", tmp_path / "none", *output)
-    assert "no condition is called 'loop3'" in refused(
+    assert "there is no condition 'loop3'" in refused(
         ours.main, "contention", "--data", shared_tiny, "--rows", "loop3", *output, status=2
     )
     in_a_file = ("--output-dir", shared_tiny / "transforms_train.json" / "below")

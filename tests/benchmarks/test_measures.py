@@ -135,7 +135,7 @@ def test_poses_are_compared_by_name_up_to_a_similarity(tmp_path: Path) -> None:
     assert found["processing"] is None
     others = make_capture(seed=1)
     others.names = [f"other{name}" for name in others.names]
-    with pytest.raises(DataError, match="no image in common"):
+    with pytest.raises(DataError, match="no common images"):
         poses.compare(write_processed(tmp_path / "none", others, others.names), model)
 
 

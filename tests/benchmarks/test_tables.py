@@ -96,7 +96,7 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
     ("text", "reason"),
     [
         ("rows: 3", "has a list of 'rows'"),
-        ("rows: []\nextra: 1", "and nothing else"),
+        ("rows: []\nextra: 1", "nothing else"),
         ("rows: [7]", "it must have data, methods"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}}]", "has no rows"),
         ("rows: [{data: {a: b}, methods: [kplanes], seconds: [1]}]", "must have names with a text each"),
@@ -166,7 +166,7 @@ def test_rows_that_are_there_are_not_run_again(
     write(tmp_path, ROWS.replace("--num-scales 2", "--num-scales 3"))
     with pytest.raises(SystemExit):
         bench(monkeypatch, tmp_path)
-    assert "is of 'kplanes --num-scales 2 on" in capsys.readouterr().err
+    assert "belongs to 'kplanes --num-scales 2 on" in capsys.readouterr().err
 
 
 def test_a_finished_run_without_its_row_is_only_written(

@@ -36,7 +36,7 @@ def test_method_help_shows_its_flags_without_prefix() -> None:
     [
         (["instant-npg"], "error: unknown method 'instant-npg'. Did you mean 'instant-ngp'?"),
         (["instant-ngp", "--data", "no/such/folder"], "error: --data no/such/folder: there is no such folder"),
-        (["instant-ngp", "--data", "."], "error: --data .: the folder is in no known data format"),
+        (["instant-ngp", "--data", "."], "error: --data .: the folder's format is unknown"),
         (["--load-config", "no.yml"], "error: cannot read no.yml: No such file or directory"),
         (["--data", "x"], "error: the method comes first, before --data"),
     ],

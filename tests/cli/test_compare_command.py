@@ -42,13 +42,13 @@ def test_two_methods_one_that_fails_and_a_second_call(shared_tiny: Path, tmp_pat
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
     other = run("ns-compare", "--methods", NGP, "--data", shared_tiny, "--max-seconds", 5, "--output-dir", out)
     assert other.returncode == 1
-    assert "holds a comparison under other conditions" in other.stderr
+    assert "has a comparison under other conditions" in other.stderr
 
 
 @pytest.mark.parametrize(
     ("flags", "status", "reason"),
     [
-        (("--methods", "kplanes"), 2, "set how long each method trains"),
+        (("--methods", "kplanes"), 2, "set the training budget"),
         (("--max-seconds", 1), 2, "--methods is empty"),
         (("--methods", "kplanez", "--max-seconds", 1), 1, "Did you mean 'kplanes'"),
         (("--methods", "kplanes", "--max-seconds", 1, "--data", "/no/such/folder"), 1, "there is no such folder"),

@@ -132,7 +132,7 @@ def test_damaged_photographs_in_our_words_and_thumbnails_with_a_warning(tmp_path
         (
             (whole[: len(whole) * 2 // 3], "it is damaged or truncated; copy it again"),
             (b"", "the file is empty; copy it again"),
-            (b"no image", "its content is no image, or its beginning is damaged; copy it again"),
+            (b"no image", "it is not an image, or its beginning is damaged; copy it again"),
         )
     ):
         first.write_bytes(content)
@@ -152,4 +152,4 @@ def test_output_over_the_input(tmp_path: Path, refused: Refused) -> None:
         assert said.endswith(f"--output-dir {tmp_path / 'scan-processed'}")
     shutil.move(folder, folder.with_name("raw"))  # beside what is written: nothing is in danger
     said = refused(process_data.main, "images", "--data", folder.with_name("raw"), "--output-dir", folder.parent)
-    assert "use --overwrite" in said
+    assert "has 'raw' but no transforms.json; choose a new folder or use --overwrite" in said

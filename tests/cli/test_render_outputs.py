@@ -206,12 +206,12 @@ def test_a_killed_render_goes_on_to_the_same_file(
     assert not parts.exists()
     # Another command does not take them, and does not remove them.
     other = called("ns-render", *words, "--output-path", parts, "--downscale-factor", 2)
-    assert "holds frames of another render" in other.stderr
+    assert "has frames of another render" in other.stderr
     assert len(rendered) == 4 + 6
     other_bytes = parts.read_bytes()
     stop = -1
     done = called("ns-render", *words, "--output-path", parts)
-    assert "3 of 6 frames are there already" in done.stderr
+    assert "3 of 6 frames already exist" in done.stderr
     assert len(rendered) == 4 + 6 + 3
     assert parts.read_bytes() == whole.read_bytes() != other_bytes
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted([whole.name, parts.name])
@@ -229,7 +229,7 @@ def test_a_process_that_is_killed_loses_no_frame(ball_run: Path, tmp_path: Path)
         process.kill()
     assert not parts.exists()
     done = called("ns-render", *words, "--output-path", parts)
-    assert "of 60 frames are there already" in done.stderr
+    assert "of 60 frames already exist" in done.stderr
     assert parts.read_bytes() == whole.read_bytes()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["parts.gif", "whole.gif"]
 

@@ -35,7 +35,7 @@ def damage_images(data: Path, content: bytes | None) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "not JSON": (lambda d: (d / "transforms_train.json").write_text("{"), "transforms_train.json is not JSON"),
-    "a list": (lambda d: (d / "transforms_train.json").write_text("[]"), "must hold a JSON object"),
+    "a list": (lambda d: (d / "transforms_train.json").write_text("[]"), "must contain a JSON object"),
     "deep": (lambda d: (d / "transforms_train.json").write_text("[" * 100_000), "transforms_train.json is not JSON"),
     "no frames": (lambda d: change(d, lambda c: c.update(frames=[])), "transforms_train.json lists no frames"),
     "no angle": (lambda d: change(d, lambda c: c.pop("camera_angle_x")), "there is no focal length"),

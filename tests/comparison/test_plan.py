@@ -56,7 +56,7 @@ def test_a_budget_without_end_is_refused(seconds: float) -> None:
 
 
 def test_conditions_must_end_somewhere() -> None:
-    with pytest.raises(ConfigError, match="set how long each method trains"):
+    with pytest.raises(ConfigError, match="set the training budget"):
         replace(CONDITIONS, max_seconds=None)
     nothings = ({"max_seconds": 0.0}, {"max_num_iterations": 0}, {"target_psnr": math.nan}, {"max_seconds": math.inf})
     for nothing in nothings:

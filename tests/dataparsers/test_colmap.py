@@ -243,7 +243,7 @@ def test_the_largest_of_several_models_is_taken(
     assert len(Colmap(eval_interval=0).parse(folder, "test").image_paths) == 10
     said = " ".join(capsys.readouterr().err.split())
     assert said.count("2 COLMAP reconstructions") == 1
-    assert "sparse/1 has 10 of the images that are there" in said
+    assert "using sparse/1 with 10 of the existing images; sparse/0 has 4" in said
     assert len(Colmap(eval_interval=0, colmap_path="sparse/0").parse(folder, "train").image_paths) == 4
 
 
@@ -303,7 +303,7 @@ def test_names_of_another_system(tmp_path: Path, capture: Capture, capsys: pytes
     scene = Colmap(eval_interval=0).parse(tmp_path, "train")
     assert [path.name for path in scene.image_paths] == [name.upper() for name in names]
     assert scene.mask_paths == (*(tmp_path / "masks" / name for name in names[:-1]), None)
-    assert "10 of 10 are on the disk in another folder" in " ".join(capsys.readouterr().err.split())
+    assert "10 of 10 found in another folder" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("digits", [2, 3, 6])

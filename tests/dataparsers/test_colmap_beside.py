@@ -139,7 +139,7 @@ def test_a_model_of_another_reconstruction_is_left_out_and_said_to_be(
     write_transforms(folder, make_capture(seed=5))
     scene = ALL.parse(folder, "train")
     assert (scene.sightings, scene.points) == (None, None)
-    assert "0 of 10 images" in capsys.readouterr().err.replace("\n", " ")
+    assert "only 0 of 10 images have their pose from transforms.json" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_a_damaged_model_is_left_out_and_said_to_be(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

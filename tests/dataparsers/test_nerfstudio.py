@@ -325,8 +325,8 @@ def test_names_of_windows(capture: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert scene.mask_paths == (*[None] * 3, capture / "masks" / "004.png", *[None] * 4)
     assert [path.name for path in Nerfstudio().parse(capture, "test").image_paths] == ["003.png"]
     said = capsys.readouterr().err
-    assert said.count("9 of 9 are on the disk in another folder") == 1  # of training alone
-    assert "'mask_path': 1 of 1" in said
+    assert said.count("9 of 9 found in another folder") == 1  # of training alone
+    assert "files of 'mask_path': 1 of 1 found in another case" in said
 
 
 @pytest.mark.parametrize("digits", [2, 3, 5])
@@ -348,7 +348,7 @@ def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureF
     for factor, said in ((0.001, True), (1.0, False)):
         flags = Nerfstudio(eval_interval=0, depth_unit_scale_factor=factor)
         scene = flags.parse(capture, "train")
-        assert ("EXR files are taken for millimetres" in capsys.readouterr().err) == said
+        assert ("EXR files are read as millimetres" in capsys.readouterr().err) == said
         depths = load_dataset(scene, "train").depths
         assert depths is not None
         assert float(depths.max()) == pytest.approx(2.5 * factor * scene.scale, rel=1e-3)

@@ -56,7 +56,7 @@ def test_a_capture_by_long_lenses_is_enlarged_in_every_split(
     factor = train.scale / plain.scale
     said = capsys.readouterr().err
     assert factor > 2
-    assert said.count(f"the scene is enlarged by {factor:.1f} (--auto-scale-poses)") == 1
+    assert said.count(f"it is enlarged by {factor:.1f} (--auto-scale-poses)") == 1
     assert held_out.scale == train.scale
     everything = Nerfstudio(eval_mode="all")
     cameras = everything.parse(folder, "train").cameras

@@ -108,13 +108,13 @@ def test_bad_content_is_refused_by_name(capture: Path, name: str) -> None:
 def test_bad_folders_and_flags(capture: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="--data"):
         Polycam().parse(None, "train")
-    with pytest.raises(DataError, match="has no keyframes/cameras"):
+    with pytest.raises(DataError, match="lacks keyframes/cameras"):
         Polycam().parse(tmp_path, "train")
     with pytest.raises(DataError, match="--depth-unit-scale-factor is 0"):
         Polycam(depth_unit_scale_factor=0).parse(capture, "train")
     for file in (capture / "keyframes" / "cameras").iterdir():
         file.unlink()
-    with pytest.raises(DataError, match=r"holds no camera"):
+    with pytest.raises(DataError, match=r"has no cameras"):
         Polycam().parse(capture, "train")
 
 

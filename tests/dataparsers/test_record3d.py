@@ -93,7 +93,7 @@ def pose(index: int, value: Any) -> Any:
 
 
 BAD = {
-    "no poses": (lambda c: c.pop("poses"), "'poses' must be a list of the camera's poses"),
+    "no poses": (lambda c: c.pop("poses"), "'poses' must be a list of camera poses"),
     "short pose": (lambda c: c["poses"][4].pop(), "pose 4: 'poses' is .*; it must be a list of 7 numbers"),
     "nan pose": (pose(5, math.nan), "pose 4: 'poses' is nan"),
     "zero quaternion": (lambda c: c["poses"].__setitem__(4, 7 * [0]), "pose 4 has a quaternion of length 0"),

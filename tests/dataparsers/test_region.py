@@ -230,7 +230,7 @@ def test_contradictions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     edit(folder, "train", camera_angle_x=1.2)
     assert Blender().parse(folder, "train").cameras.fx.tolist() == [100.0] * 3
     said = capsys.readouterr().err
-    assert "'fl_x' is 100, but 'camera_angle_x' gives 65.7763" in said
+    assert "'fl_x' is 100, but 'camera_angle_x' gives 65.7763 for a width of 90 pixels; using fl_x" in said
     Blender().parse(folder, "test")
     assert "camera_angle_x" not in capsys.readouterr().err
     edit(folder, "train", w=70, h=90)

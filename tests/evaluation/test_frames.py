@@ -34,7 +34,7 @@ def test_a_stopped_render_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[
     frames = open_frames(tmp_path / "a.gif", 5, dict(reversed(facts.items())))
     frames.path(1).write_bytes(frames.path(1).read_bytes()[:100])  # damaged
     frames.render(second)
-    assert "2 of 5 frames are there already" in capsys.readouterr().err
+    assert "2 of 5 frames already exist" in capsys.readouterr().err
     assert (first.rendered, second.rendered) == ([0, 1, 2], [1, 3, 4])
     for index, kept in enumerate(frames):
         assert kept["rgb"].tolist() == [[[index] * 3] * 2] * 2
@@ -48,7 +48,7 @@ def test_frames_of_another_render_are_left_alone(tmp_path: Path, capsys: pytest.
     with pytest.raises(KeyboardInterrupt):
         open_frames(tmp_path / "a.gif", 5, {"run": "a"}).render(Renderer(stop=2))
     other = open_frames(tmp_path / "a.gif", 5, {"run": "b"})
-    assert "holds frames of another render" in capsys.readouterr().err
+    assert "has frames of another render" in capsys.readouterr().err
     renderer = Renderer()
     other.render(renderer)
     assert renderer.rendered == list(range(5))
@@ -65,7 +65,7 @@ def test_a_frame_that_is_missing_when_files_are_written(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "a.gif.frames").touch()
-    with pytest.raises(ConfigError, match=r"cannot write .*; name another place"):
+    with pytest.raises(ConfigError, match=r"cannot write .*; use another path"):
         open_frames(tmp_path / "a.gif", 1, {})
 
 

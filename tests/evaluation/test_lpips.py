@@ -104,13 +104,13 @@ def test_files_that_hold_no_such_weights_are_refused(arrays: Arrays, tmp_path: P
         (arrays | {bias: nan[:5]}, f"has float32 \\(5,\\) as {bias}"),
         (arrays | {bias: np.zeros(64)}, f"has float64 \\(64,\\) as {bias}"),
         (arrays | {bias: np.array([{}] * 64)}, "is damaged: Object arrays cannot be loaded"),
-        (arrays | {"more": np.zeros(10**5, np.float32)}, "holds more than LPIPS's weights with AlexNet, 9.9 MB"),
+        (arrays | {"more": np.zeros(10**5, np.float32)}, "too large for LPIPS's weights with AlexNet: 9.9 MB"),
     ):
         np.savez(tmp_path / "weights.npz", **changed)  # type: ignore[arg-type]
         with pytest.raises(ConfigError, match=message):
             read_weights(tmp_path / "weights.npz")
     (tmp_path / "weights.npz").write_bytes(b"no archive")
-    with pytest.raises(ConfigError, match=r"is no \.npz file of LPIPS's weights"):
+    with pytest.raises(ConfigError, match=r"is not a \.npz file of LPIPS's weights"):
         read_weights(tmp_path / "weights.npz")
     with pytest.raises(ConfigError, match=r"--lpips-weights .*none\.npz cannot be read: No such file"):
         read_weights(tmp_path / "none.npz")

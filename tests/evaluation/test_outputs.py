@@ -76,8 +76,8 @@ def test_what_a_method_has_not_is_refused() -> None:
         outputs = (DOUBT,)
 
     assert chosen_outputs(Doubts(), ["doubt", "depth", "error"]) == [DOUBT, DEPTH, ERROR]
-    with pytest.raises(ConfigError, match=r"no such output, but rgb, .*, doubt, .*--predict-normals True"):
+    with pytest.raises(ConfigError, match=r"no such output; it has rgb, .*, doubt, .*--predict-normals True"):
         chosen_outputs(Doubts(), ["normals"])
     for output in (ERROR, PHOTOGRAPH):
-        with pytest.raises(ConfigError, match="only 'ns-render dataset' knows the true images"):
+        with pytest.raises(ConfigError, match="only 'ns-render dataset' has true images"):
             kept_outputs(picture(), [output], 1.0)

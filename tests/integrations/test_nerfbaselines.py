@@ -492,7 +492,7 @@ def test_a_method_without_appearances_says_so() -> None:
 def test_misuse_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="needs training images or a checkpoint"):
         InstantNGP()
-    with pytest.raises(CheckpointError, match="holds no checkpoint"):
+    with pytest.raises(CheckpointError, match="has no checkpoint"):
         InstantNGP(checkpoint=str(tmp_path))
     method = start(InstantNGP, handed())
     with pytest.raises(ConfigError, match="step 3 is not the next step, 0"):

@@ -20,10 +20,10 @@ GOOD = torch.zeros(4, 3)
 @pytest.mark.parametrize(
     ("tensor", "message"),
     [
-        (GOOD.double(), "the table is of type torch.float64, not torch.float32"),
+        (GOOD.double(), "the table has type torch.float64, not torch.float32"),
         (GOOD[:3], r"the table has shape \(3, 3\), not \(4, 3\)"),
         (torch.zeros(3, 4).t(), "the table is not contiguous"),
-        (torch.zeros(4, 3, device="meta"), "the table is on meta, not on the processor"),
+        (torch.zeros(4, 3, device="meta"), "the table is on meta, not on the CPU"),
     ],
 )
 def test_pointer_names_what_is_wrong(tensor: torch.Tensor, message: str) -> None:

@@ -239,7 +239,7 @@ def test_what_is_wrong_is_said() -> None:
         nerfloom.sample(timed, None, grid)
     with pytest.raises(ValueError, match="rays have no times"):
         nerfloom.sample(rays, None, nerfloom.OccupancyGrid(BOX, 8, 64, moving=True))
-    with pytest.raises(ValueError, match="smallest corner and its largest"):
+    with pytest.raises(ValueError, match="minimum and a maximum corner"):
         nerfloom.OccupancyGrid([[0, 0, 0], [1, 1, 0]])
     with pytest.raises(ValueError, match="1 to 512 cells"):
         nerfloom.OccupancyGrid(BOX, 1000)

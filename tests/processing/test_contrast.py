@@ -41,13 +41,13 @@ def test_dark_images_are_stretched_for_features_alone(tmp_path: Path, capsys: py
     assert len(deep) > 90  # of 16 bits, not of the 16 levels that 8 bits leave of 12
     assert np.ptp(np.asarray(Image.open(folder / "2.png"))) == 255
     said = " ".join(capsys.readouterr().err.split())
-    assert "1 of 4 images are black" in said
-    assert "2 of 4 images" in said
+    assert "1 of 4 images are black and cannot be placed, the first: 3.png" in said
+    assert "2 of 4 images have a small range of brightness" in said
     assert for_features(tmp_path, prepared[:1], tmp_path / "images", tmp_path / "other") == tmp_path / "images"
 
 
 def test_black_and_white_images_are_refused(tmp_path: Path) -> None:
-    for name, level, word in (("black", 3, "black, as 1.png"), ("white", 255, "of one colour, as 1.png")):
+    for name, level, word in (("black", 3, "black, such as 1.png"), ("white", 255, "of one colour, such as 1.png")):
         folder = tmp_path / name
         folder.mkdir()
         for number in (1, 2, 3):

@@ -40,7 +40,7 @@ def test_kinds_that_are_not_read_are_counted_and_named(tmp_path: Path, capsys: p
         (tmp_path / name).write_bytes(b"raw")
     assert find_images(tmp_path) == [Path("a.png")]
     said = " ".join(capsys.readouterr().err.split())
-    assert "2 .dng, 1 .jxl, 1 .txt; the first: b.DNG" in said
+    assert "left out: 4 files that are not images: 2 .dng, 1 .jxl, 1 .txt; the first: b.DNG" in said
 
 
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow is built without AVIF")

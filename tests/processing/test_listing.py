@@ -20,8 +20,8 @@ def test_other_files_are_counted_and_named(tmp_path: Path, capsys: pytest.Captur
     touch(tmp_path, "a.AVIF", "b.heic", "c.jpg", "raw/d.dng", "raw/e.dng", "clip.mov", ".hidden.dng")
     assert [path.as_posix() for path in find_images(tmp_path)] == ["a.AVIF", "b.heic", "c.jpg"]
     said = capsys.readouterr().err.replace("\n", " ")
-    assert "2 .dng, 1 .mov; the first: clip.mov" in said
-    with pytest.raises(DataError, match=r"has no image .*: 2 \.dng; the first: d\.dng"):
+    assert "left out: 3 files that are not images: 2 .dng, 1 .mov; the first: clip.mov" in said
+    with pytest.raises(DataError, match=r"has no images .*: 2 \.dng; the first: d\.dng"):
         find_images(tmp_path / "raw")
 
 
@@ -33,7 +33,7 @@ def test_a_video_and_a_folder_are_told_apart(tmp_path: Path) -> None:
     assert kind_of("images", films / "clip.MP4") == ("video", films / "clip.MP4")
     assert kind_of("video", tmp_path / "none") == ("video", tmp_path / "none")
     touch(films, "other.mkv")
-    with pytest.raises(DataError, match="has 2 videos and no image; name one of them"):
+    with pytest.raises(DataError, match="has 2 videos and no images; choose one"):
         kind_of("images", films)
 
 

@@ -103,8 +103,8 @@ def test_a_stopped_run_keeps_features_and_matches(
     monkeypatch.setattr("sys.argv", ["ns-process-data", *map(str, words), "--resume"])
     main()
     said = " ".join(capsys.readouterr().err.split())
-    assert "8 images by 1 camera, 8 kept from before" in said
-    assert "28 of 28 pairs, 28 of them kept from before" in said
+    assert "8 images by 1 camera, 8 reused" in said
+    assert "28 of 28 pairs, 28 of them reused" in said
     assert len(json.loads((output / "transforms.json").read_text())["frames"]) >= 6
     main()
     assert "nothing to resume: it is finished" in " ".join(capsys.readouterr().err.split())

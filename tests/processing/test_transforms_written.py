@@ -63,7 +63,7 @@ def test_a_folder_with_something_in_it_is_refused_unless_it_may_be_replaced(tmp_
     (output / "transforms.json").write_text("{}")
     (output / "images_2").mkdir()
     (output / "notes.txt").write_text("mine")
-    with pytest.raises(DataError, match="holds a processed data set"):
+    with pytest.raises(DataError, match="has a processed data set"):
         claim(output, data, False)
     claim(output, data, True)
     assert [path.name for path in output.iterdir()] == ["notes.txt"]

@@ -108,14 +108,12 @@ def test_repeats_are_dropped_and_counted(tmp_path: Path, capsys: pytest.CaptureF
     assert len(write_frames(tmp_path / "repeats.mp4", tmp_path / "frames", 50)) == 10
     said = " ".join(capsys.readouterr().err.split())
     assert "30 frames" in said
-    assert "20 repeat the one before and are dropped" in said
-    assert "--num-frames-target is 50" in said
+    assert "20 of them repeat the one before and are dropped" in said
+    assert "using all 10, fewer than --num-frames-target 50" in said
 
 
 def test_what_a_video_holds_is_said() -> None:
-    assert (
-        line(np.arange(4) / 2, 4, 2, 2) == "video: 4 frames in 1.5 s; 2 are taken, the sharpest of each of 2 intervals"
-    )
+    assert line(np.arange(4) / 2, 4, 2, 2) == "video: 4 frames in 1.5 s; using 2, the sharpest of each of 2 intervals"
     assert "at uneven times" in line(np.array([0, 1, 1.1, 1.2, 3]), 5, 2, 2)
 
 

@@ -173,7 +173,7 @@ def test_three_stratified_samples_are_enough_and_fewer_are_refused() -> None:
     assert t.shape == (2, 7)
     assert bool((t.diff(dim=-1) >= 0).all())
     assert bool(((t >= 0) & (t <= 8)).all())
-    with pytest.raises(ValueError, match="2 stratified samples cannot say where to look"):
+    with pytest.raises(ValueError, match="2 stratified samples are too few"):
         HierarchicalSampler(Slab(2.0, 3.0, 5.0), 2, 4)
     with pytest.raises(ConfigError, match="--num-coarse-samples"):
         VanillaNeRFConfig(num_coarse_samples=2)

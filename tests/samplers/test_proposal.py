@@ -203,5 +203,5 @@ def test_how_often_proposals_learn_and_how_many_there_are() -> None:
         assert sampler.learning
     with pytest.raises(ValueError, match="2 density fields for 1 proposals"):
         ProposalSampler(BOX, (8, 4), fields=[Wall(0, 1), Wall(0, 1)])
-    with pytest.raises(ValueError, match="one more is needed"):
+    with pytest.raises(ValueError, match="give one more"):
         ProposalSampler(BOX, (8, 4))

@@ -23,11 +23,11 @@ BROKEN = "RuntimeError: it broke"
     [
         (PLAIN, Trial(30.0, 300), "pass", 0.0, None),
         (PLAIN, Trial(30.0, 300, learnt=LEAST_LEARNT), "pass", 0.0, None),
-        (PLAIN, Trial(30.0, 300, learnt=1.0), "degraded", 0.0, "only 1.0 dB better than empty pictures"),
+        (PLAIN, Trial(30.0, 300, learnt=1.0), "degraded", 0.0, "only 1.0 dB better than empty images"),
         (HARD, Trial(30.0, 300, learnt=0.0), "pass", 0.0, None),
         (HARD, Trial(29.0, 300), "pass", 1.0, None),
         (HARD, Trial(41.0, 300), "pass", -11.0, None),
-        (HARD, Trial(30.0 - ALLOWED - 0.1, 300), "degraded", ALLOWED + 0.1, "not to be expected: at most 2 dB"),
+        (HARD, Trial(30.0 - ALLOWED - 0.1, 300), "degraded", ALLOWED + 0.1, "unexpected: at most 2 dB"),
         (EXPLAINED, Trial(12.0, 300), "degraded", 18.0, "who could do better"),
         (EXPLAINED, Trial(29.5, 300), "pass", 0.5, None),
         (HARD, Trial(30.0, 300, skipped=7), "degraded", 0.0, "7 of 300 steps were not finite"),

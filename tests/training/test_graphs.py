@@ -398,11 +398,11 @@ def test_reasons_are_said_once_each(said: list[str]) -> None:
     ("method", "settings", "words"),
     [
         ("nerfacto", {}, None),
-        ("nerfacto", {"sampler": "occupancy"}, "how many samples a ray has"),
+        ("nerfacto", {"sampler": "occupancy"}, "the number of samples on a ray varies"),
         ("nerfacto", {"few_images": True, "unseen_loss_mult": 0.1}, "the weight of unseen views changes"),
         ("nerfacto", {"few_images": True, "open_levels_until": 0.5}, "levels are still opening"),
-        ("instant-ngp", {}, "how many samples a ray has"),  # on the CPU
-        ("kplanes", {}, "how many samples a ray has"),
+        ("instant-ngp", {}, "the number of samples on a ray varies"),  # on the CPU
+        ("kplanes", {}, "the number of samples on a ray varies"),
         ("gaussian-splatting", {}, "batches are made on the host"),
     ],
 )

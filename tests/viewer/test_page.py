@@ -279,7 +279,7 @@ def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path)
         paused = step()
         time.sleep(2)
         assert step() == paused
-        tab.press("Go on training")
+        tab.press("Continue training")
         until(lambda: step() > paused)
         tab.close()
         assert process.poll() is None

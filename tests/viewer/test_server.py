@@ -184,7 +184,7 @@ def test_garbage_on_the_socket(served: Served, connected: Callable[..., Client])
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1", "http://localhost.evil.com"])
 def test_other_pages_are_refused(served: Served, connected: Callable[..., Client], origin: str) -> None:
     client = connected(origin=origin)
-    with pytest.raises(Exception, match=r"1008|not the viewer"):
+    with pytest.raises(Exception, match=r"1008|only the viewer's own page"):
         client.messages(10)
 
 

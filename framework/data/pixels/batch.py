@@ -1,4 +1,4 @@
-"""Batches of training pixels; rays are computed only for the pixels drawn."""
+"""Batches of training pixels; rays are computed only for the drawn pixels."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class PixelBatch:
     """R pixels to train on."""
 
     pixels: Tensor
-    """(R,) int64 numbers of the pixels, counted through all images."""
+    """(R,) int64 numbers of the pixels, counted over all images."""
     rays: Rays
-    """R * K rays, those of a pixel consecutive; if K is 1, through the pixel's centre."""
+    """R * K rays, those of a pixel consecutive; if K is 1, they pass through the pixel's centre."""
     rgb: Tensor
     """(R, 3) colours over `background`."""
     background: Tensor
@@ -42,12 +42,12 @@ class PixelBatch:
     distances: Tensor | None = None
     """(R,) known distance along the pixel's ray, 0 where unknown; None if no pixel has one."""
     deviations: Tensor | None = None
-    """(R,) standard deviation of `distances`, if they are those of a reconstruction's points; None if they were
-    measured, by depth images."""
+    """(R,) standard deviation of `distances`, if these come from a reconstruction's points; None if depth images
+    measured them."""
     clear: Tensor | None = None
-    """(R,) distance before which the pixel's image shows nothing; None if that is not known."""
+    """(R,) distance up to which the pixel's image shows nothing; None if unknown."""
     weights: Tensor | None = None
-    """(R,) factors of the pixels' losses, with mean 1, if the pixels were not drawn uniformly or differ in size."""
+    """(R,) factors of the pixels' losses, with mean 1, if pixels were not drawn uniformly or differ in size."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -63,18 +63,18 @@ class PixelBatch:
 
     @property
     def rays_per_pixel(self) -> int:
-        """K, rays of a pixel."""
+        """Number K of rays per pixel."""
         return max(len(self.rays) // max(len(self), 1), 1)
 
 
 def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
-    """Return a batch without some of its transparent pixels, and which pixels (Q,) int64 are left.
+    """Drop some of a batch's transparent pixels; return the batch and the indices (Q,) int64 of the remaining pixels.
 
-    Those that are left count as many times more as there were, so that the mean of a loss has the same expectation.
+    The weights of the remaining ones grow accordingly, so that the mean of a loss has the same expectation.
 
     Args:
         batch: pixels with alpha.
-        share: probability with which a pixel of alpha 0 is kept.
+        share: probability of keeping a pixel with alpha 0.
     """
     assert batch.alpha is not None
     transparent = batch.alpha == 0
@@ -86,22 +86,22 @@ def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """One whole image to learn from."""
+    """One whole training image."""
 
     index: int
-    """Which training image."""
+    """Index of the training image."""
     view: View
     """Its camera."""
     rgb: Tensor
     """(H, W, 3) colours over `background`."""
     background: Tensor
-    """(3,) what shows where the image is transparent."""
+    """(3,) colour behind transparent pixels."""
     alpha: Tensor | None = None
-    """(H, W) opacity, where the images have it."""
+    """(H, W) opacity, if the images have alpha."""
     kept: Tensor | None = None
     """(H, W) bool, pixels that count; None for all."""
     distances: Tensor | None = None
-    """(H, W) distance along each pixel's ray, 0 where unknown: measured, or that of a reconstruction's point; None if
+    """(H, W) distance along each pixel's ray, 0 where unknown: measured, or from a reconstruction's points; None if
     none is known."""
 
     def __len__(self) -> int:
@@ -124,7 +124,7 @@ def background_colors(kind: Background, count: int, device: torch.device) -> Ten
     """Return background colours (count, 3) in [0, 1].
 
     Args:
-        kind: "random" is another colour for each pixel, so that no fixed background can be learnt.
+        kind: "random" gives each pixel its own colour, so that no fixed background can be learnt.
         count: number of pixels.
         device: device of the result.
     """
@@ -141,7 +141,7 @@ def composite(rgba: Tensor, background: Tensor) -> Tensor:
 
 
 def draw_pixels(dataset: Dataset, count: int) -> Tensor:
-    """Draw `count` pixels of `dataset` uniformly from those to be drawn, with replacement, by PyTorch's generator."""
+    """Draw `count` pixels of `dataset` uniformly from `drawn`, with replacement, by PyTorch's generator."""
     device = dataset.pixels.device
     if dataset.drawn is None:
         return torch.randint(len(dataset.pixels), (count,), device=device)
@@ -149,12 +149,12 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
 
 
 def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
-    """Draw `count` pixels of `num_images` images only, which are drawn too, by PyTorch's generator.
+    """Draw `count` pixels from `num_images` randomly drawn images, by PyTorch's generator.
 
     Args:
         dataset: the images.
         count: number of pixels.
-        num_images: number of images, each of which has about as many of the pixels; one may be drawn twice.
+        num_images: number of images; each gets about the same number of pixels, and an image may be drawn twice.
     """
     drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
     ranks = ends if drawn is None else drawn.ranks(ends)
@@ -162,7 +162,7 @@ def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
     some = sizes.nonzero()[:, 0]
     images = some[torch.randint(len(some), (min(num_images, count),), device=some.device)]
     images = images.repeat(-(-count // len(images)))[:count].sort().values
-    place = torch.randint(2**62, (count,), device=some.device)  # so large that the remainder has no bias
+    place = torch.randint(2**62, (count,), device=some.device)  # a range so large that the remainder has no bias
     chosen = ranks[images] + place % sizes[images]
     return chosen if drawn is None else drawn.at(chosen)
 
@@ -179,19 +179,19 @@ def draw_batch(
 ) -> PixelBatch:
     """Draw a batch of pixels.
 
-    Of pixels with a sparse depth, some are drawn besides: they are few, and each tells where its surface is, and that
-    the space before it is empty. Their colours count as those of all others.
+    Pixels with a sparse depth are few, so some are drawn in addition: each shows where its surface is, and that the
+    space before it is empty. Their colours count like all others.
 
     Args:
         dataset: the training images.
         count: number of pixels R.
         background: kind of background.
-        errors: draw in proportion to these errors; uniformly if None.
+        errors: error map for drawing in proportion to errors; None for uniform drawing.
         subpixels: (K, 2) positions in a pixel through which its rays pass, as in `Cameras.pixel_rays`.
-        look_up: for pixels in a file, returns the stored colours of all drawn pixels, in the order of drawing
-            (`PixelStream.look_up`).
-        keypoints: number of these pixels that are drawn from `dataset.sparse_depth`; they stand last.
-        num_images: number of images of which the other pixels are; None for all.
+        look_up: for pixels in a file, a function that returns the stored colours of all drawn pixels, in the order of
+            drawing (`PixelStream.look_up`).
+        keypoints: number of pixels drawn from `dataset.sparse_depth`; they are the last ones.
+        num_images: number of images from which the other pixels are drawn; None for all.
     """
     uniform, sparse = count - keypoints, dataset.sparse_depth
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
@@ -225,11 +225,11 @@ def draw_batch(
 def gather_batch(
     dataset: Dataset, flat: Tensor, behind: Tensor, subpixels: Tensor = CENTER, stored: Tensor | None = None
 ) -> PixelBatch:
-    """Construct a batch of given pixels.
+    """Construct a batch from given pixels.
 
     Args:
         dataset: the images.
-        flat: (R,) numbers of the pixels, counted through all images.
+        flat: (R,) numbers of the pixels, counted over all images.
         behind: (R, 3) background colours.
         subpixels: (K, 2) positions in a pixel through which its rays pass.
         stored: (R, 3 or 4) uint8 stored colours; looked up if None.
@@ -256,8 +256,8 @@ def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None
 
     Args:
         dataset: the images.
-        flat: (R,) numbers of the pixels, counted through all images.
-        rays: R * K rays through them, those of a pixel consecutive.
+        flat: (R,) numbers of the pixels, counted over all images.
+        rays: R * K rays through the pixels, those of a pixel consecutive.
     """
     if dataset.depths is None or rays.camera_indices is None:
         return None

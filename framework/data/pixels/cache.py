@@ -1,8 +1,8 @@
-"""The cache of decoded pixels: data sets that exceed the memory limit are decoded once, into a file.
+"""Cache of decoded pixels: data sets that exceed the memory limit are decoded once, into a file.
 
 A file holds the pixels (P, C) uint8, then an uncompressed .npz with the other results of decoding, its length, and
-`MAGIC`. It is renamed to its final name when it is complete. The name is a hash of everything that the pixels depend
-on, so a file is never out of date; files for images that have changed since are not removed.
+`MAGIC`. It is renamed to its final name when complete. The name is a hash of everything that the pixels depend on, so a
+file is never out of date. Files for images that have changed since are not removed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from nerfloom.base.user_cache import cache_folder
 from nerfloom.data.pixels.store import FileStore
 
 FORMAT = 1
-"""Version of the format; raised whenever the file's layout or the decoded values change."""
+"""Version of the format; increase it whenever the file's layout or the decoded values change."""
 MAGIC = b"NERFLOOM"
 """Last bytes of a complete file."""
 MB = 1_000_000
@@ -42,11 +42,11 @@ class PixelMemory:
 
     @classmethod
     def of(cls, limit: float | None = None, folder: Path | None = None) -> PixelMemory:
-        """Construct from settings.
+        """Construct the limit and folder from settings.
 
         Args:
             limit: limit in MB; half of the machine's memory if None.
-            folder: cache folder; the user's if None.
+            folder: cache folder; the user's cache folder if None.
         """
         return cls(machine_memory() / 2 if limit is None else limit * MB, folder or cache_folder())
 
@@ -70,7 +70,7 @@ def cache_path(folder: Path, files: list[Path | None], numbers: list[int]) -> Pa
 
 
 def pack(facts: dict[str, np.ndarray]) -> bytes:
-    """Return the bytes that follow the pixels in a file: the arrays `facts`, their length and `MAGIC`."""
+    """Return the bytes after the pixels in a file: the arrays `facts`, their length and `MAGIC`."""
     content = io.BytesIO()
     np.savez(content, **facts)  # type: ignore[arg-type]
     values = content.getvalue()
@@ -78,7 +78,7 @@ def pack(facts: dict[str, np.ndarray]) -> bytes:
 
 
 def unpack(path: Path) -> dict[str, np.ndarray] | None:
-    """Read the arrays that follow the pixels in the file `path`; None if it does not exist or is incomplete."""
+    """Read the arrays after the pixels in the file `path`; None if it does not exist or is incomplete."""
     try:
         with path.open("rb") as file:
             size = file.seek(-16, os.SEEK_END)
@@ -98,14 +98,14 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def temporary_store(path: Path, size: int) -> FileStore:
-    """Create a file beside `path`, after removing files that killed processes left there.
+    """Create a file beside `path`, after removing leftovers of killed processes.
 
     Args:
         path: final path of the file.
         size: size in bytes.
 
     Raises:
-        DataError: if the disk has not enough space.
+        DataError: if the disk lacks space.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,7 @@ def _host() -> str:
 
 
 def _alive(process: str) -> bool:
-    """Return whether a process of this number runs; True on systems where a test could harm it."""
+    """Return whether a process with this number runs; True on systems where the test could harm it."""
     if os.name != "posix" or not process.isdecimal():
         return True
     try:

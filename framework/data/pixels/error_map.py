@@ -11,13 +11,13 @@ from nerfloom.data.dataset import Dataset
 TILE = 8
 """Side of the square tiles that share one error, pixels."""
 EVENLY = 0.5
-"""Share of the probability that is uniform, so that no weight exceeds 2."""
+"""Uniform fraction of the probability, so that no weight exceeds 2."""
 DECAY = 0.8
-"""Share of a tile's old error when it is updated."""
+"""Weight of a tile's old error in an update."""
 
 
 class ErrorMap:
-    """Running mean of the squared error of each tile of 8 x 8 pixels of a data set's images.
+    """Running mean of the squared error in each tile of 8 x 8 pixels of a data set's images.
 
     Args:
         dataset: M images.
@@ -32,26 +32,26 @@ class ErrorMap:
         self.first = counts.cumsum(0) - counts
         """(M,) index of each image's first tile."""
         self.errors = torch.ones(int(counts.sum()), device=dataset.device)
-        """(T,) mean over a pixel's channels; 1, the largest possible, for tiles without a sample yet."""
+        """(T,) mean over a pixel's channels; tiles without a sample have 1, the maximum."""
 
     def squares(self, pixels: Tensor) -> Tensor:
-        """Return the index of the tile of each of the `pixels` (R,), counted through all images."""
+        """Return the index of the tile of each of the `pixels` (R,), counted over all images."""
         dataset = self.dataset
         images = torch.searchsorted(dataset.cameras.offsets, pixels, right=True) - 1
         within, widths = pixels - dataset.cameras.offsets[images], dataset.cameras.widths[images]
         return self.first[images] + within // widths // TILE * self.columns[images] + within % widths // TILE
 
     def draw(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Return `count` of the `candidates` (M,) and the weights (count,) of their losses, selected by `choose`."""
+        """Return `count` of the `candidates` (M,) and their loss weights (count,), selected by `choose`."""
         selected, weights = self.choose(candidates, count)
         return candidates[selected], weights
 
     def choose(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Select pixels by systematic resampling.
 
-        A candidate is selected count / M times its share on average, where the shares have mean 1, and its weight is 1
-        over its share. The expectation of the weighted mean of any function over the selected pixels is therefore its
-        mean over all candidates, whatever the errors.
+        A candidate's share, with mean 1, determines how often it is selected: count / M times its share on average. Its
+        weight is 1 over its share. So the weighted mean of any function over the selected pixels has the mean over all
+        candidates as its expectation, whatever the errors.
 
         Args:
             candidates: (M,) pixels, drawn uniformly.
@@ -75,4 +75,4 @@ class ErrorMap:
         counts.index_add_(0, squares, finite.to(errors))
         total, count, old = sums[squares], counts[squares], self.errors[squares]
         updated = old + (1 - DECAY) * (total / count.clamp(min=1) - old)
-        self.errors[squares] = torch.where(count > 0, updated, old)  # the same for all pixels of a tile
+        self.errors[squares] = torch.where(count > 0, updated, old)  # equal values for all pixels of a tile

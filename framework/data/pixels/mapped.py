@@ -1,4 +1,4 @@
-"""Pixels in a memory-mapped file, of which only a bounded part is held in memory."""
+"""Pixels in a memory-mapped file; only a bounded part of it is in memory."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ import torch
 from torch import Tensor
 
 SLICE = 64_000_000
-"""Maximum number of bytes of the file that are read before their pages are dropped."""
+"""Maximum number of bytes read before their pages are dropped."""
 SMALLEST_SLICE = 2**20
-"""Minimum of the same number."""
+"""Minimum number of bytes read before their pages are dropped."""
 
 
 class MappedPixels:
     """The pixels of a file.
 
-    Pages of a mapped file count as the process's memory until they are dropped, or until the system reclaims them.
-    Readers therefore go through the file in order and drop the pages behind them. A dropped page that is read again
-    comes from the system's cache or from the disk.
+    Pages of a mapped file count as the process's memory until they are dropped or the system reclaims them. So readers
+    go through the file in order and drop the pages behind them. A dropped page that is read again comes from the
+    system's cache or from the disk.
 
     Args:
         path: a file that begins with the pixels.
         count: number of pixels P.
         channels: number of channels C.
-        limit: bytes of pixels allowed in memory; an eighth of it is the size of a slice.
+        limit: bytes of pixels allowed in memory; a slice has at most an eighth of it.
     """
 
     def __init__(self, path: Path, count: int, channels: int, limit: float) -> None:
         self.path = path
         self.slice = int(min(max(limit / 8, SMALLEST_SLICE), SLICE))
-        """Bytes that are read before pages are dropped."""
+        """Number of bytes read before pages are dropped."""
         with path.open("rb") as file:
             # Read-only: the system would reserve memory for a writable private mapping.
             self._map = mmap.mmap(file.fileno(), count * channels, access=mmap.ACCESS_READ)
         self._stored = np.frombuffer(self._map, np.uint8).reshape(count, channels)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # PyTorch warns that it has no read-only tensors
+            warnings.simplefilter("ignore")  # PyTorch warns that tensors cannot be read-only
             self.pixels: Tensor = torch.from_numpy(self._stored)
             """(P, C) uint8 over the mapping; never written to."""
 
     def drop(self, first: int = 0, last: int | None = None) -> None:
-        """Release the memory of the pixels from `first` to `last` - 1, by default all."""
+        """Release the memory of the pixels from `first` to `last` - 1; all by default."""
         if not hasattr(self._map, "madvise"):  # Windows reclaims pages by itself
             return
         channels = self._stored.shape[1]
@@ -56,8 +56,7 @@ class MappedPixels:
     def take(self, flat: np.ndarray) -> np.ndarray:
         """Return the stored colours (R, C) of pixels in ascending order.
 
-        The implementation uses numpy, which releases Python's global lock and takes one thread, so that training
-        continues meanwhile.
+        Uses numpy, which releases Python's global lock and runs on one thread, so that training continues meanwhile.
 
         Args:
             flat: (R,) int64 numbers of the pixels, ascending.

@@ -1,4 +1,4 @@
-"""Sets of a data set's pixels, stored as runs: their size depends on the outline of a region, not on its area."""
+"""Sets of a data set's pixels, stored as runs: the size depends on a region's outline, not on its area."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PixelSet:
-    """N runs of consecutive pixels, counted through all images: K pixels in ascending order."""
+    """N runs of consecutive pixels, numbered over all images: K pixels in ascending order."""
 
     starts: Tensor
     """(N,) int64 first pixel of each run, ascending."""
     before: Tensor
     """(N + 1,) int64 number of pixels in the runs before each run; the last entry is K."""
     every: Tensor | None = None
-    """(K,) all pixels, if memory suffices; sampling from this list is four times as fast."""
+    """(K,) all pixels, if memory suffices; drawing from this list is four times as fast."""
 
     @classmethod
     def of_runs(cls, starts: Tensor, lengths: Tensor) -> PixelSet:
@@ -65,7 +65,7 @@ class PixelSet:
 
         Args:
             sets: one or more sets.
-            at_least: the number of sets in which a pixel must be: 1 for the union, len(sets) for the intersection.
+            at_least: minimum number of sets that contain a pixel: 1 for the union, len(sets) for the intersection.
         """
         starts = torch.cat([part.starts for part in sets])
         ends = torch.cat([part.starts + part.before.diff() for part in sets])
@@ -88,7 +88,7 @@ class PixelSet:
 
     @cached_property
     def _ends(self) -> Tensor:
-        """(N + 1,) first pixel behind the run before each run; 0 before the first."""
+        """(N + 1,) first pixel after the run before each run; 0 before the first."""
         return torch.cat([torch.zeros_like(self.before[:1]), self.starts + self.before.diff()])
 
     def to(self, device: torch.device | str) -> PixelSet:
@@ -97,7 +97,7 @@ class PixelSet:
         return PixelSet(*(None if values is None else values.to(device) for values in tensors))  # type: ignore[arg-type]
 
     def listed(self) -> PixelSet:
-        """Return the set with the list of all its pixels in `every`."""
+        """Return the set with all pixels listed in `every`."""
         every = self.pixels()
         small = len(every) == 0 or int(every[-1]) < 2**31
         return replace(self, every=every.to(torch.int32) if small else every)
@@ -117,13 +117,13 @@ class PixelSet:
         return starts[runs] + (ranks - before[runs])
 
     def ranks(self, pixels: Tensor) -> Tensor:
-        """Return how many pixels of the set come before each of the `pixels` (R,) int64, (R,) int64."""
+        """Return the number of pixels of the set before each of the `pixels` (R,) int64, (R,) int64."""
         runs = (torch.searchsorted(self.starts, pixels, right=True) - 1).clamp(min=0)
         into = (pixels - self.starts[runs]).clamp(min=0)
         return torch.minimum(self.before[runs] + into, self.before[runs + 1])
 
     def contains(self, pixels: Tensor) -> Tensor:
-        """Return which of the `pixels` (R,) int64 are in the set, (R,) bool."""
+        """Return whether the set contains each of the `pixels` (R,) int64, (R,) bool."""
         return pixels < self._ends[torch.searchsorted(self.starts, pixels, right=True)]
 
     def pixels(self) -> Tensor:
@@ -132,7 +132,7 @@ class PixelSet:
         return shift.add_(torch.arange(len(self), device=self.starts.device))
 
     def mask(self, first: int, last: int) -> Tensor:
-        """Return which of the pixels from `first` to `last` - 1 are in the set, (last - first,) bool."""
+        """Return whether the set contains each pixel from `first` to `last` - 1, (last - first,) bool."""
         ends = self.starts + self.before.diff()
         low = int(torch.searchsorted(ends, first, right=True))
         high = int(torch.searchsorted(self.starts, last))

@@ -1,4 +1,4 @@
-"""Training images on the device as bytes, or in the machine's memory where they do not fit."""
+"""Location of training images: on the device as bytes, or in the machine's memory if they do not fit."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from nerfloom.base.device import free_memory
 from nerfloom.data.dataset import Dataset
 
 MOST = 0.5
-"""Largest share of a device's free memory that images take; the rest is for the model and its steps."""
+"""Maximum fraction of a device's free memory for images; the rest is for the model and its steps."""
 MB = 1_000_000
 """Bytes of a megabyte."""
 
 
 def on_device(dataset: Dataset, device: torch.device) -> tuple[Dataset, str | None]:
-    """Return training images on a device, as they are stored: 8 bits a channel, converted when they are drawn.
+    """Move training images to a device in their stored form, 8 bits a channel; batches are converted when drawn.
 
     Args:
         dataset: the images, in the machine's memory or in a file.
-        device: the device of training.
+        device: the training device.
 
     Returns:
-        The data set, and a line that says where its pixels are; None on the CPU. Pixels that take more than `MOST` of
-        the device's free memory stay where they are: batches of them are drawn on the CPU and copied.
+        The data set, and a line about the location of its pixels; None on the CPU. Pixels that need more than `MOST` of
+        the device's free memory stay where they are; batches of them are drawn on the CPU and copied.
     """
     free, size = free_memory(device), sum(values.nbytes for values in _moved(dataset))
     fits = dataset.mapped is None and size <= MOST * free
@@ -34,10 +34,10 @@ def on_device(dataset: Dataset, device: torch.device) -> tuple[Dataset, str | No
     if dataset.mapped is not None:
         return moved, "images: in a file; batches are read ahead and copied"
     there = f"{device.type} has {free / MB:,.0f} MB free"
-    return moved, f"images: {size / MB:,.0f} MB stay in the machine's memory, since {there}; batches are copied"
+    return moved, f"images: {size / MB:,.0f} MB stay in the machine's memory ({there}); batches are copied"
 
 
 def _moved(dataset: Dataset) -> list[torch.Tensor]:
-    """Return the large tensors that go to a device together with the pixels."""
+    """Return the large tensors that move to a device together with the pixels."""
     drawn = None if dataset.drawn is None else dataset.drawn.every
     return [dataset.pixels, *([] if drawn is None else [drawn])]

@@ -12,7 +12,7 @@ from typing import BinaryIO, Protocol
 import numpy as np
 
 CHUNK = 2**24
-"""Bytes moved at once."""
+"""Number of bytes moved at once."""
 
 
 class PixelStore(Protocol):
@@ -47,15 +47,15 @@ class MemoryStore(PixelStore):
 class FileStore(PixelStore):
     """A new file.
 
-    It is written to, not mapped: on a full disk a write fails, where a mapping would kill the process. Its space is
-    allocated at once if the system can, so that a full disk is noticed before anything is decoded.
+    The file is written, not mapped: on a full disk a write fails, whereas a mapping would kill the process. Its space
+    is allocated at once if the system can, so that a full disk is noticed before decoding.
 
     Args:
         path: the file to create.
         size: its size in bytes.
 
     Raises:
-        OSError: if the disk has not enough space.
+        OSError: if the disk lacks space.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -68,7 +68,7 @@ class FileStore(PixelStore):
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 self.discard()
                 raise
-            # otherwise the file system cannot allocate, and a full disk is noticed while writing
+            # Otherwise the file system cannot allocate, and a full disk is noticed while writing.
 
     def write(self, start: int, values: np.ndarray) -> None:
         with self._lock:
@@ -81,7 +81,7 @@ class FileStore(PixelStore):
             return np.frombuffer(self._file.read(count), np.uint8)
 
     def finish(self, size: int, ending: bytes, path: Path) -> None:
-        """Complete the file and rename it, once its content is safe on the disk.
+        """Complete the file and rename it once its content is safely on the disk.
 
         Args:
             size: bytes to keep.

@@ -1,9 +1,9 @@
 """Colours of future batches, read ahead from a file in the file's order.
 
-The pixels of a step are a function of seed, step and process alone (`device.seed_step`), so they can be drawn long
-before the step. A thread draws and sorts the pixels of many steps and reads them from front to back, while training
-continues with those of earlier steps. Each batch has the same bits as with all pixels in memory, however far is read
-ahead, and a resumed run does not depend on what an earlier one had read.
+The pixels of a step depend only on seed, step and process (`device.seed_step`), so they can be drawn long before the
+step. A thread draws and sorts the pixels of many steps and reads them from front to back, while training continues with
+earlier steps. Each batch has the same bits as with all pixels in memory, however far ahead the thread reads. A resumed
+run does not depend on what an earlier run had read.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from nerfloom.data.dataset import Dataset
 MOST_STEPS = 64
 """Maximum number of steps whose pixels are read together."""
 FIRST_STEPS = 4
-"""Number of steps of the first block, for which training waits; each later block has twice as many."""
+"""Number of steps of the first block; training waits for it. Each later block has twice as many."""
 MARGIN = 1.25
-"""Ratio of the pixels read per step to the last batch's, as batches may grow meanwhile."""
+"""Ratio of the pixels read per step to those of the last batch, because batches may grow."""
 BYTES = 32
-"""Memory per pixel that is read, bytes: 8 for number and position, 3 or 4 for the colour, the rest for temporary
-arrays."""
+"""Memory per pixel read, bytes: 8 for number and position, 3 or 4 for the colour, the rest for temporary arrays."""
 CHUNK = 2**16
 """Number of pixels processed at once."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """The colours read for some steps."""
+    """The colours of several steps."""
 
     first: int
     """First step."""
@@ -47,7 +46,7 @@ class Block:
 
 
 class PixelStream:
-    """A reader of the colours that training will draw.
+    """Reads the colours that training will draw.
 
     Args:
         dataset: a data set whose pixels are in a file. `drawn` must not change afterwards.
@@ -73,7 +72,7 @@ class PixelStream:
 
         Args:
             step: the step's number.
-            flat: (R,) numbers of the pixels, in the order in which they were drawn.
+            flat: (R,) numbers of the pixels, in the order of drawing.
 
         Returns:
             (R, C) uint8.
@@ -86,7 +85,7 @@ class PixelStream:
         return torch.cat([ready, self.mapped.look_up(flat[len(ready) :])])
 
     def _read(self, step: int, count: int) -> Block:
-        """Return the block of a step that draws `count` pixels, and start to read the next block."""
+        """Return the block of a step that draws `count` pixels, and start reading the next block."""
         block = None if self._next is None else self._next.result()
         if block is None or not block.holds(step):
             block = self._begin(step, FIRST_STEPS, count).result()
@@ -95,15 +94,15 @@ class PixelStream:
         return block
 
     def _begin(self, first: int, steps: int, count: int) -> Future[Block]:
-        """Start to read a block of `steps` steps, or of as many as fit, in the thread."""
+        """Start reading a block of `steps` steps, or of as many as fit, in the thread."""
         count = max(min(count, self.capacity), 1)
         return self._reader.submit(self.read, first, max(min(steps, self.capacity // count), 1), count)
 
     def read(self, first: int, steps: int, count: int) -> Block:
-        """Return the colours of the pixels that some steps draw.
+        """Return the colours of the pixels of several steps.
 
-        An integer holds a pixel's rank among `drawn` and, in its low bits, the position of its colour in the block; one
-        in-place sort then gives both the order of reading and the positions.
+        An integer holds a pixel's rank in `drawn` and, in its low bits, the position of its colour in the block. One
+        in-place sort then gives both the reading order and the positions.
 
         Args:
             first: the first step.

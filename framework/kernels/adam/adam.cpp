@@ -1,4 +1,4 @@
-// Adam over the entries of a table that got a gradient. See ../adam.py for the reference and what is computed.
+// Adam over the entries of a table that got a gradient. See ../adam.py for the reference and the formulas.
 #include "adam/adam.h"
 
 #include <algorithm>
@@ -8,7 +8,7 @@
 
 namespace {
 
-constexpr int64_t RUN = 16384;  // values that a thread looks at together
+constexpr int64_t RUN = 16384;  // values that a thread tests together
 
 template <int F>
 int64_t update_all(float* values, float* mean, float* square, float* grad, float* seen, int64_t entries, int features,
@@ -20,7 +20,7 @@ int64_t update_all(float* values, float* mean, float* square, float* grad, float
     return touched;
 }
 
-// A function of its own, for what a lambda captures might be written to by any store of a float.
+// A separate function, because the compiler assumes that any store of a float may change what a lambda captures.
 void update_dense(float* __restrict p, float* __restrict m, float* __restrict v, const float* __restrict g,
                   int64_t count, float step, float unbias, float add1, float keep2, float add2, float eps) {
     for (int64_t k = 0; k < count; k++) {
@@ -32,8 +32,8 @@ void update_dense(float* __restrict p, float* __restrict m, float* __restrict v,
 
 }  // namespace
 
-// Updates the entries with a gradient that is not zero, and sets that to zero. `touched`: how many there were.
-// values, mean, square, grad (E, F); seen (E): how often an entry has been updated.
+// Updates the entries with a nonzero gradient and sets the gradient to zero. `touched`: number of such entries. values,
+// mean, square, grad (E, F); seen (E): number of updates of each entry.
 EXPORT int adam_sparse(float* values, float* mean, float* square, float* grad, float* seen, int64_t entries,
                        int features, float rate, double beta1, double beta2, float eps, int threads,
                        int64_t* touched) {
@@ -48,7 +48,7 @@ EXPORT int adam_sparse(float* values, float* mean, float* square, float* grad, f
     });
 }
 
-// Adam on every value of `tensors` tensors of counts[i] values each, which have had steps[i] updates, this one included.
+// Adam on every value of `tensors` tensors with counts[i] values each. steps[i]: number of updates, including this one.
 EXPORT int adam_dense(float* const* values, float* const* mean, float* const* square, const float* const* grad,
                       const int64_t* counts, const double* steps, int tensors, float rate, double beta1, double beta2,
                       float eps, int threads) {
@@ -67,7 +67,7 @@ EXPORT int adam_dense(float* const* values, float* const* mean, float* const* sq
     });
 }
 
-// Whether every value is finite. The sum of values times zero is NaN if any is not.
+// Whether all values are finite. The sum of values times zero is NaN if one is not.
 EXPORT int all_finite(const float* values, int64_t count, int threads, int* finite) {
     return guarded([&] {
         std::atomic<bool> bad{false};

@@ -1,4 +1,4 @@
-// Adam on entries of a table: what adam.cpp and hash_grid.cpp share. See ../adam.py for what is computed.
+// Adam on entries of a table, shared by adam.cpp and hash_grid.cpp. See ../adam.py for the formulas.
 #pragma once
 
 #include "runtime/common.h"
@@ -31,9 +31,9 @@ inline bool all_zero(const float* values) {
 
 struct Settings {
     float keep1, add1, keep2, add2, rate, eps;
-    std::vector<float> unbias1, unbias2;  // by how often an entry has been updated
-    std::vector<uint64_t> unbias;         // the bits of both, those of the first moment below
-    float settled;                        // updates from which on both are 1: the last index of each table
+    std::vector<float> unbias1, unbias2;  // by the number of an entry's updates
+    std::vector<uint64_t> unbias;         // the bits of both; the first moment's are the lower half
+    float settled;                        // number of updates after which both are 1: the last index
 
     Settings(float rate, double beta1, double beta2, float eps)
         : keep1(float(beta1)), add1(float(1 - beta1)), keep2(float(beta2)), add2(float(1 - beta2)), rate(rate),
@@ -67,13 +67,13 @@ inline void move(float* values, float* mean, float* square, float* grad, Ints ma
     store(grad, splat(0));
 }
 
-// As many 64-bit integers as there are pairs of lanes, and one number for each pair.
+// Vector of 64-bit integers, one for each pair of lanes.
 typedef uint64_t Longs __attribute__((vector_size(LANES * 4)));
 typedef int32_t PairInts __attribute__((vector_size(LANES * 2)));
 typedef float PairFloats __attribute__((vector_size(LANES * 2)));
 constexpr int PAIRS = LANES / 2;
 
-// value(0), value(1), ... in a vector that is put together in registers: a load would wait for many small stores.
+// value(0), value(1), ... assembled in a register: a load would wait for many small stores.
 template <typename Vector, size_t... I, typename Value>
 inline Vector each(std::index_sequence<I...>, const Value& value) { return Vector{value(I)...}; }
 
@@ -104,7 +104,7 @@ inline Ints with_gradient(const float* grad) {
     }
 }
 
-// Counts the updates of LANES / F entries, and looks up their corrections, which each of their values gets.
+// Counts the updates of LANES / F entries and looks up the corrections of each of their values.
 template <int F>
 inline void count(Ints any, float* seen, Floats& unbias1, Floats& unbias2, const Settings& s) {
     if constexpr (F == 1) {
@@ -135,7 +135,7 @@ inline void count(Ints any, float* seen, Floats& unbias1, Floats& unbias2, const
     }
 }
 
-// Whether all of LANES / F entries are past the correction: then they need no look at each by itself.
+// Whether all of LANES / F entries are past the correction, so that they need no individual look-up.
 template <int F>
 inline bool all_settled(const float* seen, const Settings& s) {
     bool settled = true;
@@ -143,7 +143,7 @@ inline bool all_settled(const float* seen, const Settings& s) {
     return settled;
 }
 
-// LANES values, LANES / F entries; settled ones are counted no more. Returns which of them had a gradient.
+// LANES values, LANES / F entries; settled entries are not counted. Returns which of them had a gradient.
 template <int F>
 inline Ints update(float* values, float* mean, float* square, float* grad, float* seen, const Settings& s) {
     const Ints any = with_gradient<F>(grad);
@@ -157,7 +157,7 @@ inline Ints update(float* values, float* mean, float* square, float* grad, float
     return any;
 }
 
-// A single entry, where fewer than LANES values are left or an entry has an odd number of features.
+// A single entry, if fewer than LANES values are left or an entry has an odd number of features.
 inline int update_entry(float* values, float* mean, float* square, float* grad, float* seen, int features,
                         const Settings& s) {
     bool any = false;
@@ -187,7 +187,7 @@ inline int update_row(float* values, float* mean, float* square, float* grad, fl
     return 1;
 }
 
-// Entries [begin, end) in order. Returns how many had a gradient.
+// Entries [begin, end) in order. Returns the number with a gradient.
 template <int F>
 int64_t update_range(float* values, float* mean, float* square, float* grad, float* seen, int64_t begin, int64_t end,
                      int features, const Settings& s) {

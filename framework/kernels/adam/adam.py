@@ -1,9 +1,8 @@
-"""Adam (Kingma and Ba 2015), dense, and sparse for tables of which a step uses few entries.
+"""Adam (Kingma and Ba 2015), dense, and sparse for tables of which each step uses few entries.
 
 Sparse Adam updates an entry only if its gradient is not zero. The moments of the entry decay, and their bias is
-corrected, by the number of its updates rather than the number of steps. An entry that is used for the first time after
-a thousand steps therefore moves as far as in a first step (Instant-NGP's optimiser skips entries in the same way;
-Mueller et al. 2022, section 4).
+corrected, by the number of its updates, not by the number of steps. So an entry first used after a thousand steps moves
+as far as in a first step. (Instant-NGP's optimiser skips entries in the same way; Mueller et al. 2022, section 4.)
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ def sparse_adam_reference(
     rows = (grad != 0).any(-1).nonzero().squeeze(-1)
     g = grad[rows]
     seen[rows] += 1
-    # expm1 rather than 1 - beta^count, which would lose digits in the type of the values, the one all devices have.
+    # expm1 rather than 1 - beta^count, which would lose digits in the type of the values; all devices have that type.
     count, logs = seen[rows], [math.log(beta) if beta else -math.inf for beta in betas]
     mean[rows] = betas[0] * mean[rows] + (1 - betas[0]) * g
     square[rows] = betas[1] * square[rows] + (1 - betas[1]) * g * g
@@ -65,10 +64,10 @@ def sparse_adam(
         betas: decay rates of the two moments.
         eps: added to the square root of the second moment.
         found_inf: () float32 on the device, 1 if a gradient of the step is not finite, so that no entry is updated,
-            else 0; None for 0.
+            otherwise 0; None for 0.
 
     Returns:
-        the number of entries that were updated, which may still be on the device, () int64.
+        The number of updated entries, which may still be on the device, () int64.
     """
     tensors = values, grad, mean, square, seen
     return SPARSE_ADAM(tensors, *tensors, rate, betas, eps, found_inf)
@@ -104,7 +103,7 @@ def _masked_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
 ) -> int | Tensor:  # fmt: skip
-    """Update all entries, by nothing where the gradient is zero: the device need not say which entries have one."""
+    """Update all entries, by zero if the gradient is zero, so that the device need not report which have one."""
     if found_inf is not None:
         grad.masked_fill_(found_inf != 0, 0)
     touched = (grad != 0).any(-1)
@@ -163,12 +162,12 @@ def dense_adam(
         grads: gradient of each parameter, of the same shape.
         means: first moments of each parameter, of the same shape.
         squares: second moments of each parameter, of the same shape.
-        steps: () float32 number of updates of each parameter, which is increased by 1.
+        steps: () float32 number of updates of each parameter, incremented by 1.
         rate: learning rate, possibly on the device, () float32.
         betas: decay rates of the two moments.
         eps: added to the square root of the second moment.
-        found_inf: () float32 on the device, 1 if a gradient of the step is not finite, so that nothing is updated, else
-            0; None for 0.
+        found_inf: () float32 on the device, 1 if a gradient of the step is not finite, so that nothing is updated,
+            otherwise 0; None for 0.
     """
     DENSE_ADAM((*values, *grads), values, grads, means, squares, steps, rate, betas, eps, found_inf)
 
@@ -219,13 +218,13 @@ def all_finite_reference(values: Sequence[Tensor]) -> bool | Tensor:
 
 
 def all_finite(values: Sequence[Tensor]) -> bool | Tensor:
-    """Return whether no value of several tensors is infinite or NaN, in one pass over each.
+    """Return whether all values of several tensors are finite, in one pass over each.
 
     Args:
         values: float tensors of any shapes on one device.
 
     Returns:
-        the answer, which may still be on the device, () bool.
+        The answer, which may still be on the device, () bool.
     """
     return ALL_FINITE(values, values)
 
@@ -241,6 +240,6 @@ def _all_finite(values: Sequence[Tensor]) -> bool | Tensor:
 @ALL_FINITE.implementation(FEW_OPERATIONS, types=None)
 @torch.no_grad()
 def _largest_is_finite(values: Sequence[Tensor]) -> bool | Tensor:
-    """Leave the answer on the device: the largest size of a value is finite only if all are; NaN is largest."""
+    """Compute the answer on the device: the largest magnitude is finite only if all are; NaN is largest."""
     filled = [value for value in values if value.numel()]
     return torch.stack([*torch._foreach_norm(filled, torch.inf)]).isfinite().all() if filled else True

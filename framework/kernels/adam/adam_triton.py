@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfloom.kernels.triton_launch import blocks, launch, on_device, opacity_of
 
 BLOCK = 1024
-"""Values that are taken together."""
+"""Number of values per program."""
 
 
 @triton.jit(do_not_specialize=["entries"])
@@ -39,7 +39,7 @@ def _sparse(
     tl.atomic_add(updated, tl.sum(used.to(tl.int64), 0), sem="relaxed")
     count = tl.load(seen + e, mask=used, other=0.0) + 1
     tl.store(seen + e, count, mask=used)
-    # 1 / (1 - beta^count), which would lose digits where beta^count is close to 1.
+    # 1 / (1 - beta^count), which would lose digits if beta^count is close to 1.
     unbias1, unbias2 = 1 / opacity_of(count * decay1), 1 / opacity_of(count * decay2)
     m = keep1 * tl.load(mean + at, mask=mask, other=0.0) + add1 * g
     v = keep2 * tl.load(square + at, mask=mask, other=0.0) + add2 * g * g
@@ -53,7 +53,7 @@ def sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
 ) -> Tensor:  # fmt: skip
-    """Compute `nerfloom.kernels.adam.adam.sparse_adam`, whose number of entries stays on the GPU.
+    """Compute `nerfloom.kernels.adam.adam.sparse_adam`; the number of entries stays on the GPU.
 
     `values`, `grad`, `mean`, `square`, `seen`, `rate`, `betas`, `eps` and `found_inf` are as there.
     """

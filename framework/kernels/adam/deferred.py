@@ -15,7 +15,7 @@ class _Waiting(torch.autograd.Function):
     """A node between a look-up and its table, which receives the gradient of the look-up's result.
 
     Autograd calls the backward of a node only in a pass that needs the gradient of one of its inputs. The look-up
-    itself has the positions as a further input, so that its backward may be called for those only.
+    itself has the positions as a further input, so its backward may be called for the positions alone.
     """
 
     @staticmethod

@@ -3,8 +3,8 @@
     T_i = prod_{j < i} (1 - alpha_j)            transmittance in front of a sample
     w_i = T_i alpha_i                           weight
 
-An alpha is equivalent to the optical depth tau = -log(1 - alpha) of an interval of length 1, so that alphas are
-composited as densities.
+An alpha is equivalent to the optical depth tau = -log(1 - alpha) of an interval of length 1, so alphas are composited
+as densities.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def alpha_depth(alpha: Tensor) -> Tensor:
         alpha: (N,) in [0, 1].
 
     Returns:
-        optical depth (N,), float64 if `alpha` is float64, and float32 otherwise.
+        Optical depth (N,), float64 if `alpha` is float64, and float32 otherwise.
     """
     alpha = alpha if alpha.dtype == torch.float64 else alpha.float()
     most = 1 - torch.finfo(alpha.dtype).eps ** 0.5
@@ -36,14 +36,14 @@ def alpha_depth(alpha: Tensor) -> Tensor:
 
 
 def unit_intervals(samples: Samples, alpha: Tensor) -> tuple[Samples, Tensor]:
-    """Convert alphas to densities of intervals of length 1, which have the same opacity.
+    """Convert alphas to densities of intervals of length 1 with the same opacity.
 
     Args:
         samples: N samples.
         alpha: (N,) opacity of each sample in [0, 1].
 
     Returns:
-        the samples with such intervals and their previous t, and the density (N,).
+        The samples with such intervals and their previous t, and the density (N,).
     """
     depth = alpha_depth(alpha)
     t = samples.t
@@ -63,7 +63,7 @@ def composite_alpha(samples: Samples, alpha: Tensor, rgb: Tensor, background: Te
         fars: (R,) distance of the far end of each ray.
 
     Returns:
-        colour, opacity and depth of R rays, and the weights.
+        Colour, opacity and depth of R rays, and the weights.
 
     Raises:
         IndexError: if the offsets of the samples do not divide them between the rays.

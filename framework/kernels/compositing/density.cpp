@@ -3,8 +3,8 @@
 
 #include <cmath>
 
-// Per ray: colour over the background, opacity, the first moment of t, and the t at which half the light is gone (the
-// ray's far end where it never is). Per sample: the weight. points may be null: the middles.
+// Per ray: colour over the background, opacity, first moment of t, and median t (the far end of the ray if the
+// transmittance stays above 0.5). Per sample: the weight. points may be null for the middles of intervals.
 EXPORT int composite_forward(const float* sigma, const float* rgb, const float* starts, const float* ends,
                              const float* points, const int64_t* offsets, int64_t rays, int64_t samples,
                              const float* background, const float* fars,
@@ -22,7 +22,7 @@ EXPORT int composite_forward(const float* sigma, const float* rgb, const float* 
                 weights[n] = weight;
                 depth += tau;
                 total += weight;
-                mean += weight == 0 ? 0 : weight * t;  // t is infinite in the middle of an endless interval
+                mean += weight == 0 ? 0 : weight * t;  // t is infinite in the middle of an infinite interval
                 for (int c = 0; c < 3; c++) sum[c] += weight * rgb[n * 3 + c];
                 if (!found && in_front - weight <= 0.5f) {
                     half = t < half ? t : half;
@@ -38,7 +38,7 @@ EXPORT int composite_forward(const float* sigma, const float* rgb, const float* 
     });
 }
 
-// From the gradients of colour (R, 3), opacity (R) and weights (N), of which the last two may be null. With
+// From the gradients of colour (R, 3), opacity (R) and weights (N); the last two may be null. With
 // g_i = dL/dw_i:  dL/dtau_i = g_i T_{i+1} - sum_{j > i} g_j w_j.
 EXPORT int composite_backward(const float* sigma, const float* rgb, const float* starts, const float* ends,
                               const int64_t* offsets, int64_t rays, int64_t samples, const float* background,

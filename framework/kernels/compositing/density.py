@@ -25,7 +25,7 @@ from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.triton_backend import later
 
 MAX_PADDED = 2**26
-"""Maximum number of values of rays that are padded to the longest, so that they are added up in one pass."""
+"""Maximum number of values for padding rays to the longest one, so that one pass sums them all."""
 MAX_OPTICAL_DEPTH = 1e3
 """Maximum optical depth of an interval, so that sums stay finite. exp(-1000) is 0 even in float64."""
 
@@ -34,7 +34,7 @@ def optical_depth(sigma: Tensor, deltas: Tensor) -> Tensor:
     """Return the optical depth (N,) of intervals: sigma * delta, at most `MAX_OPTICAL_DEPTH`.
 
     It is 0 if the density or the length is 0, even if the other is infinite. NaN densities stay NaN, so that a broken
-    field is noticed. The density of an infinite interval has no gradient, because its optical depth is either 0 or the
+    field is noticed. The density of an infinite interval has no gradient, because its optical depth is 0 or the
     maximum.
 
     Args:
@@ -60,7 +60,7 @@ def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
     """Return the exclusive cumulative sum (N,) of `values` (N,) within each ray.
 
     Values of different rays are never added, so that NaN and rounding errors stay in their ray. The sums take log2 S
-    passes (Hillis and Steele 1986), and no padding to the longest ray.
+    passes (Hillis and Steele 1986), without padding to the longest ray.
 
     Args:
         values: (N,) one value per sample.
@@ -75,9 +75,9 @@ def segmented_sum(values: Tensor, places: Tensor) -> Tensor:
 
 
 def bounded_sum(values: Tensor, owners: Tensor, places: Tensor, num_rays: int, longest: int) -> Tensor:
-    """Return `segmented_sum` of `values` (N,) where the number of samples on a ray is bounded.
+    """Return `segmented_sum` of `values` (N,) if the number of samples on a ray has an upper bound.
 
-    Rays are padded to the bound, unless that takes too much memory; no device is waited for.
+    Rays are padded to the bound unless that takes too much memory; there is no wait for the device.
 
     Args:
         values: (N,) one value per sample.
@@ -90,7 +90,7 @@ def bounded_sum(values: Tensor, owners: Tensor, places: Tensor, num_rays: int, l
     if num_rays * width > MAX_PADDED:
         return segmented_sum(values, places)
     slots = owners * width + places
-    padded = values.new_zeros(num_rays * width).index_copy_(0, slots + 1, values)  # a place behind its own
+    padded = values.new_zeros(num_rays * width).index_copy_(0, slots + 1, values)  # one position after its own
     return padded.view(num_rays, width).cumsum(-1).view(-1).index_select(0, slots)
 
 
@@ -215,7 +215,7 @@ def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, 
         fars: (R,) distance of the far end of each ray.
 
     Returns:
-        colour, opacity and depth of R rays, and the weights.
+        Colour, opacity and depth of R rays, and the weights.
 
     Raises:
         IndexError: if the offsets of the samples do not divide them between the rays.
@@ -240,7 +240,7 @@ COMPOSITE.implementation(TRITON, differentiable=2)(later("compositing.density_tr
 
 
 def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
-    """Compute `distortion` of `weights` and `samples` over all pairs of samples of a ray, as its definition says."""
+    """Compute `distortion` of `weights` and `samples` over all pairs of samples of a ray, by its definition."""
     middles, losses = (samples.t_starts + samples.t_ends) / 2, []
     for start, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
         w, m, delta = weights[start:end], middles[start:end], samples.deltas[start:end]
@@ -252,7 +252,7 @@ def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
 def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
     """Compute `distortion` of `weights` and `samples` in PyTorch, on any device and for any float type."""
     # m_i - m_j is the sum of the gaps between neighbouring middles from j to i, so each gap is multiplied by the sum of
-    # the weights in front of it. No term is negative, so that there is no cancellation.
+    # the weights in front of it. No term is negative, so there is no cancellation.
     starts, ends = samples.t_starts, samples.t_ends
     gaps = ((starts - starts.roll(1)) + (ends - ends.roll(1))).masked_fill(samples.ranks == 0, 0) / 2
     steps = gaps * exclusive_sum(weights, samples)
@@ -286,7 +286,7 @@ class _Distortion(torch.autograd.Function):
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
     """Return the distortion of rays, the spread of their weights: mip-NeRF 360 (Barron et al. 2022), equation 15.
 
-    It is computed in time proportional to the number of samples, without their pairs.
+    The time is proportional to the number of samples, not of pairs.
 
     Args:
         weights: (N,) weight of each sample.

@@ -1,7 +1,7 @@
 """Compositing and distortion of packed samples, in Triton. `nerfloom.kernels.compositing.density` has the equations.
 
-A program takes a ray, in blocks of samples. What stands in front of a sample is summed without the sample, from values
-of its neighbours, since subtracting a large value from its own sum would leave rounding errors.
+A program processes a ray, in blocks of samples. Sums in front of a sample are computed without the sample, from its
+neighbours' values, because subtracting a large value from its own sum would leave rounding errors.
 """
 
 # Triton gives the kernels' arguments their types.
@@ -21,7 +21,7 @@ from nerfloom.kernels.compositing.density import Composited
 from nerfloom.kernels.triton_launch import depth_slope, launch, opacity_of, optical_depth
 
 BLOCK = 32
-"""Samples of a ray that are taken together, by one warp."""
+"""Samples of a ray processed together, by one warp."""
 
 
 @triton.jit
@@ -41,7 +41,7 @@ def _forward(
         start = tl.load(starts + n, mask=here, other=0.0)
         stop = tl.load(ends + n, mask=here, other=0.0)
         tau = optical_depth(tl.load(sigma + n, mask=here, other=0.0), stop - start)
-        before = here & (n > begin)  # of the neighbour in front
+        before = here & (n > begin)  # for the neighbour in front
         length = tl.load(ends + n - 1, mask=before, other=0.0) - tl.load(starts + n - 1, mask=before, other=0.0)
         passed = optical_depth(tl.load(sigma + n - 1, mask=before, other=0.0), length)
         in_front = tl.exp(-(depth + tl.cumsum(passed, 0)))
@@ -55,7 +55,7 @@ def _forward(
             t = tl.load(points + n, mask=here, other=0.0)
         weight = tl.where(here, weight, 0.0)
         total += tl.sum(weight, 0)
-        mean += tl.sum(tl.where(weight == 0, 0.0, weight * t), 0)  # t is infinite in the middle of an endless interval
+        mean += tl.sum(tl.where(weight == 0, 0.0, weight * t), 0)  # t is infinite in the middle of an infinite interval
         red += tl.sum(weight * tl.load(rgb + n * 3, mask=here, other=0.0), 0)
         green += tl.sum(weight * tl.load(rgb + n * 3 + 1, mask=here, other=0.0), 0)
         blue += tl.sum(weight * tl.load(rgb + n * 3 + 2, mask=here, other=0.0), 0)
@@ -159,8 +159,8 @@ def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, 
 
 @triton.jit
 def _distortion(weights, starts, ends, offsets, loss, of_weights, BLOCK: tl.constexpr):
-    # The distance of two middles is the sum of the gaps between them. A gap counts with all weight in front of it, seen
-    # from behind, and with all weight behind it, seen from in front. No term is negative, so nothing cancels.
+    # The distance of two middles is the sum of the gaps between them. From behind, a gap counts with all weight in
+    # front of it; from in front, with all weight behind it. No term is negative, so nothing cancels.
     ray = tl.program_id(0).to(tl.int64)
     begin = tl.load(offsets + ray)
     end = tl.load(offsets + ray + 1)
@@ -183,12 +183,12 @@ def _distortion(weights, starts, ends, offsets, loss, of_weights, BLOCK: tl.cons
         spread += tl.sum(weight * (2 * front + own), 0)
         tl.store(of_weights + n, 2 * (front + own), mask=here)
     tl.store(loss + ray, spread)
-    tl.debug_barrier()  # other threads may read on below what these have written
+    tl.debug_barrier()  # other threads may read these values below
     total, apart = 0.0, 0.0
     for back in range(0, end - begin, BLOCK):
         n = end - back - BLOCK + tl.arange(0, BLOCK)
         here = n >= begin
-        before = here & (n < end - 1)  # of the neighbour behind
+        before = here & (n < end - 1)  # for the neighbour behind
         gap = (tl.load(starts + n + 1, mask=before, other=0.0) - tl.load(starts + n, mask=before, other=0.0)) / 2
         gap += (tl.load(ends + n + 1, mask=before, other=0.0) - tl.load(ends + n, mask=before, other=0.0)) / 2
         passed = tl.load(weights + n + 1, mask=before, other=0.0)

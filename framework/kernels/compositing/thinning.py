@@ -1,9 +1,9 @@
-"""Thinning of gradients: of samples with small gradients, a random share goes on, enlarged so that the mean stays.
+"""Thinning of gradients: a random fraction of samples with small gradients is kept, scaled up to preserve the mean.
 
-After the first steps most samples along rays have gradients that are small in relation to the mean: those in empty
-space, behind surfaces, and of pixels that are right already. Networks and tables skip samples whose gradient is zero
-(`mlp`, `hash_grid`, `planes`), so that a step takes less time. The roulette is that of Arvo and Kirk 1990, "Particle
-Transport and Image Synthesis".
+After the first steps most samples along rays have gradients much smaller than the mean: those in empty space, behind
+surfaces, and of pixels that are already right. Networks and tables skip samples with zero gradient (`mlp`, `hash_grid`,
+`planes`), so a step takes less time. The roulette is that of Arvo and Kirk 1990, "Particle Transport and Image
+Synthesis".
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class _Thinned(torch.autograd.Function):
             red, green, blue = of_rgb.abs().unbind(-1)  # torch's norm along an axis of 3 takes fifty times as long
             size = size + (red + green + blue)
         chance = (size / (ctx.floor * size.mean())).clamp(max=1)
-        # NaN, of a gradient or where all are 0, is never below a chance; times 0 it stays NaN, which must be seen.
+        # NaN, of a gradient or where all are 0, is never below a chance; times 0 it stays NaN, so that it is noticed.
         factor = torch.where(draws < chance, 1 / chance, torch.zeros_like(chance))
         sigma_grad = None if of_sigma is None else of_sigma * factor
         return sigma_grad, None if of_rgb is None else of_rgb * factor[:, None], None
@@ -40,15 +40,15 @@ class _Thinned(torch.autograd.Function):
 def thinned(sigma: Tensor, rgb: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Return density and colour of samples unchanged, with the gradients of most small ones set to zero.
 
-    The size of a sample's gradient is that of the logarithm of its density, plus the sum over colour channels. A sample
-    below the bound is kept with a probability in proportion to its size, and its gradients are divided by that; the
-    expected gradients are those without thinning. Where a density is 0 its own gradient counts as 0: no density is
-    less, so that what it is computed from has none.
+    The size of a sample's gradient is that of its log-density plus the sum over colour channels. A sample below the
+    bound is kept with a probability proportional to its size, and its gradients are divided by that probability, so the
+    expected gradients are unchanged. If a density is 0, its own gradient counts as 0, because the density cannot
+    decrease.
 
     Args:
         sigma: (N,) density in 1/length.
         rgb: (N, 3) colour.
-        floor: the bound, in relation to the mean size of all N; more than 0.
+        floor: the bound, relative to the mean size of all N; more than 0.
     """
     found: tuple[Tensor, Tensor] = _Thinned.apply(sigma, rgb, floor)
     return found

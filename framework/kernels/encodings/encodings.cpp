@@ -7,9 +7,10 @@
 
 namespace {
 
-constexpr float LARGEST_ANGLE = 8192;  // up to which the three parts of pi / 2 below leave no error that counts
+constexpr float LARGEST_ANGLE = 8192;  // limit for the three-part pi / 2 below
 
-// sin and cos to 2 units in the last place of 1, for |x| <= LARGEST_ANGLE: x less a whole number of quarter turns, then
+// sin and cos to 2 units in the last place of 1, for |x| <= LARGEST_ANGLE: x minus a whole number of quarter turns,
+// then
 // polynomials (Cephes' sinf and cosf).
 inline void sine_and_cosine(Floats x, Floats& sine, Floats& cosine) {
     const Ints turns = __builtin_convertvector(x * 0.636619772f + (x < 0 ? splat(-0.5f) : splat(0.5f)), Ints);
@@ -24,7 +25,8 @@ inline void sine_and_cosine(Floats x, Floats& sine, Floats& cosine) {
     cosine = (turns + 1) & 2 ? -other : other;
 }
 
-// The same for `count` values, a multiple of LANES; the rare large, infinite or NaN ones by the standard library.
+// The same for `count` values, a multiple of LANES; the standard library handles the rare large, infinite or NaN
+// values.
 void sines_and_cosines(const float* angles, int count, float* sines, float* cosines) {
     for (int i = 0; i < count; i += LANES) {
         Floats sine, cosine;
@@ -39,7 +41,7 @@ void sines_and_cosines(const float* angles, int count, float* sines, float* cosi
     }
 }
 
-// How many harmonics `levels` bands have.
+// Number of harmonics in `levels` bands.
 inline int harmonics_of_levels(int levels) {
     if (levels < 1 || levels > 4) throw std::invalid_argument("spherical harmonics have 1 to 4 levels");
     return levels * levels;
@@ -47,7 +49,7 @@ inline int harmonics_of_levels(int levels) {
 
 }  // namespace
 
-// Rows [x, sin(x), cos(x), sin(2 x), ...] of x (N, dims); x itself only where `include_input`.
+// Rows [x, sin(x), cos(x), sin(2 x), ...] of x (N, dims); x itself only if `include_input`.
 EXPORT int frequency_encoding(const float* x, int64_t count, int dims, int frequencies, int include_input, float* out,
                               int threads) {
     return guarded([&] {
@@ -74,7 +76,7 @@ EXPORT int frequency_encoding(const float* x, int64_t count, int dims, int frequ
     });
 }
 
-// The gradient of x (N, dims), from the encoding's own rows and their gradient.
+// The gradient of x (N, dims), from the encoding's rows and their gradient.
 EXPORT int frequency_encoding_backward(const float* rows, const float* grad, int64_t count, int dims, int frequencies,
                                        int include_input, float* x_grad, int threads) {
     return guarded([&] {
@@ -106,7 +108,7 @@ EXPORT int spherical_harmonics(const float* directions, int64_t count, int level
     });
 }
 
-// The gradient (N, 3) by directions, from `grad` (N, levels^2) by their harmonics.
+// The gradient (N, 3) of directions, from `grad` (N, levels^2) of their harmonics.
 EXPORT int spherical_harmonics_backward(const float* directions, int64_t count, int levels, const float* grad,
                                         float* out, int threads) {
     return guarded([&] {

@@ -19,7 +19,7 @@ from nerfloom.kernels.encodings.harmonics_triton import harmonics
 from nerfloom.kernels.triton_launch import MAX_FLOAT, blocks, launch
 
 BLOCK = 256
-"""Rows, or values, that are taken together."""
+"""Rows, or values, per program."""
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -110,7 +110,7 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
 
 @triton.jit
 def _place(positions, centre, scale, n, here, axis: tl.constexpr):
-    """Return the position along an axis from the centre in half edges; what is infinite has no direction."""
+    """Return the position along an axis from the centre in half edges; infinity has no direction."""
     x = tl.load(positions + n * 3 + axis, mask=here, other=0.0)
     x = (x - tl.load(centre + axis)) * tl.load(scale + axis)
     return tl.where(x > MAX_FLOAT, MAX_FLOAT, tl.where(x < -MAX_FLOAT, -MAX_FLOAT, x))
@@ -118,9 +118,10 @@ def _place(positions, centre, scale, n, here, axis: tl.constexpr):
 
 @triton.jit
 def _contracted(positions, centre, scale, n, here):
-    """Return x, y and z, the unit that they are in, max(1, norm) in it, and the factor that contracts them.
+    """Return x, y and z, their unit, max(1, norm) in that unit, and the factor that contracts them.
 
-    The unit is 1, but far away, where squares would overflow, a power of two that makes everything smaller.
+    The unit is 1, except far away, where squares would overflow: there it is a power of two that scales everything
+    down.
     """
     x = _place(positions, centre, scale, n, here, 0)
     y = _place(positions, centre, scale, n, here, 1)
@@ -145,8 +146,8 @@ def _contract(positions, centre, scale, out, count, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count"])
 def _contract_backward(positions, centre, scale, grad, out, count, BLOCK: tl.constexpr):
-    # With n = max(1, |x|) and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n, whose second part is
-    # 0 where n is 1.
+    # With n = max(1, |x|) and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n. The second term is 0
+    # if n is 1.
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = n < count
     x, y, z, unit, norm, factor = _contracted(positions, centre, scale, n, here)

@@ -12,7 +12,7 @@ from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.triton_backend import later
 
 MAX_FREQUENCIES = 32
-"""Maximum number of frequencies. In float32 the sines of the highest ones are noise already with fewer."""
+"""Maximum number of frequencies. In float32 the sines of the highest ones are noise even earlier."""
 
 _forward = native.Function("frequency_encoding", "pqiiipi")
 _backward = native.Function("frequency_encoding_backward", "ppqiiipi")

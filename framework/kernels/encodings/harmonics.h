@@ -1,8 +1,8 @@
-// Real spherical harmonics of directions (Sloan 2008), of one or of a vector of them. See ../spherical_harmonics.py for
+// Real spherical harmonics of directions (Sloan 2008), for a single one or a vector. See ../spherical_harmonics.py for
 // the reference.
 #pragma once
 
-constexpr float FIRST_HARMONIC = 0.28209479177387814f;  // the same in every direction
+constexpr float FIRST_HARMONIC = 0.28209479177387814f;  // constant over directions
 
 // The first `basis` harmonics of degrees 1 to 3: 3, 8 or 15.
 template <typename T>
@@ -26,7 +26,7 @@ inline void harmonics(T x, T y, T z, int basis, T* b) {
     }
 }
 
-// Of the sum of g[k] times each harmonic, the gradient.
+// The gradient of the sum of g[k] times each harmonic.
 template <typename T>
 inline void harmonics_gradient(T x, T y, T z, int basis, const T* g, T* out) {
     T gx{}, gy{}, gz{};

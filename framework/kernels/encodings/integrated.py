@@ -9,8 +9,8 @@ from torch import Tensor
 def integrated_encoding(means: Tensor, variances: Tensor, num_frequencies: int) -> Tensor:
     """Return the expected sines and cosines of Gaussians times 1, 2, 4, ..., 2^(L - 1): equation 14.
 
-    A frequency whose waves are short beside a Gaussian averages to 0, so that a network is told of no detail that is
-    smaller than what it is asked about.
+    A frequency with waves much shorter than a Gaussian averages to 0, so that a network sees no detail smaller than the
+    region it is evaluated for.
 
     Args:
         means: (N, K) mean along each of K directions, of any float type.

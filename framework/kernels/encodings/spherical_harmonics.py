@@ -20,7 +20,7 @@ from nerfloom.kernels.triton_backend import later
 MAX_LEVELS = 4
 """Maximum number of bands."""
 CONSTANT = 0.28209479177387814
-"""The first harmonic, the same in every direction."""
+"""The first harmonic, constant over directions."""
 PAIRS = tuple(combinations_with_replacement(range(3), 2))
 """Axes of the products x x, x y, ..., z z."""
 TRIPLES = tuple((PAIRS.index((a, b)), c) for a, b, c in combinations_with_replacement(range(3), 3))
@@ -36,7 +36,7 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
 
     Args:
         directions: (N, 3) unit vectors.
-        levels: number of bands, 1 to 4, which papers call the degree.
+        levels: number of bands, 1 to 4 (the degree in papers).
 
     Returns:
         (N, levels^2) values of functions that are orthonormal over the sphere.
@@ -56,7 +56,7 @@ def spherical_harmonics_reference(directions: Tensor, levels: int = 4) -> Tensor
 
 
 def _polynomials(x: Any, y: Any, z: Any, levels: int) -> list[Any]:
-    """Return the harmonics but the first of directions (x, y, z), tensors or numpy's arrays."""
+    """Return all harmonics but the first for directions (x, y, z), tensors or numpy arrays."""
     bands = []
     if levels > 1:
         bands += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
@@ -132,7 +132,7 @@ class _Products(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _products(levels: int, dtype: torch.dtype, device: torch.device) -> _Products:
-    """Return the sums, found from values of the polynomials at more positions than there are products."""
+    """Return the sums, computed from values of the polynomials at more positions than there are products."""
     positions = np.random.default_rng(0).uniform(-1, 1, (64, 3))
     ones, columns = np.ones(64), (positions[:, 0], positions[:, 1], positions[:, 2])
     twos = [columns[a] * columns[b] for a, b in PAIRS]
@@ -157,5 +157,5 @@ def _as_product(directions: Tensor, levels: int = 4) -> Tensor:
         parts.append(directions.index_select(1, known.pairs[0]) * directions.index_select(1, known.pairs[1]))
     if levels > 3:
         parts.append(parts[1].index_select(1, known.triples[0]) * directions.index_select(1, known.triples[1]))
-    with torch.autocast(directions.device.type, torch.bfloat16, enabled=False):  # which rounds products
+    with torch.autocast(directions.device.type, torch.bfloat16, enabled=False):  # autocast rounds products
         return torch.addmm(known.constants, torch.cat(parts, dim=-1), known.factors)

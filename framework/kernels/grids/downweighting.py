@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 SMALLEST = 0.05
-"""Standard deviation, in cells, below which a weight is 1: erf(1 / (sqrt(8) 0.05)) differs from 1 by 2e-23."""
+"""Below this standard deviation, in cells, a weight is 1: erf(1 / (sqrt(8) 0.05)) differs from 1 by 2e-23."""
 
 
 def level_weights(deviations: Tensor, resolutions: Tensor) -> Tensor:
     """Return the factors of the features of each level of a grid, for isotropic Gaussians.
 
-    The factor is erf(1 / sqrt(8 s^2 n^2)), the share of a Gaussian along an axis that lies within half a cell of its
-    mean: 1 where the Gaussian is small beside the cells of a level, and 0 where it covers many.
+    The factor is erf(1 / sqrt(8 s^2 n^2)), the fraction of a Gaussian along an axis that lies within half a cell of its
+    mean. It is 1 for Gaussians much smaller than the cells of a level, and 0 for Gaussians that cover many cells.
 
     Args:
         deviations: (N,) standard deviation s of each Gaussian, in units of the domain [0, 1] of the grid; at least 0,
@@ -24,6 +24,6 @@ def level_weights(deviations: Tensor, resolutions: Tensor) -> Tensor:
         (N, L) factors in [0, 1]; float64 if `deviations` is float64, and float32 otherwise. A NaN stays NaN.
     """
     deviations = deviations if deviations.dtype == torch.float64 else deviations.float()
-    # The bound leaves all values as they are, and is for the gradient, which would be infinity times 0 at s = 0.
+    # The bound changes no value; without it the gradient would be infinity times 0 at s = 0.
     cells = (deviations[:, None] * resolutions.to(deviations)).clamp(min=SMALLEST)
     return torch.erf(8**-0.5 / cells)

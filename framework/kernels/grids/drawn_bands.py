@@ -1,4 +1,4 @@
-"""Bands of rows of factors at places that the device draws, so that a step that reads them can be repeated."""
+"""Bands of rows of factors at positions drawn on the device, so that a step that reads them can be captured."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Rows = tuple[int, int, int]
 
 
 class _Bands(NamedTuple):
-    """Entries of K bands, E in all, before their places are known."""
+    """Entries of K bands, E in total, before their positions are drawn."""
 
     entries: Tensor
     """(E,) int64 entries of the table if each band were at its factor's first row."""
@@ -25,15 +25,15 @@ class _Bands(NamedTuple):
     across: Tensor
     """(K,) int64 entries of a row."""
     above: Tensor
-    """(K,) int64 number of a band's rows less 1, which may lie above the factor's first row when it is drawn."""
+    """(K,) int64 number of a band's rows minus 1; these may lie above the factor's first row when drawn."""
     last: Tensor
-    """(K,) int64 last row at which a band may begin."""
+    """(K,) int64 last possible first row of a band."""
 
 
 def drawn_bands(table: Tensor, layout: PlanesLayout, bands: Sequence[Rows]) -> list[Tensor]:
-    """Return consecutive rows of factors, at random places, in torch; the host does not know where.
+    """Return consecutive rows of factors at random positions, unknown to the host, in torch.
 
-    A band that would extend beyond its factor is moved into it.
+    A band that would extend beyond its factor is moved inside.
 
     Args:
         table: (E, F) entries of all factors.
@@ -44,7 +44,7 @@ def drawn_bands(table: Tensor, layout: PlanesLayout, bands: Sequence[Rows]) -> l
         (rows, vertices along the first axis, F) entries of each band.
     """
     known = _known(layout, tuple(bands), table.device)
-    spread = known.last + known.above + known.above + 1  # places at which a band has a row within the factor
+    spread = known.last + known.above + known.above + 1  # positions at which a band has a row within the factor
     places = (torch.rand(len(bands), device=table.device) * spread).long() - known.above
     moved = torch.minimum(places.clamp(min=0), known.last) * known.across
     found = table.index_select(0, known.entries + moved.index_select(0, known.owners))
@@ -55,7 +55,7 @@ def drawn_bands(table: Tensor, layout: PlanesLayout, bands: Sequence[Rows]) -> l
 
 @lru_cache(maxsize=64)
 def _known(layout: PlanesLayout, bands: tuple[Rows, ...], device: torch.device) -> _Bands:
-    """Return what is known of bands; it is kept, since bringing it to a device means to wait for it."""
+    """Return the constants of bands; cached, because a copy to the device waits for it."""
     across = [layout.shape(group, index)[1] for group, index, _ in bands]
     firsts = [layout.offsets[group][index] for group, index, _ in bands]
     sizes = [rows * wide for (_, _, rows), wide in zip(bands, across, strict=True)]

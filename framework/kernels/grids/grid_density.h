@@ -1,11 +1,11 @@
-// A density that is a small network on a hash grid, for kernels that evaluate it block by block.
+// A density that is a small network on a hash grid, evaluated block by block in other kernels.
 #pragma once
 
 #include "encodings/contraction.h"
 #include "grids/hash_grid.h"
 #include "networks/mlp.h"
 
-struct Density {  // at positions * scale + shift, or at positions contracted around a box (2, 3), unless that is null
+struct Density {  // at positions * scale + shift, or contracted around a box (2, 3) if given
     const float *scale, *shift, *table;
     const int64_t *resolutions, *offsets;
     int levels;
@@ -35,7 +35,7 @@ struct Density {  // at positions * scale + shift, or at positions contracted ar
         }
     }
 
-    // Where a distance along a ray is in the unit cube.
+    // Maps a distance along a ray to the unit cube.
     void place(const float* origin, const float* direction, float t, float* unit) const {
         float position[3];
         for (int a = 0; a < 3; a++) position[a] = origin[a] + t * direction[a];
@@ -43,8 +43,8 @@ struct Density {  // at positions * scale + shift, or at positions contracted ar
         for (int a = 0; a < 3; a++) unit[a] = position[a] * scale[a] + shift[a];
     }
 
-    // Features (count, inputs), the network's outputs (count, width) and density (count) at `unit` (count, 3); records
-    // of the network, unless null.
+    // Features (count, inputs), the network's outputs (count, width) and density (count) at `unit` (count, 3); the
+    // network's records unless null.
     void evaluate(const float* unit, int64_t count, float* encoded, float* outputs, float* density,
                   char* records) const {
         for (int64_t n = 0; n < count; n += grid::CHUNK)

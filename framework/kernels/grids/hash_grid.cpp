@@ -42,7 +42,7 @@ void scatter_level(const Level& level, const float* positions, int64_t count, co
     }
 }
 
-// Where samples with a gradient stand, in their order.
+// Positions of the samples with a gradient, in order.
 struct Live {
     std::vector<const float*> points, grads;
 
@@ -62,13 +62,13 @@ struct Live {
     }
 };
 
-// Samples with a gradient, which come in parts, put together: positions, and the incoming gradient level by level.
+// Samples with a gradient, collected from parts: positions, and the incoming gradient level by level.
 template <int F>
 struct Gathered {
     Live live;
     int64_t count;
     int levels;
-    std::unique_ptr<float[]> points, by_level;  // not std::vector, which would fill them with zeros first
+    std::unique_ptr<float[]> points, by_level;  // std::vector would fill them with zeros first
 
     Gathered(const float* const* positions, const float* const* grads, const int64_t* ends, int parts, int levels,
              int threads)
@@ -82,18 +82,18 @@ struct Gathered {
             }
         });
     }
-    // Adds a level's gradient to `table`, where that level's first entry stands.
+    // Adds a level's gradient to `table`, which points to that level's first entry.
     void scatter_to(const Level& level, int l, float* table) const {
         const auto run = level.dense ? scatter_level<F, true> : scatter_level<F, false>;
         run(level, points.get(), count, by_level.get() + size_t(l) * count * F, table);
     }
 };
 
-// Adds the gradient of one level by positions to `out`; `grad`: the incoming one of the level, rows `stride` wide.
+// Adds the gradient of one level by positions to `out`; `grad`: the level's incoming gradient, rows `stride` wide.
 template <int F, bool DENSE>
 void add_position_gradient(const Level& level, const Floats (*xyz)[3], int64_t count, const float* table,
                            const float* grad, int64_t stride, Floats (*out)[3]) {
-    Cell cells[2];  // this block's and the next one's, whose entries are on their way meanwhile
+    Cell cells[2];  // this block's and the next one's, which is prefetched
     alignas(64) float value[CORNERS][LANES] = {};
     const float* entries = table + level.offset * F;
     find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
@@ -160,7 +160,7 @@ EXPORT int hash_grid_backward_table(const float* const* positions, const float* 
     });
 }
 
-// Adam on what hash_grid_backward_table would add. `touched`: how many entries were updated.
+// Adam on the gradient that hash_grid_backward_table would add. `touched`: number of updated entries.
 EXPORT int hash_grid_adam(const float* const* positions, const float* const* grads, const int64_t* ends, int parts,
                           int features, const int64_t* resolutions, const int64_t* offsets, int levels, float* values,
                           float* mean, float* square, float* seen, float rate, double beta1, double beta2, float eps,

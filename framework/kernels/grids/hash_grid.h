@@ -1,5 +1,5 @@
-// What the look-ups in a multiresolution hash grid share: levels, and the corners around positions (Instant-NGP, section
-// 3). See ../hash_grid.py for the reference.
+// Shared by look-ups in a multiresolution hash grid: levels, and the corners around positions (Instant-NGP, section 3).
+// See ../hash_grid.py for the reference.
 #pragma once
 
 #include "adam/adam.h"
@@ -14,13 +14,13 @@ constexpr int CORNERS = 8;
 
 struct Level {
     int64_t offset;
-    uint32_t mask;  // entries - 1, of a hashed level
+    uint32_t mask;  // entries - 1, for a hashed level
     int32_t resolution;
     bool dense;
 };
 
 inline Level level_of(const int64_t* resolutions, const int64_t* offsets, int level) {
-    // In floating point, for the product of large resolutions does not fit 64 bits.
+    // In floating point, because the product of large resolutions does not fit 64 bits.
     const double vertices = double(resolutions[level]) + 1;
     const int64_t entries = offsets[level + 1] - offsets[level];
     return {offsets[level], uint32_t(entries - 1), int32_t(resolutions[level]),
@@ -34,7 +34,7 @@ struct Cell {
     alignas(64) uint32_t entry[CORNERS][LANES];
     alignas(64) float weight[CORNERS][LANES];
     Floats fraction[3];
-    Floats inside[3];  // the resolution where the position is inside the box, 0 where it was moved to the face
+    Floats inside[3];  // the resolution if the position is inside the box, 0 if it was clamped
 };
 
 template <bool DENSE>
@@ -79,7 +79,7 @@ inline void find_cell(const Level& level, Floats x, Floats y, Floats z, Cell& ce
 
 inline int block(int64_t first, int64_t end) { return int(end - first < LANES ? end - first : LANES); }
 
-constexpr int64_t CHUNK = 1024;  // samples that go through all levels together: their features stay in cache
+constexpr int64_t CHUNK = 1024;  // samples processed together: their features stay in cache
 
 template <int F>
 inline void blend(const Cell& cell, const float* table, int count, float* out, int64_t stride) {
@@ -110,7 +110,7 @@ inline void load_positions(const float* positions, int64_t first, int count, Flo
 template <int F, bool DENSE>
 void forward_level(const Level& level, const Floats (*xyz)[3], const float* table, int64_t begin, int64_t end,
                    float* out, int64_t stride) {
-    Cell cells[2];  // this block's and the next one's, whose entries are on their way meanwhile
+    Cell cells[2];  // this block's and the next one's, which is prefetched
     const float* entries = table + level.offset * F;
     find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
     for (int64_t n = begin, turn = 0; n < end; n += LANES, turn ^= 1) {
@@ -138,7 +138,7 @@ void encode(const float* positions, int64_t begin, int64_t end, const float* tab
     }
 }
 
-// What the entries at the corners of a lane's cell are worth: each times the incoming gradient `grad`, to value[c][s].
+// Products of the entries at the corners of a lane's cell with the incoming gradient `grad`, to value[c][s].
 template <int F>
 inline void weigh_corners(const Cell& cell, int s, const float* entries, const float* grad, float (*value)[LANES]) {
     for (int c = 0; c < CORNERS; c++) {
@@ -149,7 +149,7 @@ inline void weigh_corners(const Cell& cell, int s, const float* entries, const f
     }
 }
 
-// Adds the gradient by the position to `out`, by what the corners are worth.
+// Adds the gradient by the position to `out`, from these products.
 inline void add_slopes(const Cell& cell, const float (*value)[LANES], Floats* out) {
     const Floats* t = cell.fraction;
     for (int axis = 0; axis < 3; axis++) {
@@ -165,7 +165,8 @@ inline void add_slopes(const Cell& cell, const float (*value)[LANES], Floats* ou
     }
 }
 
-// Fills `out` with the numbers of those of `count` rows, `stride` wide, of which some gradient is not zero (or is NaN).
+// Fills `out` with the indices of those of `count` rows, `stride` wide, that have a gradient that is not zero (or is
+// NaN).
 inline void rows_with_gradient(const float* grads, int64_t count, int64_t stride, std::vector<int64_t>& out) {
     out.clear();
     for (int64_t n = 0; n < count; n++) {
@@ -176,23 +177,24 @@ inline void rows_with_gradient(const float* grads, int64_t count, int64_t stride
     }
 }
 
-// Adds the gradient of each level to `table`. Levels are shared out over threads, so that no two write to the same entry
-// and the order of sums never changes. samples.scatter_to(level, l, first) adds that of level l, from its first entry on.
+// Adds the gradient of each level to `table`. Levels are distributed over threads, so that no two write to the same
+// entry and the order of sums never changes. samples.scatter_to(level, l, first) adds that of level l, starting at its
+// first entry.
 template <int F, typename Samples>
 void add_by_level(const Samples& samples, const int64_t* resolutions, const int64_t* offsets, int levels, float* table,
                   int threads) {
     for_each(threads, levels, 1, [&](int64_t turn) {
-        const int l = levels - 1 - int(turn);  // the slowest first
+        const int l = levels - 1 - int(turn);  // slowest first
         samples.scatter_to(level_of(resolutions, offsets, l), l, table + offsets[l] * F);
     });
 }
 
-// The same, and Adam on each level while its gradient is still in cache. Returns how many entries were updated.
+// The same, followed by Adam on each level while its gradient is in cache. Returns the number of updated entries.
 template <int F, typename Samples>
 int64_t adam_by_level(const Samples& samples, const int64_t* resolutions, const int64_t* offsets, int levels,
                       float* values, float* mean, float* square, float* seen, const adam::Settings& settings,
                       int threads) {
-    // Of each thread, and zero between calls: the update clears what it has used.
+    // Per thread, and zero between calls, because the update clears what it has used.
     static thread_local std::vector<std::vector<float>> kept;
     std::vector<std::vector<float>>& grads_of = kept;
     if (grads_of.size() < size_t(threads)) grads_of.resize(size_t(threads));

@@ -24,7 +24,7 @@ from nerfloom.kernels.triton_backend import later
 PRIMES = (1, 2654435761, 805459861)
 """Factors of the hash (equation 4)."""
 MAX_HELD = 2**26
-"""Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
+"""Maximum number of corner features held at once in the form with few operations; it processes positions in parts."""
 
 
 def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -33,7 +33,7 @@ def corners(positions: Tensor, layout: HashGridLayout, level: int) -> tuple[Tens
     Args:
         positions: (N, 3); coordinates are clamped to [0, 1]. NaN is in cell 0, with weights of NaN.
         layout: resolutions and offsets of the levels.
-        level: number of the level.
+        level: index of the level.
 
     Returns:
         entries (8, N) int32, counted from the first entry of the level; trilinear weights (8, N); and positions in the
@@ -123,23 +123,23 @@ HASH_GRID.implementation(TRITON, fits=fits)(later("grids.hash_grid_triton", "has
 
 
 class _Levels(NamedTuple):
-    """Constants of all levels on a device, in the shapes in which they are combined with positions."""
+    """Constants of all levels on a device, shaped for operations with positions."""
 
     cells: Tensor
     """(L, 1, 1) number of cells along each axis."""
     strides: Tensor
     """(L, 3, 1) int32 factor of the vertex's index along each axis."""
     dense: Tensor
-    """(L, 1, 1, 1, 1) bool, whether each vertex has an entry of its own."""
+    """(L, 1, 1, 1, 1) bool, whether each vertex has its own entry."""
     masks: Tensor
-    """(L, 1, 1, 1, 1) int32 bits of a hash that are used."""
+    """(L, 1, 1, 1, 1) int32 mask of the hash bits in use."""
     offsets: Tensor
     """(L, 1, 1, 1, 1) int32 index of the first entry."""
 
 
 @lru_cache(maxsize=64)
 def _levels(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) -> _Levels:
-    """Return the constants; they are kept, since bringing them to a device means to wait for it."""
+    """Return the constants; cached, because a copy to the device waits for it."""
     sizes = [end - first for first, end in pairwise(layout.offsets)]
     dense = [layout.is_dense(level) for level in range(layout.num_levels)]
     strides = [
@@ -179,7 +179,7 @@ def _at_all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout) -> 
     x, y, z = _spread(torch.stack([low, low + levels.strides], 2))
     entries = torch.where(levels.dense, x + y + z, (x ^ y ^ z) & levels.masks) + levels.offsets
     wx, wy, wz = _spread(torch.stack([1 - fractions, fractions], 2))
-    # By index_select, whose gradient is added up in place; that of table[entries] is sorted first on a GPU.
+    # By index_select, whose gradient is added in place; on a GPU that of table[entries] is sorted first.
     rows = table.index_select(0, entries.flatten()).view(layout.num_levels, 8, len(positions), table.shape[1])
     features = (rows * (wx * wy * wz).flatten(1, 3)[..., None]).sum(1)
     return features.transpose(0, 1).flatten(1)

@@ -1,4 +1,4 @@
-"""The layout of a hash grid: resolution and entries of each level, checked where it is made."""
+"""The layout of a hash grid: resolution and entries of each level, validated on construction."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ MAX_LEVELS = 64
 MAX_RESOLUTION = 2**20
 """Maximum number of cells along an axis; float32 then has 4 bits left for the position in a cell."""
 MAX_LOG2_TABLE_SIZE = 28
-"""Maximum number of entries of a level, as a power of two, so that 32 bits can index them."""
+"""Maximum number of entries of a level, log2, so that 32 bits can index them."""
 
 
 @dataclass(frozen=True)
 class HashGridLayout:
-    """Resolution and entries of each of L levels, in one table (E, F) that all levels share.
+    """Resolution and entries of each of L levels, in one table (E, F) shared by all levels.
 
     Raises:
         ConfigError: if the numbers are inconsistent or out of range; the kernels rely on them.
@@ -34,7 +34,7 @@ class HashGridLayout:
     def __post_init__(self) -> None:
         _check("levels", len(self.resolutions), MAX_LEVELS)
         if len(self.offsets) != len(self.resolutions) + 1 or self.offsets[0] != 0:
-            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels needs one more offset, the first being 0")
+            raise ConfigError(f"a hash grid of {len(self.resolutions)} levels needs one more offset, starting at 0")
         for resolution, (first, end) in zip(self.resolutions, pairwise(self.offsets), strict=True):
             _check("cells along an axis", resolution, MAX_RESOLUTION)
             _check("entries of a level", end - first, 2**MAX_LOG2_TABLE_SIZE)
@@ -67,7 +67,7 @@ class HashGridLayout:
         return cls(resolutions, tuple(offsets))
 
     def first(self, count: int) -> HashGridLayout:
-        """Return the layout of the first `count` levels, 1 or more, whose entries stand first in the table."""
+        """Return the layout of the first `count` levels, 1 or more; their entries come first in the table."""
         return _first(self, count)
 
     @property
@@ -86,7 +86,7 @@ class HashGridLayout:
         return native.integers(self.resolutions), native.integers(self.offsets)
 
     def is_dense(self, level: int) -> bool:
-        """Return whether each vertex of `level` has an entry of its own."""
+        """Return whether each vertex of `level` has its own entry."""
         return (self.resolutions[level] + 1) ** 3 <= self.offsets[level + 1] - self.offsets[level]
 
 

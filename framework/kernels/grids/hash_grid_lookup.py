@@ -1,7 +1,7 @@
-"""Look-ups of a hash grid's table: checks, autograd, and gradients that wait for Adam, whatever is looked up.
+"""Look-ups in a hash grid's table, for any kind of points: checks, autograd, and gradients deferred until Adam.
 
-A look-up takes N rows of points, (N, 3) positions or (N, J, 4) points with a size, and returns L * F features of each
-row. It is given by its reference and by compiled functions (`LookUp`).
+A look-up takes N rows of points, (N, 3) positions or (N, J, 4) points with a size, and returns L * F features per row.
+It is defined by its reference and by compiled functions (`LookUp`).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ class LookUp:
     points: str
     """Name of the points, for errors."""
     shape: tuple[str | int, ...]
-    """Shape of the points, with letters for what is free, such as ("N", 3)."""
+    """Shape of the points, with letters for free sizes, such as ("N", 3)."""
     forward: native.Function
     """Computes the features."""
     backward_table: native.Function
-    """Accumulates the gradient of the table, of several look-ups."""
+    """Accumulates the gradient of the table over several look-ups."""
     backward_points: native.Function
     """Computes the gradient of the points."""
     adam: native.Function
-    """Applies the gradient of the table by Adam, of several look-ups."""
+    """Applies the gradient of the table by Adam, for several look-ups."""
 
     def check(self, points: Tensor, table: Tensor, layout: HashGridLayout) -> None:
-        """Refuse what a look-up cannot take.
+        """Check the arguments of a look-up.
 
         Args:
             points: (N, ..., D) points.
@@ -69,7 +69,7 @@ class LookUp:
             points: (N, ..., D) points.
             table: (E, F) entries of all levels.
             layout: resolutions and offsets of the levels.
-            deferred: collects the gradient of the table, instead of autograd; None for autograd.
+            deferred: collects the gradient of the table instead of autograd; None for autograd.
         """
         points, table, placeholder = points.contiguous(), table.contiguous(), None
         if deferred is not None and table.requires_grad:
@@ -80,7 +80,7 @@ class LookUp:
     def operation(
         self, reference: Callable[[Tensor, Tensor, HashGridLayout], Tensor]
     ) -> Operation[[Tensor, Tensor, HashGridLayout, TableGradient | None], Tensor]:
-        """Return the operation that chooses between the reference, which knows autograd alone, and compiled code.
+        """Return the operation that chooses between compiled code and the reference, which only supports autograd.
 
         Args:
             reference: computes the features of points and table by layout.
@@ -95,7 +95,7 @@ class LookUp:
 
 
 def fits(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
-    """Return whether kernels are built for the features of `table`; `points`, `layout` and `deferred` do not matter."""
+    """Return whether kernels support the features of `table`; `points`, `layout` and `deferred` do not matter."""
     return table.shape[1] in (1, 2, 4, 8)
 
 
@@ -103,11 +103,11 @@ class TableGradient:
     """The deferred gradient of a table: gradients of encodings, collected in backward passes and not yet accumulated.
 
     A step uses few entries. Accumulating the gradient level by level, each followed by Adam, takes one pass over the
-    table, while autograd's dense gradient takes many.
+    table; autograd's dense gradient takes many.
 
     Args:
-        look_up: the kind of look-up whose gradients are collected.
-        layout: resolutions and offsets of the levels that are looked up: all of the table's, or the first ones.
+        look_up: kind of look-up whose gradients are collected.
+        layout: resolutions and offsets of the levels in use: all of the table's, or the first ones.
     """
 
     def __init__(self, look_up: LookUp, layout: HashGridLayout) -> None:
@@ -139,16 +139,16 @@ class TableGradient:
         return points, grads, ends, *map(native.integers, inner), len(self.parts), features, *layout
 
     def add_to(self, grad: Tensor) -> None:
-        """Add the gradient to `grad` (E, F), and discard it."""
+        """Add the gradient to `grad` (E, F) and discard it."""
         shape = (self.layout.num_entries, grad.shape[1])
         into = native.pointer(grad[: shape[0]], "the table's gradient", shape)
         self.look_up.backward_table(*self._arguments(shape[1]), into, native.threads())
         self.parts.clear()
 
     def summed(self, table: Tensor) -> Tensor:
-        """Return the accumulated gradient (E, F) of `table`, and discard it.
+        """Return the accumulated gradient (E, F) of `table` and discard it.
 
-        The result's memory is used again: its entries must be zero before the next call, as Adam leaves them.
+        The result's memory is reused: its entries must be zero before the next call, as Adam leaves them.
         """
         if self._sum is None:
             self._sum = table_memory.table(*table.shape)

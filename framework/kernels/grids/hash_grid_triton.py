@@ -1,8 +1,8 @@
 """Multiresolution hash encoding, in Triton. `nerfloom.kernels.grids.hash_grid` has the reference.
 
-A program takes a block of positions at one level. The gradient of the table is added up by atomic operations: positions
-of a batch are scattered over far more entries than there are processors, but for the coarsest levels. Sums therefore
-depend on the order in which they happen to be formed, by rounding errors.
+A program processes a block of positions at one level. The gradient of the table is accumulated by atomic operations:
+except at the coarsest levels, the positions of a batch are spread over far more entries than there are processors. So
+sums depend on the order of execution, by rounding errors.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
@@ -23,13 +23,13 @@ from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.triton_launch import blocks, launch
 
 BLOCK = 128
-"""Positions that are taken together."""
+"""Positions per program."""
 PRIME_Y, PRIME_Z = tl.constexpr(2654435761), tl.constexpr(805459861)
 
 
 @functools.lru_cache(maxsize=16)
 def _levels(layout: HashGridLayout, device: torch.device) -> Tensor:
-    """Return resolution, first entry, mask of the hash, and 1 if it is dense or else 0 of each level, (L, 4) int64."""
+    """Return resolution, first entry, hash mask, and 1 if dense (otherwise 0) of each level, (L, 4) int64."""
     rows = [
         (resolution, first, layout.offsets[level + 1] - first - 1, int(layout.is_dense(level)))
         for level, (resolution, first) in enumerate(zip(layout.resolutions, layout.offsets[:-1], strict=True))
@@ -39,7 +39,7 @@ def _levels(layout: HashGridLayout, device: torch.device) -> Tensor:
 
 @triton.jit
 def _along(positions, n, here, axis: tl.constexpr, resolution):
-    """Return the cell along an axis, the position in it in [0, 1], and the derivative of that."""
+    """Return the cell along an axis, the position in it in [0, 1], and the derivative of the latter."""
     x = tl.load(positions + n * 3 + axis, mask=here, other=0.0)
     scaled = tl.where(x < 0, 0.0, tl.where(x > 1, 1.0, x)) * resolution.to(tl.float32)  # NaN stays
     cell = tl.minimum(tl.where(scaled == scaled, scaled, 0.0).to(tl.int32), resolution - 1)
@@ -100,7 +100,7 @@ def _backward_table(positions, grad, levels, of_table, count, num_levels, F: tl.
     y, v, _ = _along(positions, n, here, 1, resolution)
     z, w, _ = _along(positions, n, here, 2, resolution)
     g = tl.load(grad + (n[:, None] * num_levels + level) * F + f[None, :], mask=here[:, None], other=0.0)
-    some = here[:, None] & (g != 0)  # what is hidden has no gradient, and needs no writing
+    some = here[:, None] & (g != 0)  # hidden samples have no gradient and need no writing
     for corner in tl.static_range(8):
         weight = _end(u, corner >> 2 & 1) * _end(v, corner >> 1 & 1) * _end(w, corner & 1)
         entry = first + _entry(x, y, z, corner, resolution, mask, dense)

@@ -1,9 +1,9 @@
 // A hash grid at the multisamples of conical frustums: means of features, weighted by scale (Zip-NeRF). See
 // ../multisampled_grid.py for the reference.
 //
-// The points of a sample lie close together, and at most levels some of them, or all, have the same corners. Weights of
-// such a run are added up before an entry is touched: where all 6 points share a cell, 8 entries are read or written
-// instead of 48. Lanes are samples, so that the weights of a run are added up by vectors.
+// The points of a sample lie close together, and at most levels some or all of them have the same corners. The weights
+// of such a run are added up before an entry is accessed: if all 6 points share a cell, 8 entries are read or written
+// instead of 48. Lanes are samples, so that vectors add up the weights of runs.
 #include "grids/hash_grid.h"
 
 #include <memory>
@@ -12,16 +12,16 @@ using namespace grid;
 
 namespace {
 
-constexpr int64_t CHUNK = 256;      // samples that go through all levels together: their points stay in cache
-constexpr float SMALLEST = 0.05f;   // deviation, in cells, below which a weight is 1 in float32
-constexpr size_t NEAR = 1 << 15;    // floats of a level that stay in a near cache, where fetching ahead only takes time
+constexpr int64_t CHUNK = 256;      // samples processed together: their points stay in cache
+constexpr float SMALLEST = 0.05f;   // deviations in cells below this have a weight of 1 in float32
+constexpr size_t NEAR = 1 << 15;    // floats of a level that stay in a near cache, where prefetching does not pay
 
 // One point of each of LANES samples.
 struct Point {
     Floats xyz[3], deviation;
 };
 
-// Fills `out` with the points of `size` samples, `points` being (count, per_sample, 4); `row(s)`: which the s-th is.
+// Fills `out` with the points of `size` samples; `points` is (count, per_sample, 4), and `row(s)` the row of sample s.
 template <typename Row>
 inline void load_points(const float* points, int per_sample, int size, Point* out, const Row& row) {
     for (int j = 0; j < per_sample; j++) {
@@ -56,11 +56,11 @@ inline uint32_t bits_of(Ints lanes) {
     return uint32_t(bits);
 }
 
-// A point's share in the mean over its sample: the weight of the level, over the number of points.
+// A point's weight in the mean over its sample: the weight of the level over the number of points.
 inline Floats share_of(const Level& level, Floats deviation, int per_sample) {
     const Floats cells = deviation * float(level.resolution);
     const Floats equal = splat(1.0f / float(per_sample));
-    const Ints sized = ~(cells < SMALLEST);  // NaN counts, and stays
+    const Ints sized = ~(cells < SMALLEST);  // NaN is included and stays NaN
     return bits_of(sized) ? error_function(0.353553391f / (sized ? cells : splat(SMALLEST))) * equal : equal;
 }
 
@@ -77,7 +77,7 @@ inline Ints have_moved(const Cell& here, const Cell& before) {
     return moved;
 }
 
-// Of the lanes whose bits are set.
+// For the lanes whose bits are set.
 template <int F>
 inline void prefetch(const Cell& cell, uint32_t lanes, const float* entries) {
     for (; lanes; lanes &= lanes - 1)
@@ -85,7 +85,7 @@ inline void prefetch(const Cell& cell, uint32_t lanes, const float* entries) {
             __builtin_prefetch(entries + int64_t(cell.entry[c][__builtin_ctz(lanes)]) * F);
 }
 
-// Whether a level, of F features, is too large to stay in a near cache.
+// Whether a level, with F features, is too large for a near cache.
 template <int F>
 inline bool is_far(const Level& level) {
     return (size_t(level.mask) + 1) * F > NEAR;
@@ -93,8 +93,8 @@ inline bool is_far(const Level& level) {
 
 inline uint32_t first_lanes(int size) { return uint32_t((uint64_t(1) << size) - 1); }
 
-// Calls visit(cell, s) for each run of consecutive points of sample s that have the same corners, whose weights in
-// `cell` are those of the run.
+// Calls visit(cell, s) for each run of consecutive points of sample s with the same corners; the weights in `cell` are
+// the run's.
 template <int F, bool DENSE, typename Visit>
 inline void for_runs(const Level& level, const Point* points, int per_sample, int size, const float* entries,
                      const Visit& visit) {
@@ -122,7 +122,7 @@ inline void for_runs(const Level& level, const Point* points, int per_sample, in
     for (int s = 0; s < size; s++) visit(cells[(per_sample - 1) & 1], s);
 }
 
-// One point a sample: while a block is looked up, the next one's entries are on their way.
+// One point per sample: while a block is looked up, the next block's entries are prefetched.
 template <int F, bool DENSE>
 void forward_level_of_points(const Level& level, const Point* points, const float* table, int64_t begin, int64_t end,
                             float* out, int64_t stride) {
@@ -177,7 +177,7 @@ void forward(const float* positions, int64_t count, int per_sample, const float*
     });
 }
 
-// `grad`: that of this level, (count, F).
+// `grad`: the gradient of this level, (count, F).
 template <int F, bool DENSE>
 void scatter_level(const Level& level, const Point* points, int per_sample, int64_t count, const float* grad,
                    float* table) {
@@ -192,8 +192,8 @@ void scatter_level(const Level& level, const Point* points, int per_sample, int6
         });
 }
 
-// Samples with a gradient, which come in parts, each with its own number of points a sample: which rows they are, points
-// in blocks of LANES samples, and the incoming gradient level by level.
+// Samples with a gradient, collected from parts, each with its own number of points per sample: their rows, points in
+// blocks of LANES samples, and the incoming gradient level by level.
 template <int F>
 struct Gathered {
     struct Part {
@@ -229,7 +229,7 @@ struct Gathered {
             parts.push_back(std::move(part));
         }
     }
-    // Adds a level's gradient to `table`, where that level's first entry stands.
+    // Adds a level's gradient to `table`, which points to that level's first entry.
     void scatter_to(const Level& level, int l, float* table) const {
         const auto run = level.dense ? scatter_level<F, true> : scatter_level<F, false>;
         for (const Part& part : parts)
@@ -237,15 +237,15 @@ struct Gathered {
     }
 };
 
-// Adds the gradient of one level by the points of `count` samples to `out`, which has three sums for each block of
-// points; `grad`: that of the level, (count, F). The points of a run look up once what its corners are worth.
+// Adds the gradient of one level by the points of `count` samples to `out`, with three sums per block of points;
+// `grad`: that of the level, (count, F). The points of a run share one look-up of their corners.
 template <int F, bool DENSE>
 void add_point_gradient(const Level& level, const Point* points, int per_sample, int64_t count, const float* table,
                         const float* grad, Floats (*out)[3]) {
     const float* entries = table + level.offset * F;
     const bool far = is_far<F>(level);
     alignas(64) float value[CORNERS][LANES] = {};
-    Cell cells[2];  // this point's and the next one's, whose entries are on their way meanwhile
+    Cell cells[2];  // this point's and the next one's, which is prefetched
     uint32_t fresh[2];
     for (int64_t n = 0; n < count; n += LANES, points += per_sample) {
         const uint32_t all = first_lanes(block(n, count));
@@ -325,7 +325,7 @@ EXPORT int multisampled_grid_backward_table(const float* const* points, const fl
     });
 }
 
-// Adam on what multisampled_grid_backward_table would add. `touched`: how many entries were updated.
+// Adam on the gradient that multisampled_grid_backward_table would add. `touched`: number of updated entries.
 EXPORT int multisampled_grid_adam(const float* const* points, const float* const* grads, const int64_t* ends,
                                   const int64_t* per_sample, int parts, int features, const int64_t* resolutions,
                                   const int64_t* offsets, int levels, float* values, float* mean, float* square,

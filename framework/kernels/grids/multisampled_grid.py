@@ -1,8 +1,8 @@
 """Hash encoding of conical frustums by a few points in each: Zip-NeRF (Barron et al. 2023), section 3.
 
-The features of a frustum are the mean over its points, each weighted level by level with the share of its Gaussian that
-lies within a cell (`level_weights`). The compiled form computes the mean while it looks up, so that features of single
-points are never stored.
+The features of a frustum are the mean over its points. Each point is weighted per level with the fraction of its
+Gaussian that lies within a cell (`level_weights`). The compiled form computes the mean during the look-up, so features
+of single points are never stored.
 
 Letters: N frustums, J points in each, L levels, F features of an entry.
 """
@@ -44,7 +44,7 @@ def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridL
 
 @lru_cache(maxsize=64)
 def _resolutions(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return cells along an axis (L,); they are kept, since bringing them to a device means to wait for it."""
+    """Return cells along an axis (L,); cached, because a copy to the device waits for it."""
     return torch.tensor(layout.resolutions, dtype=dtype, device=device)
 
 
@@ -59,13 +59,13 @@ LOOK_UP = LookUp("multisampled_grid", "points", ("N", "J", 4), _forward, _backwa
 def multisampled_grid(
     points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None
 ) -> Tensor:
-    """Return the hash encoding of frustums: the mean over their points of features that are weighted by scale.
+    """Return the hash encoding of frustums: the mean over their points of features weighted by scale.
 
     The compiled form has first derivatives only.
 
     Args:
-        points: (N, J, 4) positions, clamped to [0, 1], and standard deviations in units of the cube, through which no
-            gradient goes.
+        points: (N, J, 4) positions, clamped to [0, 1], and standard deviations in units of the cube; the deviations get
+            no gradient.
         table: (E, F) entries of all levels, E = layout.num_entries.
         layout: resolutions and offsets of the levels.
         deferred: collects the gradient of the table in the compiled form, instead of autograd; None for autograd.

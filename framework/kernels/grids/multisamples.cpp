@@ -1,5 +1,5 @@
-// Points in conical frustums, in the unit cube of a grid (Zip-NeRF): several in each, or one ball of its volume. See
-// ../multisamples.py for the references.
+// Points in conical frustums, in the unit cube of a grid (Zip-NeRF): several per frustum, or one ball of its volume.
+// See ../multisamples.py for the references.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -20,7 +20,7 @@ inline Floats root(Floats x) {
     return load(lanes);
 }
 
-// The cube root of x >= 0: a third of the exponent as a first guess, and two steps of Halley's method.
+// The cube root of x >= 0: a third of the exponent as initial guess, and two steps of Halley's method.
 inline Floats cube_root(Floats x) {
     Ints bits;
     std::memcpy(&bits, &x, sizeof bits);
@@ -34,7 +34,7 @@ inline Floats cube_root(Floats x) {
     return x > 0 ? t : x;
 }
 
-// A row of (count, 3) for each lane.
+// A row of (count, 3) per lane.
 inline void load_rows(const float* from, int64_t first, int size, Floats* xyz) {
     alignas(64) float lanes[3][LANES] = {};
     for (int s = 0; s < size; s++)
@@ -55,8 +55,8 @@ inline Floats load_some(const float* from, int64_t first, int size) {
     return load(lanes);
 }
 
-// Divides a position in half edges by its largest coordinate where that exceeds 1, so that squares do not overflow.
-// Returns 1 / max(1, |x|), of which `inverse_norm` is what is left to divide by.
+// Divides a position in half edges by its largest coordinate if that exceeds 1, so that squares do not overflow.
+// Returns 1 / max(1, |x|); `inverse_norm` is the remaining divisor.
 inline Floats shrink(Floats* x, Floats& inverse_norm) {
     const Floats limit = splat(std::numeric_limits<float>::max());
     Floats largest = splat(1);
@@ -96,7 +96,7 @@ inline void contract_backward(Floats* x, Floats* grad) {
         grad[axis] = 0.25f * (inverse * (2.0f - inverse) * grad[axis] - along * x[axis]);
 }
 
-// What rays and intervals say of LANES frustums: middle and half length along the ray, and their ratio and its square.
+// Ray and interval of LANES frustums: middle and half length along the ray, their ratio and its square.
 struct Frustums {
     Floats origin[3], direction[3], start, radius, middle, half, share, squared;
 
@@ -119,7 +119,7 @@ inline Frustums load_frustums(const float* origins, const float* directions, con
     return out;
 }
 
-// Two axes across LANES directions, as in framework.geometry.points.frames.
+// Two axes perpendicular to LANES directions, as in framework.geometry.points.frames.
 struct Across {
     Floats first[3], second[3], sign, a;
 
@@ -130,7 +130,7 @@ struct Across {
         second[0] = xy, second[1] = sign + d[1] * d[1] * a, second[2] = -d[1];
     }
 
-    // Adds the gradient by the directions to `out`; `u` and `v`: those by the two axes.
+    // Adds the gradient by the directions to `out`; `u` and `v`: the gradients by the two axes.
     void backward(const Floats* d, const Floats* u, const Floats* v, Floats* out) const {
         const Floats x = d[0] * a, y = d[1] * a;
         out[0] += sign * (2.0f * x * u[0] + y * u[1] - u[2]) + y * v[0];
@@ -139,7 +139,7 @@ struct Across {
     }
 };
 
-// Where the points of LANES frustums lie along the axis and across it.
+// Positions of the points of LANES frustums along the axis and across it.
 struct Helix {
     Floats start, radius, step, base, spread, cosine, sine, mirror;
 
@@ -151,7 +151,7 @@ struct Helix {
           cosine(load_some(cosines, first, size)), sine(load_some(sines, first, size)),
           mirror(load_some(mirrors, first, size)) {}
 
-    // The distance t of the j-th point, its distance `away` from the axis over the root of 2, and (u, v) across.
+    // The distance t of the j-th point, its distance `away` from the axis over the square root of 2, and (u, v) across.
     void point(int j, Floats& t, Floats& away, Floats& u, Floats& v) const {
         const float along = float(2 * j - (POINTS - 1)) / (POINTS - 1);
         t = start + step * (base + along * spread), away = radius * t * ROOT_HALF;
@@ -182,7 +182,8 @@ struct Map {
             for (int i = 0; i < 4; i++) out[s * stride + i] = lanes[i][s];
     }
 
-    // The gradient by positions x in the scene, from that by what `write` has written, which is `stride` floats apart.
+    // The gradient by positions x in the scene, from that by the values that `write` has written, `stride` floats
+    // apart.
     void read_gradient(Floats* x, int size, const float* from, int stride, Floats* grad) const {
         alignas(64) float lanes[3][LANES] = {};
         for (int s = 0; s < size; s++)
@@ -206,8 +207,8 @@ inline void for_blocks(int64_t count, int threads, const Body& body) {
 }  // namespace
 
 // 6 points (x, y, z, deviation) in each of `count` frustums. `cosines` and `sines` are those of the pattern's rotation,
-// `mirrors` 1 or -1. A position p becomes (p - centre) * scale and, if `contracted`, is contracted from there; a
-// deviation is multiplied by `deviation_scale`, which includes that of the box.
+// `mirrors` are 1 or -1. A position p becomes (p - centre) * scale and is then contracted if `contracted`. A deviation
+// is multiplied by `deviation_scale`, which includes that of the box.
 EXPORT int multisamples(const float* origins, const float* directions, const float* t_starts, const float* t_ends,
                         const float* radii, const float* cosines, const float* sines, const float* mirrors,
                         int64_t count, const float* centre, const float* scale, float deviation_scale, int contracted,
@@ -230,8 +231,8 @@ EXPORT int multisamples(const float* origins, const float* directions, const flo
     });
 }
 
-// The gradients (count, 3) by origins and directions, from `grad` (count, 6, 4) by the points; none goes through
-// deviations. Everything else is as in multisamples.
+// The gradients (count, 3) by origins and directions, from `grad` (count, 6, 4) by the points; deviations have none.
+// The other arguments are as in multisamples.
 EXPORT int multisamples_backward(const float* origins, const float* directions, const float* t_starts,
                                  const float* t_ends, const float* radii, const float* cosines, const float* sines,
                                  const float* mirrors, int64_t count, const float* centre, const float* scale,
@@ -262,7 +263,7 @@ EXPORT int multisamples_backward(const float* origins, const float* directions, 
     });
 }
 
-// (x, y, z, deviation) of the ball that stands for each of `count` frustums; the map is as in multisamples.
+// (x, y, z, deviation) of the equivalent ball of each of `count` frustums; the map is as in multisamples.
 EXPORT int frustum_balls(const float* origins, const float* directions, const float* t_starts, const float* t_ends,
                          const float* radii, int64_t count, const float* centre, const float* scale,
                          float deviation_scale, int contracted, float* out, int threads) {
@@ -273,7 +274,7 @@ EXPORT int frustum_balls(const float* origins, const float* directions, const fl
             const Floats middle = cones.middle, squared = cones.squared;
             const Floats total = 3.0f + squared, part = squared / total;
             const Floats t = cones.mean_t();
-            // Roots of the variances: half^2 and middle^2 would overflow.
+            // Roots of the variances, because half^2 and middle^2 would overflow.
             const Floats along = cones.half * root(1.0f / 3 - (4.0f / 15) * part * (12.0f - squared) / total);
             const Floats across =
                 cones.radius * middle * root(0.25f + (5.0f / 12) * squared - (4.0f / 15) * squared * part);
@@ -285,7 +286,7 @@ EXPORT int frustum_balls(const float* origins, const float* directions, const fl
     });
 }
 
-// The gradients (count, 3) by origins and directions, from `grad` (count, 4) by the balls; none goes through deviations.
+// The gradients (count, 3) by origins and directions, from `grad` (count, 4) by the balls; deviations have none.
 EXPORT int frustum_balls_backward(const float* origins, const float* directions, const float* t_starts,
                                   const float* t_ends, const float* radii, int64_t count, const float* centre,
                                   const float* scale, int contracted, const float* grad, float* by_origins,

@@ -1,4 +1,4 @@
-"""Conical frustums in the unit cube of a grid, as six points of each, or as one ball: Zip-NeRF (Barron et al. 2023).
+"""Conical frustums in the unit cube of a grid, each as six points or as one ball: Zip-NeRF (Barron et al. 2023).
 
 Letters: N frustums, J points in each.
 """
@@ -30,7 +30,7 @@ def unit_balls(positions: Tensor, deviations: Tensor, box: Tensor, contracted: b
 
     Args:
         positions: (..., 3) means, scene coordinates.
-        deviations: (...) standard deviations, scene units, through which no gradient goes.
+        deviations: (...) standard deviations, scene units; without a gradient.
         box, contracted: as in `unit_multisamples`.
 
     Returns:
@@ -54,13 +54,13 @@ def unit_multisamples(frustums: Frustums, pattern: Pattern, box: Tensor, contrac
 
     Args:
         frustums: N frustums.
-        pattern: how the points lie in each of them.
+        pattern: arrangement of the points in each frustum.
         box: (2, 3) corners of the scene's box.
-        contracted: whether all of space is contracted into the cube, as `contract_to_unit` does; otherwise the box
+        contracted: whether all of space is contracted into the cube, as in `contract_to_unit`; otherwise the box
             becomes the cube.
 
     Returns:
-        (N, 6, 4) positions and isotropic standard deviations; no gradient goes through the deviations.
+        (N, 6, 4) positions and isotropic standard deviations; the deviations have no gradient.
     """
     tensors = frustums.origins, frustums.directions, frustums.t_starts, frustums.t_ends, frustums.radii, box
     return UNIT_MULTISAMPLES((*tensors, *pattern), frustums, pattern, box, contracted)
@@ -86,7 +86,7 @@ def frustum_balls_reference(frustums: Frustums, box: Tensor, contracted: bool) -
 
 
 def ball_deviations(along: Tensor, across: Tensor) -> Tensor:
-    """Return the standard deviation (N,) of balls of the volume of Gaussians.
+    """Return the standard deviation (N,) of balls with the volume of given Gaussians.
 
     Args:
         along, across: (N,) variance along an axis and across it.
@@ -97,8 +97,8 @@ def ball_deviations(along: Tensor, across: Tensor) -> Tensor:
 def frustum_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
     """Return a ball for each of N conical frustums, mapped to the unit cube, with its standard deviation.
 
-    It is the isotropic Gaussian with the mean and the volume of the frustum's own (Mip-NeRF, equation 7); its deviation
-    is scaled by the cube root of the determinant of the map's Jacobian (`bounds.contraction_scale`).
+    It is the isotropic Gaussian with the mean and the volume of the frustum's Gaussian (Mip-NeRF, equation 7). Its
+    deviation is scaled by the cube root of the determinant of the map's Jacobian (`bounds.contraction_scale`).
 
     Args:
         frustums: N frustums.
@@ -106,7 +106,7 @@ def frustum_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
         contracted: whether all of space is contracted into the cube, as in `unit_multisamples`.
 
     Returns:
-        (N, 4) positions and standard deviations; no gradient goes through the deviations.
+        (N, 4) positions and standard deviations; the deviations have no gradient.
     """
     tensors = frustums.origins, frustums.directions, frustums.t_starts, frustums.t_ends, frustums.radii, box
     return FRUSTUM_BALLS(tensors, frustums, box, contracted)
@@ -136,7 +136,7 @@ class _Map(NamedTuple):
     @classmethod
     def of(cls, box: Tensor, contracted: bool, deviation: float) -> _Map:
         half = (box[1] - box[0]) / 2
-        # What is contracted is in half edges from the centre, everything else in edges from the corner.
+        # Contracted positions are in half edges from the centre, all others in edges from the corner.
         centre, scale = ((box[0] + box[1]) / 2, 1 / half) if contracted else (box[0].clone(), 0.5 / half)
         smaller = (half.prod() ** (1 / 3)).item() * (4 if contracted else 2)
         return cls(centre, scale, deviation / smaller, contracted)
@@ -146,13 +146,13 @@ class _Map(NamedTuple):
 
 
 def _addresses(count: int, origins: Tensor, directions: Tensor, *columns: Tensor) -> list[int]:
-    """Return the addresses of what describes N = `count` frustums: (N, 3) rays, and numbers (N,)."""
+    """Return the addresses of the description of N = `count` frustums: (N, 3) rays, and numbers (N,)."""
     rows = [native.pointer(x, "rays", (count, 3)) for x in (origins, directions)]
     return rows + [native.pointer(x, "frustums", (count,)) for x in columns]
 
 
 class _InCube(torch.autograd.Function):
-    """Points and balls that stand for N frustums in the unit cube, with the gradient by the rays of the frustums."""
+    """Points and balls for N frustums in the unit cube, with the gradient by the rays of the frustums."""
 
     @staticmethod
     def forward(

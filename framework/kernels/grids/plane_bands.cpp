@@ -1,5 +1,5 @@
-// The mean squared difference of neighbours along each axis of bands of rows, summed over both axes. See
-// ../../plane_bands.py. `shapes` holds for each band its first entry, its number of rows and the entries of a row.
+// The mean squared difference of neighbours along each axis in bands of rows, summed over both axes. See
+// ../../plane_bands.py. `shapes` has for each band its first entry, its number of rows and the entries per row.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -36,7 +36,7 @@ inline void add_differences(const float* __restrict a, const float* __restrict b
     for (int64_t i = 0; i < count; i++) to[i] += weight * (a[i] - b[i]);
 }
 
-// body(band, row, number of the row among all) for each row of each band, shared out over threads.
+// body(band, row, index of the row over all bands) for each row of each band, distributed over threads.
 template <typename Body>
 void for_rows(int threads, int bands, const int64_t* shapes, const Body& body) {
     std::vector<int64_t> ends;
@@ -56,7 +56,7 @@ EXPORT int band_variation(const float* table, int features, int bands, const int
     return guarded([&] {
         int64_t count = 0;
         for (int band = 0; band < bands; band++) count += rows_of(shapes, band).rows;
-        std::vector<double> sums(count);  // of each row, so that the order of sums never changes
+        std::vector<double> sums(count);  // per row, so that the order of sums never changes
         for_rows(threads, bands, shapes, [&](int64_t band, int64_t row, int64_t item) {
             const Rows of = rows_of(shapes, band);
             const int64_t width = of.across * features;
@@ -75,7 +75,7 @@ EXPORT int band_variation(const float* table, int features, int bands, const int
     });
 }
 
-// Adds to `table_grad`. Each row adds to its own entries alone.
+// Adds to `table_grad`. Each row adds only to its own entries.
 EXPORT int band_variation_backward(const float* table, int features, int bands, const int64_t* shapes,
                                    const float* grad, float* table_grad, int threads) {
     return guarded([&] {

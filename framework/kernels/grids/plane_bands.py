@@ -1,7 +1,7 @@
-"""Bands of rows of factors, and how much they vary: what regularisers read of a table that is large.
+"""Bands of rows of factors, and their variation, for regularisers of large tables.
 
-A regulariser that read all of a table in every step would take longer than the step. The mean over a band of rows at a
-random place is an estimate of it without bias.
+Reading all of a table in every step would take a regulariser longer than the step itself. The mean over a band of rows
+at a random position is an unbiased estimate.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Shape = tuple[int, int, int]
 
 
 class _Band(torch.autograd.Function):
-    """Rows of a table, whose gradient is deferred; the table is the only input with a gradient."""
+    """Rows of a table, with a deferred gradient; the table is the only input with a gradient."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, shape: Shape, deferred: PlanesGradient) -> Tensor:
@@ -93,7 +93,7 @@ def plane_bands(
         table: (E, F) entries of all factors.
         layout: axes, resolutions and offsets of the factors.
         bands: group, factor in the group, first row and number of rows of each band; rows are along the second axis.
-        deferred: collects the gradient of the table on the CPU, instead of autograd, as in `planes`; None for autograd.
+        deferred: collects the gradient of the table on the CPU instead of autograd, as in `planes`; None for autograd.
 
     Returns:
         (rows, vertices along the first axis, F) entries of each band.
@@ -110,7 +110,7 @@ def _shapes(layout: PlanesLayout, bands: Sequence[Band]) -> tuple[Shape, ...]:
 
 
 def squared_steps(band: Tensor, dim: int) -> Tensor:
-    """Return the mean squared difference () of neighbours along an axis; 0 if there is only one entry.
+    """Return the mean squared difference () of neighbours along an axis; 0 for a single entry.
 
     Args:
         band: values of a factor, or of some of its rows.
@@ -133,7 +133,7 @@ _backward = native.Function("band_variation_backward", "piipppi")
 
 
 class _Variation(torch.autograd.Function):
-    """The compiled form of `band_variation`, whose gradient is deferred: no difference is ever written to memory."""
+    """The compiled form of `band_variation`, with a deferred gradient: no difference is ever written to memory."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, shapes: tuple[Shape, ...], deferred: PlanesGradient) -> Tensor:
@@ -158,8 +158,8 @@ def add_variation_gradient(total: Tensor, table: Tensor, shapes: tuple[Shape, ..
     """Add the gradient of `band_variation` to a table of gradients.
 
     Args:
-        total: (E, F) gradients of all entries, to which is added.
-        table: (E, F) the entries.
+        total: (E, F) gradients of all entries; the result is added to it.
+        table: (E, F) entries.
         shapes: the K bands.
         grad: (K,) gradients of their variation.
     """
@@ -191,6 +191,6 @@ def band_variation(
         table: (E, F) entries of all factors.
         layout: axes, resolutions and offsets of the factors.
         bands: group, factor in the group, first row and number of rows of each band.
-        deferred: collects the gradient of the table in the compiled form, instead of autograd; None for autograd.
+        deferred: collects the gradient of the table in the compiled form instead of autograd; None for autograd.
     """
     return BAND_VARIATION((table,), table, _shapes(layout, bands), deferred)

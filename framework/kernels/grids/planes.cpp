@@ -1,6 +1,6 @@
 // Factorised features: look-ups in planes and lines, multiplied (K-Planes, TensoRF). See ../../planes.py.
 //
-// An entry is a row of features, so that a corner is one or two cache lines and every product a whole vector.
+// An entry is a row of features, so that a corner takes one or two cache lines and every product is a whole vector.
 #include "runtime/common.h"
 
 #include <initializer_list>
@@ -24,7 +24,7 @@ constexpr int size_of() { return int(sizeof(V) / sizeof(float)); }
 
 struct Layout {
     int dims, features, scales, planes;
-    const int64_t* axes;         // (scales, planes, 2) the two axes of each plane; of a line the second is -1
+    const int64_t* axes;         // (scales, planes, 2) the two axes of each plane; for a line the second is -1
     const int64_t* resolutions;  // (scales, dims)
     const int64_t* offsets;      // (scales, planes) first entry
 
@@ -37,11 +37,11 @@ struct Layout {
     }
 };
 
-// Where a position falls on a plane: the entry of its cell's first corner, and the fractions along both axes.
+// The cell of a position on a plane: the entry of its first corner, and the fractions along both axes.
 struct Place {
-    int64_t first, up;  // `up` entries further along the second axis, if any; the next along the first is next door
+    int64_t first, up;  // `up`: entries to the next along the second axis, if any; along the first it is adjacent
     float a, b;
-    float inside_a, inside_b;  // cells along the axis, or 0 where the position was moved to the face
+    float inside_a, inside_b;  // cells along the axis, or 0 if the position was clamped
 };
 
 inline void along(float x, int64_t resolution, int64_t& cell, float& fraction, float& inside) {
@@ -89,7 +89,7 @@ template <typename V>
 void forward(const Layout& layout, const float* positions, int64_t count, const float* table, float* out, int threads) {
     const int F = layout.features, P = layout.planes;
     const int64_t width = int64_t(layout.scales) * F;
-    constexpr int64_t CHUNK = 512;  // samples that go through a scale together: its planes stay in cache
+    constexpr int64_t CHUNK = 512;  // samples processed together: a scale's planes stay in cache
     for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
         for (int s = 0; s < layout.scales; s++) {
             Place at[2][MAX_PLANES];
@@ -113,11 +113,11 @@ void forward(const Layout& layout, const float* positions, int64_t count, const 
     });
 }
 
-// Values of all planes, and the incoming gradient times the product of all others but each.
+// Values of all planes, and the incoming gradient times the product of all planes but each one.
 template <typename V>
 inline void factors(const Layout& layout, const Place* at, const float* table, int c, V grad, V* others) {
     const int P = layout.planes;
-    if (P < 1) __builtin_unreachable();  // a Layout has one or more, which the compiler does not know
+    if (P < 1) __builtin_unreachable();  // tells the compiler that a Layout has one or more
     V value[MAX_PLANES];
     for (int p = 0; p < P; p++) value[p] = blend<V>(at[p], table + at[p].first * layout.features + c, layout.features);
     V before = grad;
@@ -142,7 +142,7 @@ inline void scatter(const Place& at, float* corner, int features, V grad) {
     put<V>(above + features, get<V>(above + features) + high * at.a);
 }
 
-// The next sample from n on with a gradient, whose vectors stand `width` apart; end if there is none.
+// The next sample from n on with a gradient; its vectors are `width` apart. end if there is none.
 template <typename V>
 inline int64_t next_live(const float* grad, int64_t width, int64_t n, int64_t end) {
     for (; n < end; n++) {
@@ -156,8 +156,8 @@ inline int64_t next_live(const float* grad, int64_t width, int64_t n, int64_t en
     return n;
 }
 
-// Scales and vectors of features are shared out over threads, so that no two write to the same place and the order of
-// sums never changes.
+// Scales and vectors of features are distributed over threads, so that no two write to the same location and the order
+// of sums never changes.
 template <typename V>
 void backward_table(const Layout& layout, const float* positions, int64_t count, const float* table, const float* grad,
                     float* table_grad, int threads) {
@@ -165,7 +165,7 @@ void backward_table(const Layout& layout, const float* positions, int64_t count,
     const int parts = F / lanes, units = layout.scales * parts;
     const int64_t width = int64_t(layout.scales) * F;
     for_each(threads, units, 1, [&](int64_t unit) {
-        const int s = layout.scales - 1 - int(unit) / parts, c = int(unit) % parts * lanes;  // the slowest first
+        const int s = layout.scales - 1 - int(unit) / parts, c = int(unit) % parts * lanes;  // slowest first
         Place at[2][MAX_PLANES];
         const auto find = [&](int64_t n, Place* found) {
             for (int p = 0; p < P; p++) {

@@ -25,7 +25,7 @@ from nerfloom.kernels.grids.planes_layout import PlanesLayout as PlanesLayout
 from nerfloom.kernels.triton_backend import later
 
 MAX_HELD = 2**26
-"""Maximum number of features at corners that the form in few operations holds at once; it takes positions in parts."""
+"""Maximum number of corner features held at once in the form with few operations; it processes positions in parts."""
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
@@ -72,11 +72,11 @@ _backward_positions = native.Function("planes_backward_positions", "pqp" + _TAIL
 class PlanesGradient:
     """The deferred gradient of a table: gradients of look-ups, collected in backward passes and not yet accumulated.
 
-    A step uses few entries. The gradient is accumulated in a table that is kept between steps, in which Adam sets the
-    entries that were used to zero.
+    A step uses few entries. The gradient is accumulated in a table kept between steps; Adam resets the used entries to
+    zero.
 
     Args:
-        layout: axes, resolutions and offsets of the factors that are looked up: all of the table's, or the first ones.
+        layout: axes, resolutions and offsets of the factors in use: all of the table's, or the first ones.
     """
 
     def __init__(self, layout: PlanesLayout) -> None:
@@ -84,9 +84,9 @@ class PlanesGradient:
         self.parts: Parts = []
         """Positions (N, D) of each look-up, and gradient (N, G * F) of its result."""
         self.bands: list[tuple[int, Tensor]] = []
-        """Index of the first entry, and gradient (B, F), of each band of entries that `plane_bands` has read."""
+        """Index of the first entry, and gradient (B, F), of each band of entries read by `plane_bands`."""
         self.variations: list[tuple[tuple[Shape, ...], Tensor]] = []
-        """Bands of which `band_variation` was computed, and gradient (K,) of its result."""
+        """Bands passed to `band_variation`, and gradient (K,) of its result."""
         self._sum: Tensor | None = None
 
     @property
@@ -106,7 +106,7 @@ class PlanesGradient:
         self.variations.clear()
 
     def relayout(self, layout: PlanesLayout) -> None:
-        """Change the layout of the table to `layout`, and discard the gradient."""
+        """Change the layout of the table to `layout` and discard the gradient."""
         self.clear()
         self.layout, self._sum = layout, None
 
@@ -121,9 +121,9 @@ class PlanesGradient:
         return sparse_adam(table, self.summed(table), mean, square, seen, rate, betas, eps)
 
     def summed(self, table: Tensor) -> Tensor:
-        """Return the accumulated gradient (E, F) of `table`, and discard it.
+        """Return the accumulated gradient (E, F) of `table` and discard it.
 
-        The result's memory is used again: its entries must be zero before the next call, as Adam leaves them.
+        The result's memory is reused: its entries must be zero before the next call, as Adam leaves them.
         """
         if self._sum is None:
             self._sum = table_memory.table(*table.shape)
@@ -207,7 +207,7 @@ def planes(
         positions: (N, D); coordinates are clamped to [0, 1].
         table: (E, F) entries of all factors, E = layout.num_entries.
         layout: axes, resolutions and offsets of the factors.
-        deferred: collects the gradient of the table in the compiled form, instead of autograd; None for autograd.
+        deferred: collects the gradient of the table in the compiled form instead of autograd; None for autograd.
 
     Returns:
         (N, G * F) features, group by group.
@@ -243,14 +243,14 @@ PLANES.implementation(TRITON)(later("grids.planes_triton", "planes"))
 
 
 class _Factors(NamedTuple):
-    """Constants of all P factors on a device, in the shapes in which they are combined with positions (2 P, N)."""
+    """Constants of all P factors on a device, shaped for operations with positions (2 P, N)."""
 
     axes: Tensor
     """(2 P,) int64 first axes of all factors, then their second axes; a line has its only axis twice."""
     cells: Tensor
     """(2 P, 1) number of cells along these axes."""
     planes: Tensor
-    """(P, 1) 1 for planes and 0 for lines, along whose second axis nothing changes."""
+    """(P, 1) 1 for planes and 0 for lines, which are constant along their second axis."""
     offsets: Tensor
     """(P, 1, 1, 1) int64 index of the first entry."""
     strides: Tensor
@@ -261,7 +261,7 @@ class _Factors(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _factors(layout: PlanesLayout, dtype: torch.dtype, device: torch.device) -> _Factors:
-    """Return the constants; they are kept, since bringing them to a device means to wait for it."""
+    """Return the constants; cached, because a copy to the device waits for it."""
     factors = [(sizes, along) for sizes, group in zip(layout.resolutions, layout.axes, strict=True) for along in group]
     pairs = [(along[0], along[-1]) for _, along in factors]
     axes = [first for first, _ in pairs] + [second for _, second in pairs]
@@ -298,7 +298,7 @@ def _at_all_factors(positions: Tensor, table: Tensor, layout: PlanesLayout) -> T
     second = second * constants.planes
     along, beside = (torch.stack([1 - fraction, fraction], 1) for fraction in (first, second))
     weights = beside[:, :, None] * along[:, None]
-    # By index_select, whose gradient is added up in place; that of table[entries] is sorted first on a GPU.
+    # By index_select, whose gradient is added in place; on a GPU that of table[entries] is sorted first.
     corners = table.index_select(0, entries.flatten()).view(len(constants.offsets), 4, len(positions), table.shape[1])
     values = (corners * weights.flatten(1, 2)[..., None]).sum(1).unflatten(0, (layout.num_groups, -1))
     product, *others = values.unbind(1)

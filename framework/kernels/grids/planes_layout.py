@@ -1,4 +1,4 @@
-"""The layout of factorised features: which planes and lines there are, and where their entries stand in one table."""
+"""The layout of factorised features: planes and lines, and the positions of their entries in one table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_VERTICES = 2**20
 
 @dataclass(frozen=True)
 class PlanesLayout:
-    """Axes, resolution and entries of each factor, in one table (E, F) that all factors share.
+    """Axes, resolution and entries of each factor, in one table (E, F) shared by all factors.
 
     Raises:
         ConfigError: if the numbers are inconsistent or out of range; the kernels rely on them.
@@ -42,7 +42,7 @@ class PlanesLayout:
             for along, first in zip(group, firsts, strict=True):
                 last = first + math.prod(sizes[axis] for axis in along)
                 if not 0 <= first < last <= self.num_entries:
-                    raise ConfigError(f"planes of {self.num_entries} entries have no entries {first} to {last}")
+                    raise ConfigError(f"planes with {self.num_entries} entries have no entries {first} to {last}")
 
     @classmethod
     def build(
@@ -70,7 +70,7 @@ class PlanesLayout:
         return cls(resolutions, axes, tuple(offsets), total)
 
     def first(self, count: int) -> PlanesLayout:
-        """Return the layout of the first `count` groups, 1 or more, whose entries stand first in the table."""
+        """Return the layout of the first `count` groups, 1 or more; their entries come first in the table."""
         return _first(self, count)
 
     @property
@@ -84,7 +84,7 @@ class PlanesLayout:
         return len(self.resolutions)
 
     def shape(self, group: int, index: int) -> tuple[int, int]:
-        """Return the vertices along the second axis, 1 for a line, and the first axis of factor `index` of `group`."""
+        """Return the vertices along the second axis (1 for a line) and the first axis of factor `index` of `group`."""
         sizes = [self.resolutions[group][axis] for axis in self.axes[group][index]]
         return (sizes[1] if len(sizes) == 2 else 1), sizes[0]
 
@@ -93,8 +93,8 @@ class PlanesLayout:
 
         Args:
             table: (E, F) entries of all factors.
-            group: number of the group.
-            index: number of the factor in the group.
+            group: index of the group.
+            index: index of the factor in the group.
 
         Returns:
             (vertices along the second axis, or 1, vertices along the first axis, F) entries.
@@ -119,7 +119,7 @@ def _first(layout: PlanesLayout, count: int) -> PlanesLayout:
 
 
 def _check_factors(resolutions: tuple[tuple[int, ...], ...], axes: tuple[tuple[tuple[int, ...], ...], ...]) -> None:
-    """Check vertices and axes, on which the kernels rely; a ConfigError says what is wrong."""
+    """Check vertices and axes, which the kernels rely on; raise ConfigError if they are invalid."""
     dims = {len(scale) for scale in resolutions}
     if len(dims) != 1 or not dims <= {2, 3, 4} or len(resolutions) > MAX_GROUPS:
         groups = f"{len(resolutions)} groups of {sorted(dims)} axes"

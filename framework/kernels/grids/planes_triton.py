@@ -1,7 +1,7 @@
 """Factorised features, in Triton. `nerfloom.kernels.grids.planes` has the reference.
 
-A program takes a block of positions in one group of factors, with all features. The gradient of the table is added up
-by atomic operations, so that its rounding errors depend on the order in which they happen to run.
+A program processes a block of positions in one group of factors, with all features. The gradient of the table is
+accumulated by atomic operations, so its rounding errors depend on the order of execution.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
@@ -21,7 +21,7 @@ from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout
 from nerfloom.kernels.triton_launch import blocks, launch
 
 BLOCK = 32
-"""Positions that are taken together."""
+"""Positions per program."""
 
 
 @functools.lru_cache(maxsize=16)
@@ -40,7 +40,7 @@ def _factors(layout: PlanesLayout, device: torch.device) -> Tensor:
 
 @triton.jit
 def _along(positions, n, here, dims, axis, size):
-    """Return the cell along an axis, the position in it in [0, 1], and the derivative of that."""
+    """Return the cell along an axis, the position in it in [0, 1], and the derivative of the latter."""
     x = tl.load(positions + n * dims + axis, mask=here, other=0.0)
     cells = (size - 1).to(tl.float32)
     scaled = tl.where(x < 0, 0.0, tl.where(x > 1, 1.0, x)) * cells  # NaN stays
@@ -88,7 +88,7 @@ def _forward(
 
 @triton.jit
 def _others(positions, table, grad, factors, n, f, dims, features, mask, here, p, P: tl.constexpr):
-    """Return the incoming gradient times the features of all factors of a group but number `p`."""
+    """Return the incoming gradient times the features of all factors of a group except factor `p`."""
     product = grad
     for q in range(P):
         if q != p:
@@ -107,7 +107,7 @@ def _backward_table(
     here = n < count
     mask = here[:, None] & (f < features)[None, :]
     g = tl.load(grad + (n[:, None] * groups + group) * features + f[None, :], mask=mask, other=0.0)
-    mask &= g != 0  # what is hidden has no gradient, and needs no reading
+    mask &= g != 0  # hidden samples have no gradient and need no reading
     factors += group * P * 6
     for p in range(P):
         own = _others(positions, table, g, factors, n, f, dims, features, mask, here, p, P)

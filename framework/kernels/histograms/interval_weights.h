@@ -1,4 +1,4 @@
-// Weights of a ray's intervals (NeRF, equation 3), with the exponentials of a whole vector at once.
+// Weights of a ray's intervals (NeRF, equation 3), with vectorised exponentials.
 #pragma once
 
 #include "runtime/common.h"
@@ -7,7 +7,7 @@
 
 class Weights {
     int64_t bins;
-    std::vector<float> before, here;  // of each interval: the optical depth in front of it, and its own
+    std::vector<float> before, here;  // of each interval: optical depth in front of it, and its own
 
 public:
     explicit Weights(int64_t bins)

@@ -1,5 +1,5 @@
-// What proposal sampling does with the histograms of rays, and the contraction of space. See ../intervals.py and
-// ../contraction.py for the references and the equations.
+// Histograms of rays in proposal sampling, and the contraction of space. See ../intervals.py and ../contraction.py for
+// the references and the equations.
 #include "encodings/contraction.h"
 #include "histograms/interval_weights.h"
 
@@ -39,8 +39,8 @@ EXPORT int interval_weights_backward(const float* sigma, const float* t, const f
     });
 }
 
-// count + 1 new edges a ray, at the quantiles (j + shift) / (count + 1) of the histogram whose bins weigh
-// weight^power + padding.
+// count + 1 new edges per ray, at the quantiles (j + shift) / (count + 1) of the histogram with weights weight^power +
+// padding.
 EXPORT int resample_intervals(const float* edges, const float* weights, const float* shift, int64_t rays, int64_t bins,
                               int64_t count, float power, float padding, float* out, int threads) {
     return guarded([&] {
@@ -58,7 +58,7 @@ EXPORT int resample_intervals(const float* edges, const float* weights, const fl
                     const double u = total * (j + double(shift[r])) / (count + 1);
                     while (bin < bins - 1 && cdf[bin + 1] <= u) bin++;
                     const double width = cdf[bin + 1] - cdf[bin];
-                    // Comparisons and the operands' order let NaN through, so that it is seen in the edges.
+                    // Comparisons and the order of operands let NaN through, so that it appears in the edges.
                     const double share = width <= 0 ? 0.0 : std::min(std::max((u - cdf[bin]) / width, 0.0), 1.0);
                     out[r * (count + 1) + j] = float(edge[bin] + share * (double(edge[bin + 1]) - edge[bin]));
                 }
@@ -68,7 +68,7 @@ EXPORT int resample_intervals(const float* edges, const float* weights, const fl
 }
 
 // Per ray sum_i max(0, w_i - bound_i)^2 / (w_i + eps), where bound_i is the weight of all proposed bins that touch
-// interval i; and its gradient with respect to the proposed weights.
+// interval i; and its gradient by the proposed weights.
 EXPORT int proposal_excess(const float* edges, const float* weights, int64_t bins, const float* proposed_edges,
                            const float* proposed_weights, int64_t proposed_bins, int64_t rays, float eps, float* loss,
                            float* grad, int threads) {
@@ -119,8 +119,8 @@ float from_disparity(float s) {
 
 }  // namespace
 
-// Normalised distances (rays, count) between the near and the far end of each ray to distances: linear if scale is 0,
-// else in disparity beyond that distance. See ../spacing.py.
+// Converts normalised distances (rays, count) between the near and the far end of each ray to distances: linear if
+// scale is 0, otherwise in disparity beyond that distance. See ../spacing.py.
 EXPORT int spaced_distances(const float* edges, const float* nears, const float* fars, int64_t rays, int64_t count,
                             float scale, float* out, int threads) {
     return guarded([&] {
@@ -137,8 +137,8 @@ EXPORT int spaced_distances(const float* edges, const float* nears, const float*
     });
 }
 
-// Positions (count, 3) to [0, 1]^3: those within half an edge of the centre as they are, all others contracted into the
-// ball of radius 2.
+// Positions (count, 3) to [0, 1]^3: those within half an edge of the centre are unchanged, all others contracted into
+// the ball of radius 2.
 EXPORT int contract_positions(const float* positions, const float* centre, const float* scale, int64_t count,
                               float* out, int threads) {
     return guarded([&] {
@@ -149,8 +149,8 @@ EXPORT int contract_positions(const float* positions, const float* centre, const
     });
 }
 
-// With n = max(1, |x|) and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n, whose second part is 0
-// where n is 1.
+// With n = max(1, |x|) and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n. The second term is 0 if
+// n is 1.
 EXPORT int contract_positions_backward(const float* positions, const float* centre, const float* scale,
                                        const float* grad, int64_t count, float* out, int threads) {
     return guarded([&] {

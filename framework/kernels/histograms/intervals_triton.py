@@ -1,7 +1,7 @@
 """Histograms along rays, in Triton. `nerfloom.kernels.histograms.intervals` has the references.
 
-A program takes a ray, in blocks of bins. Sums of weights of which differences are taken are float64, as are the
-differences; the bins of a value are found by bisection of them.
+A program processes a ray, in blocks of bins. Sums of weights that are subtracted are float64, as are their differences;
+the bin of a value is found by bisection of the sums.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
@@ -20,7 +20,7 @@ from nerfloom.kernels.histograms.intervals import EPS
 from nerfloom.kernels.triton_launch import depth_slope, launch, on_device, opacity_of, optical_depth
 
 BLOCK = 64
-"""Bins of a ray that are taken together, by one warp."""
+"""Bins of a ray processed together, by one warp."""
 
 
 @triton.jit
@@ -33,7 +33,7 @@ def _weights(sigma, t, weights, bins, BLOCK: tl.constexpr):
     for first in range(0, bins, BLOCK):
         i = first + tl.arange(0, BLOCK)
         here = i < bins
-        before = here & (i > 0)  # of the neighbour in front
+        before = here & (i > 0)  # for the neighbour in front
         edge = tl.load(t + i, mask=here, other=0.0)
         tau = optical_depth(tl.load(sigma + i, mask=here, other=0.0), tl.load(t + i + 1, mask=here, other=0.0) - edge)
         length = tl.where(before, edge - tl.load(t + i - 1, mask=before, other=0.0), 0.0)
@@ -99,7 +99,7 @@ def interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
 
 @triton.jit
 def _sums(values, sums, count, power, padding, BLOCK: tl.constexpr):
-    """Write the sums of values^power + padding up to each value, in float64; return that of all."""
+    """Write the sums of values^power + padding up to each value, in float64; return the total."""
     total = tl.full([], 0.0, tl.float64)
     for first in range(0, count, BLOCK):
         i = first + tl.arange(0, BLOCK)
@@ -110,13 +110,13 @@ def _sums(values, sums, count, power, padding, BLOCK: tl.constexpr):
         heavy = tl.where(here, raised.to(tl.float64) + padding, 0.0)
         tl.store(sums + i, total + tl.cumsum(heavy, 0), mask=here)
         total += tl.sum(heavy, 0)
-    tl.debug_barrier()  # any thread may read what these have written
+    tl.debug_barrier()  # any thread may read these values
     return total
 
 
 @triton.jit
 def _preceding(values, bound, most, steps, AT: tl.constexpr):
-    """Return how many of the first `most` of sorted values are below a bound, or, with AT, not above it."""
+    """Return the number of the first `most` sorted values that are below a bound or, with AT, not above it."""
     low = tl.zeros_like(bound).to(tl.int32)
     high = low + most
     for _ in range(steps):
@@ -145,7 +145,7 @@ def _resample(edges, weights, shift, power, sums, out, bins, count, padding, ste
         place = _preceding(sums, u, bins - 1, steps, True)
         low = tl.load(sums + place - 1, mask=place > 0, other=0.0)
         width = tl.load(sums + place) - low
-        # Comparisons let NaN through, so that it is seen in the edges.
+        # Comparisons let NaN through, so that it appears in the edges.
         share = (u - low) / tl.where(width <= 0, 1.0, width)
         share = tl.where(width <= 0, 0.0, tl.where(share < 0, 0.0, tl.where(share > 1, 1.0, share)))
         start, end = tl.load(edges + place).to(tl.float64), tl.load(edges + place + 1).to(tl.float64)
@@ -200,7 +200,7 @@ def _excess(
         tl.store(scaled_sums + i, running + tl.cumsum(scaled, 0), mask=here)
         running += tl.sum(scaled, 0)
     tl.store(loss + ray, spread.to(tl.float32))
-    tl.debug_barrier()  # any thread may read what these have written
+    tl.debug_barrier()  # any thread may read these values
     for first in range(0, proposed_bins, BLOCK):
         j = first + tl.arange(0, BLOCK)
         here = j < proposed_bins

@@ -20,7 +20,7 @@ def inverse_cdf(edges: Tensor, weights: Tensor, u: Tensor, padding: float = 1e-5
     """
     weights = weights.to(torch.promote_types(weights.dtype, edges.dtype)) + padding
     cdf = torch.cumsum(weights / weights.sum(-1, keepdim=True), dim=-1)
-    # Rounding errors leave the last value about 1e-7 from 1, so it is set to exactly 1.
+    # Rounding leaves the last value about 1e-7 from 1, so it is set to exactly 1.
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf[:, :-1].clamp(max=1), torch.ones_like(cdf[:, :1])], dim=-1)
     above = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, weights.shape[-1])
     low, high = cdf.gather(-1, above - 1), cdf.gather(-1, above)

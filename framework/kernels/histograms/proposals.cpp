@@ -6,13 +6,13 @@
 
 namespace {
 
-constexpr int64_t SAMPLES = grid::CHUNK;  // of a block, about
+constexpr int64_t SAMPLES = grid::CHUNK;  // in a block, about
 
 }  // namespace
 
-// Distances t (rays, bins + 1) along rays; the density in the middle of each interval is as in trace_rays. Writes weights
-// (rays, bins), or for the way back, if they are null: unit (N, 3), features (N, E), outputs (N, D) and density (N), with
-// N = rays * bins.
+// Distances t (rays, bins + 1) along rays; the density in the middle of each interval is as in trace_rays. Writes
+// weights (rays, bins). If these are null, it writes values for the backward pass: unit (N, 3), features (N, E),
+// outputs (N, D) and density (N), with N = rays * bins.
 EXPORT int proposal_weights(const float* origins, const float* directions, const float* t, int64_t rays, int64_t bins,
                             const float* scale, const float* shift, const float* around, const float* table, int features,
                             const int64_t* resolutions, const int64_t* offsets, int levels, const int64_t* widths,

@@ -1,9 +1,9 @@
 """Weights of a proposal along rays, in one compiled call.
 
-A proposal is a small network on a hash grid, whose density is evaluated in many intervals of each ray, only to draw the
-intervals of the next level from its weights. In single operations most of what that writes to memory (positions, their
-contraction, features, outputs) is read once. The compiled form takes a block of rays through all of it in cache
-(`kernels/histograms/proposals.cpp`). In steps in which the proposal learns, it also writes what the way back needs.
+A proposal is a small network on a hash grid. Its density is evaluated in many intervals of each ray, only to draw the
+intervals of the next level from its weights. In single operations most intermediate values (positions, their
+contraction, features, outputs) are written to memory and read once. The compiled form processes a block of rays in
+cache (`kernels/histograms/proposals.cpp`). In steps in which the proposal learns, it also writes what the backward pass needs.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from nerfloom.kernels.traced.trace import DENSITY, GridDensity, density_argument
 
 
 def proposal_weights(rays: Rays, t: Tensor, density: GridDensity) -> Tensor:
-    """Return the weights (R, B) of intervals along rays, by the density in the middle of each.
+    """Return the weights (R, B) of intervals along rays, from the density in the middle of each.
 
     Args:
-        rays: R rays, to which no gradient goes.
-        t: (R, B + 1) sorted distances between which the intervals lie; without a gradient.
+        rays: R rays; they get no gradient.
+        t: (R, B + 1) sorted distances that bound the intervals; without a gradient.
         density: the proposal.
     """
     rays, t = rays.detached(), t.detach()

@@ -1,8 +1,8 @@
-"""Spacing of intervals along rays: from normalised distance to distance, and disparity and the power ladder behind it.
+"""Spacing of intervals along rays: from normalised distance to distance, by disparity or a power ladder.
 
 Intervals are drawn in normalised distance s in [0, 1], from the near to the far end of a ray. In a bounded scene s is
-linear in the distance; in an unbounded scene it is linear up to half the edge of the box, and linear in disparity
-beyond, or follows Zip-NeRF's power ladder (Barron et al. 2023).
+linear in the distance. In an unbounded scene it is linear up to half the edge of the box and linear in disparity
+beyond, or it follows Zip-NeRF's power ladder (Barron et al. 2023).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
 
 LADDER_PREMULTIPLIER = 2.0
-"""Factor of distances, in units of the scene's scale, before the power ladder: Zip-NeRF."""
+"""Factor of distances, in units of the scene's scale, before the power ladder (Zip-NeRF)."""
 
 
 def spacing(
@@ -27,10 +27,10 @@ def spacing(
 
     Args:
         nears, fars: (R,) distances of the rays' ends, which correspond to 0 and 1.
-        scale: the distance up to which normalised distance is linear; beyond, it is linear in disparity. None if it is
+        scale: distance up to which normalised distance is linear; beyond, it is linear in disparity. None if it is
             linear throughout.
-        ladder: exponent of the power ladder of twice the distance in units of `scale`, in place of disparity: Zip-NeRF
-            has -1.5. It is linear near the camera as well, and bends gradually.
+        ladder: exponent of a power ladder instead of disparity, applied to twice the distance in units of `scale`;
+            Zip-NeRF uses -1.5. It is linear near the camera as well, and bends gradually.
     """
     if scale is None or ladder is None:
         return lambda edges: SPACED((edges, nears, fars), edges, nears, fars, scale)
@@ -71,7 +71,7 @@ def power_ladder(x: Tensor, power: float) -> Tensor:
 
 
 def inverse_power_ladder(y: Tensor, power: float) -> Tensor:
-    """Return the distances whose `power_ladder` is `y`, with a large, finite result where that is bounded.
+    """Return the distances whose `power_ladder` is `y`; large but finite where the ladder is bounded.
 
     Args:
         y: values of the ladder.

@@ -7,8 +7,8 @@
 namespace {
 
 // The second integral D of a ray's step function, from the left: quadratic within each bin and linear after the last.
-// Blurring with a box of half-width r gives the first integral (D(x + r) - D(x - r)) / (2 r) at x. In double, of which
-// the difference leaves enough digits.
+// Blurring with a box of half-width r gives the first integral (D(x + r) - D(x - r)) / (2 r) at x. In double precision,
+// so that the difference keeps enough digits.
 struct SecondIntegral {
     int64_t bins;
     const float* edge;
@@ -26,7 +26,8 @@ struct SecondIntegral {
             slope[i] = width > 0 ? weights[i] / width : 0.0;
         }
     }
-    // Its value at x. `bin` is where the search starts; x must not be less than in the call before with the same `bin`.
+    // Its value at x. `bin` is the start of the search; x must not be less than in the previous call with the same
+    // `bin`.
     double at(double x, int64_t& bin) const {
         while (bin < bins && edge[bin + 1] < x) bin++;
         const double past = x - edge[bin];

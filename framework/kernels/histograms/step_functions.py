@@ -1,12 +1,13 @@
 """Blurred step functions, and the anti-aliased loss of proposals: Zip-NeRF (Barron et al. 2023), on z-aliasing.
 
 A histogram along a ray is a step function. The loss of mip-NeRF 360 jumps when an edge of one histogram passes an edge
-of the other, so that proposals learn where edges are, and lose thin things as the camera moves. Zip-NeRF first blurs
-the finer histogram with a box, which makes it piecewise linear, and then compares the weight in each proposed bin.
+of the other, so that proposals learn where edges are, and lose thin structures as the camera moves. Zip-NeRF first
+blurs the finer histogram with a box, which makes it piecewise linear, and then compares the weight in each proposed
+bin.
 
-The paper sorts the edges of the blurred function. Here none are sorted: if D is the second integral of the step
-function, which is quadratic between its edges, the integral of the blurred function up to x is
-(D(x + r) - D(x - r)) / (2 r), and walking along both histograms takes linear time.
+The paper sorts the edges of the blurred function. Here nothing is sorted. With D the second integral of the step
+function, which is quadratic between its edges, the integral of the blurred function up to x is (D(x + r) - D(x - r)) /
+(2 r), and a walk along both histograms takes linear time.
 
 Letters: R rays, B bins of a histogram, which has B + 1 sorted edges on every ray, P bins of a proposed one.
 """
@@ -23,14 +24,14 @@ from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
 
 EPS = 1e-5
-"""Added to proposed weights in a denominator. The paper's code has 1.2e-7 and clips gradients, which we do not: what a
-bin with little weight adds to the gradient of its density is at most its excess squared, divided by 4 EPS."""
+"""Added to proposed weights in a denominator. The paper's code has 1.2e-7 and clips gradients, which we do not. A bin
+with little weight contributes at most its excess squared, divided by 4 EPS, to the gradient of its density."""
 
 
 def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: float) -> Tensor:
-    """Return the weights (R, P) of other bins in a histogram that is blurred with a box.
+    """Return the weights (R, P) of other bins in a histogram blurred with a box.
 
-    Computed in float64, since differences of integrals are divided by the width of the box.
+    Computed in float64, because differences of integrals are divided by the width of the box.
 
     Args:
         edges: (R, B + 1) sorted edges of the histogram.
@@ -67,7 +68,7 @@ def blurred_excess_reference(
 
 
 def blurred_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:
-    """Return the loss (R,) of proposed weights that are less than those of a blurred histogram: Zip-NeRF's loss.
+    """Return the loss (R,) of proposed weights below those of a blurred histogram: Zip-NeRF's loss.
 
     It is the sum over proposed bins of max(0, b - p)^2 / p, where b is the weight of the blurred histogram in a bin and
     p the proposed one.
@@ -80,7 +81,7 @@ def blurred_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_we
         radius: half the width of the box, in the units of the edges.
 
     Raises:
-        ValueError: if the radius is not more than 0.
+        ValueError: if the radius is not positive.
     """
     if not radius > 0:
         raise ValueError(f"a histogram is blurred with a box of a radius above 0, not {radius}")

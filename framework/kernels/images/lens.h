@@ -1,4 +1,4 @@
-// Undoing a lens's distortion for one place on a picture. See ../../lenses.py, whose iteration this is.
+// Inversion of a lens's distortion for one position on an image. See ../../lenses.py for the iteration.
 #pragma once
 
 #include <cmath>
@@ -7,7 +7,7 @@ constexpr int LENS_SIZE = 11;  // k1, k2, p1, p2, k3, k4, k5, k6, k7, reach, out
 constexpr int LENS_ITERATIONS = 60;
 
 struct Bent {
-    double u, v, uu, uv, vv;  // the place, and the Jacobian du/dx, du/dy = dv/dx, dv/dy
+    double u, v, uu, uv, vv;  // the position, and the Jacobian du/dx, du/dy = dv/dx, dv/dy
 
     Bent(double x, double y, const double* k) {
         const double xx = x * x, xy = x * y, yy = y * y, q = xx + yy, p1 = k[2], p2 = k[3];
@@ -24,7 +24,8 @@ struct Bent {
     double area() const { return uu * vv - uv * uv; }
 };
 
-// The point of the lens's disk that is bent to (u, v), and the Jacobian's determinant there; the disk's edge if none is.
+// The point of the lens's disk that is distorted to (u, v), and the Jacobian's determinant there; the disk's edge if
+// none.
 static inline void straighten(double u, double v, const double* lens, double& x, double& y, double& area) {
     const double reach = lens[9], outer = lens[10], distance = std::sqrt(u * u + v * v);
     x = y = 0;

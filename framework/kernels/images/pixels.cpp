@@ -11,7 +11,7 @@ static int64_t image_of(int64_t pixel, const int64_t* offsets, int64_t images) {
 
 enum Model { PINHOLE, OPENCV, FISHEYE };
 
-// What (x, y) in normalised image coordinates shows: a unit direction, and radians between rays a unit apart.
+// Converts (x, y) in normalised image coordinates to a unit direction, and to the radians between rays one unit apart.
 static inline float look(int model, double x, double y, const double* lens, float* local) {
     double area;
     straighten(x, y, lens, x, y, area);
@@ -26,9 +26,9 @@ static inline float look(int model, double x, double y, const double* lens, floa
     return float(1 / (length * std::sqrt(area)));
 }
 
-// flat (P): pixel indices into all images, which start at offsets (M + 1); places (K, 2): column and row from a
-// pixel's centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M); lenses (M, LENS_SIZE), null for pinholes.
-// Writes P * K rays, those of a pixel together.
+// flat (P): pixel indices over all images, which start at offsets (M + 1); places (K, 2): column and row from a pixel's
+// centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M); lenses (M, LENS_SIZE), null for pinholes. Writes P * K rays,
+// those of a pixel consecutively.
 EXPORT int camera_rays(int model, const int64_t* flat, int64_t count, const float* places, int64_t per_pixel,
                        const int64_t* offsets, int64_t images, const int64_t* widths, const float* poses,
                        const float* fx, const float* fy, const float* cx, const float* cy, const double* lenses,

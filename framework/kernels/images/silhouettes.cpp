@@ -1,5 +1,4 @@
-// What photographs with alpha say about cells of space and about their own pixels. See ../silhouettes.py for the
-// references.
+// Tests of cells of space and of pixels against photographs with alpha. See ../silhouettes.py for the references.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -15,7 +14,7 @@ struct Photograph {
     float fx, fy, cx, cy;
     const int32_t* sums;
     int64_t height, width;
-    int closed;  // whether there is nothing outside the frame
+    int closed;  // whether space outside the frame is empty
 
     int32_t opaque_pixels(int64_t x0, int64_t x1, int64_t y0, int64_t y1) const {
         const int64_t stride = width + 1;
@@ -27,13 +26,13 @@ struct Rectangle {
     int64_t x0, x1, y0, y1;
 };
 
-// Where a photograph shows LANES balls, to a pixel more on each side.
+// Rectangles of LANES balls in a photograph, one pixel larger on each side.
 struct Footprints {
     Floats depth;  // of the centres, along the camera's axis
-    Ints whole;    // those that lie in the photograph whole, or outside of a closed one too, in front of the camera
+    Ints whole;    // balls in front of the camera and wholly in the frame (anywhere if closed)
     Ints x0, x1, y0, y1;
 
-    // Of the balls with `count` centres (count, 3), of which the last one stands for all lanes after it.
+    // For the balls with `count` centres (count, 3); the last one fills all further lanes.
     Footprints(const Photograph& photograph, const float* centers, int64_t count, float radius) {
         float from[3][LANES];
         for (int64_t lane = 0; lane < LANES; lane++)
@@ -69,7 +68,7 @@ struct Footprints {
 
 }  // namespace
 
-// sums (height + 1, width + 1) of opaque (height, width): how many pixels lie above and left of a pixel's corner.
+// sums (height + 1, width + 1) of opaque (height, width): number of pixels above and to the left of a pixel's corner.
 EXPORT int opaque_sums(const uint8_t* opaque, int64_t height, int64_t width, int32_t* sums) {
     const int64_t stride = width + 1;
     std::memset(sums, 0, sizeof(int32_t) * size_t(stride));
@@ -84,8 +83,8 @@ EXPORT int opaque_sums(const uint8_t* opaque, int64_t height, int64_t width, int
     return DONE;
 }
 
-// held (count): clears it for balls that the photograph shows whole and empty (every = 1), or sets it for balls in whose
-// direction it shows matter, and for balls around the camera's plane (every = 0).
+// held (count): cleared for balls that the photograph shows completely and empty (every = 1), or set for balls with
+// matter in their direction, and for balls around the camera's plane (every = 0).
 EXPORT int hold_balls(const float* centers, int64_t count, float radius, const float* pose, float fx, float fy,
                       float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int closed, int every,
                       uint8_t* held, int threads) {
@@ -109,8 +108,8 @@ EXPORT int hold_balls(const float* centers, int64_t count, float radius, const f
     });
 }
 
-// near (height, width): whether an opaque pixel lies within twice the largest reach of a ball, or a ball that the
-// photograph does not show whole may be seen through the pixel.
+// near (height, width): whether an opaque pixel lies within twice the largest reach of a ball, or the pixel may show a
+// ball that is not completely in the photograph.
 EXPORT int pixels_near_balls(const float* centers, int64_t count, float radius, const float* pose, float fx, float fy,
                              float cx, float cy, const int32_t* sums, int64_t height, int64_t width, int closed,
                              uint8_t* near, int threads) {
@@ -161,7 +160,7 @@ EXPORT int pixels_near_balls(const float* centers, int64_t count, float radius, 
         });
         if (!any_cut) return;
         const int64_t stride = width + 1;
-        std::vector<int32_t> marks(size_t(stride * (height + 1)), 0);  // whose sums say how many balls cover a pixel
+        std::vector<int32_t> marks(size_t(stride * (height + 1)), 0);  // their sums count the balls over a pixel
         for (const Part& part : parts)
             for (const Rectangle& f : part.cut) {
                 marks[size_t(f.y0 * stride + f.x0)]++;

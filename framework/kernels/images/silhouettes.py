@@ -1,6 +1,6 @@
 """Projections of balls into an image with alpha, for the visual hull (Laurentini 1994).
 
-They determine which balls the image shows to be empty, and which pixels may show the others: see
+They determine which balls the image shows to be empty, and which pixels may show the others; see
 `nerfloom.scene.silhouettes`.
 """
 
@@ -38,7 +38,7 @@ class Photograph:
     sums: Tensor
     """(H + 1, W + 1) int32 sums of the pixels that are not fully transparent (`opaque_sums`)."""
     closed: bool = False
-    """Whether there is nothing outside the frame, as if the image went on, transparent, on all sides."""
+    """Whether space outside the frame is empty, as if the image continued, transparent, on all sides."""
 
     @property
     def height(self) -> int:
@@ -96,7 +96,7 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
         radius: radius of the balls, scene units.
 
     Returns:
-        left, right, top and bottom (4, N) int64 as numbers of pixel corners, clamped to the image; and (N,) bool, True
+        Left, right, top and bottom (4, N) int64 as numbers of pixel corners, clamped to the image; and (N,) bool, True
         for balls in front of the camera whose rectangle is entirely inside the image, or anywhere if it is closed.
     """
     pose, depth = photograph.pose, photograph.depth(centers)
@@ -105,7 +105,7 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
     local = (centers - pose[:, 3]) @ pose[:, :2]
     column = photograph.cx + photograph.fx * local[:, 0] / depth
     row = photograph.cy - photograph.fy * local[:, 1] / depth
-    # Off the optical axis a ball is projected to an ellipse, longer than wide by a factor of at most 1 / cos^2.
+    # Off the optical axis, the image of a ball is an ellipse, longer than wide by a factor of at most 1 / cos^2.
     slant = 1 + (local / safe[:, None]).square().sum(-1)
     reach = radius / safe * max(photograph.fx, photograph.fy) * slant + 1  # edges are accurate to a pixel
     edges = torch.stack(
@@ -138,19 +138,19 @@ def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float,
 
 
 def hold_balls(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
-    """Update, in place, which balls may hold matter, by one image.
+    """Update, in place, which balls may hold matter, using one image.
 
-    An image shows a ball to be empty if the ball's `footprint` is entirely inside the image, or anywhere in front of
-    the camera if it is closed, and has no opaque pixel. It
-    shows matter in a ball's direction if the part of the footprint that is inside the image has an opaque pixel.
+    An image shows a ball to be empty if the ball's `footprint` has no opaque pixel and is entirely inside the image, or
+    anywhere in front of the camera if the image is closed. It shows matter in a ball's direction if the part of the
+    footprint inside the image has an opaque pixel.
 
     Args:
         photograph: the image.
         centers: (N, 3) centres of the balls, scene coordinates.
         radius: radius of the balls, scene units.
-        held: (N,) bool, the result of the images before.
-        every: True for balls that no image shows to be empty, where `held` starts as True; False for balls in whose
-            direction at least one image shows matter, and balls around a camera's plane, where `held` starts as False.
+        held: (N,) bool, the result of the previous images.
+        every: True for balls that no image shows to be empty; `held` starts as True. False for balls with matter in
+            their direction in at least one image, and balls around a camera's plane; `held` starts as False.
     """
     HOLD_BALLS((photograph.pose, centers), photograph, centers, radius, held, every)
 
@@ -170,11 +170,11 @@ def pixels_near_balls_reference(photograph: Photograph, centers: Tensor, radius:
 
 
 def pixels_near_balls(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
-    """Return the pixels (H, W) bool whose rays may meet one of the balls, and some more pixels.
+    """Return the pixels (H, W) bool whose rays may meet one of the balls, with a margin.
 
     The projection of a ball that is entirely inside the image contains an opaque pixel, and the pixels of rays that
-    meet the ball. All pixels within twice the largest radius of a projection around opaque pixels are therefore
-    sufficient. For balls that are partly outside the image, all pixels of their rectangles are included.
+    meet the ball. So all pixels within twice the largest radius of a projection around opaque pixels suffice. For balls
+    partly outside the image, all pixels of their rectangles are included.
 
     Args:
         photograph: the image.
@@ -217,12 +217,12 @@ def _under_cut_balls(photograph: Photograph, centers: Tensor, radius: float) -> 
 
 
 def pixels_under_balls(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
-    """Return the pixels (H, W) bool in the `footprint` of a ball, on any device: all whose rays meet one, and more.
+    """Return the pixels (H, W) bool in the `footprint` of a ball, on any device, with a margin.
 
-    If a ball reaches through the camera's plane, these are all pixels.
+    If a ball extends through the camera's plane, these are all pixels.
 
     Args:
-        photograph: a camera; its image does not matter.
+        photograph: a camera; its image is not used.
         centers: (N, 3) centres of the balls, scene coordinates.
         radius: radius of the balls, scene units.
     """
@@ -234,7 +234,7 @@ def pixels_under_balls(photograph: Photograph, centers: Tensor, radius: float) -
 
 
 def _covered(photograph: Photograph, x0: Tensor, x1: Tensor, y0: Tensor, y1: Tensor, chosen: Tensor) -> Tensor:
-    """Return the pixels (H, W) bool in any of those rectangles (N,) that are `chosen` (N,)."""
+    """Return the pixels (H, W) bool in any of the rectangles (N,) that are `chosen` (N,)."""
     height, width = photograph.height, photograph.width
     marks = torch.zeros((height + 1) * (width + 1), dtype=torch.int32, device=chosen.device)
     for x, y, sign in ((x0, y0, 1), (x1, y0, -1), (x0, y1, -1), (x1, y1, 1)):

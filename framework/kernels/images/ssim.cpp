@@ -1,10 +1,10 @@
-// The loss of an image, of its structural similarity and its mean absolute error, and the derivative by the image. See
+// The loss of an image from structural similarity and mean absolute error, and its derivative by the image. See
 // ../ssim.py for formulas and reference.
 //
 // An image of interleaved channels is filtered as rows of width * channels floats, with taps `channels` apart. A band
-// of rows goes from input to gradient in one sweep, which holds no more rows than the window reaches over: rows are
-// blurred along, then down, which gives the windows' moments; the slopes by those are blurred down, then along, which
-// gives the gradient.
+// of rows is processed from input to gradient in one sweep, which keeps no more rows than the window covers. Rows are
+// blurred along, then down, which gives the windows' moments; the derivatives by the moments are blurred down, then
+// along, which gives the gradient.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -71,8 +71,8 @@ struct Rows {
 struct Images {
     const float *image, *target;
     int64_t height, width, channels;
-    float c1;  // of the means; where it is infinite, variances alone are compared
-    const bool* counted;  // (height - REACH, width - REACH): the windows that count; all if null
+    float c1;  // of the means; if it is infinite, only variances are compared
+    const bool* counted;  // (height - REACH, width - REACH): windows that count; null for all
 };
 
 inline int64_t whole_vectors(int64_t floats) { return (floats + LANES - 1) / LANES * LANES; }
@@ -80,22 +80,22 @@ inline int64_t whole_vectors(int64_t floats) { return (floats + LANES - 1) / LAN
 // A variance, which rounding may leave below 0. NaN stays NaN.
 inline Floats positive(Floats variance) { return variance < 0.0f ? splat(0) : variance; }
 
-// What is measured of each row, and the factors of both in the gradient.
+// Measures of each row, and their factors in the gradient.
 struct Measure {
     std::vector<double> dissimilarity;  // of the windows that begin in it
     std::vector<double> error;          // absolute, of its pixels
     float of_similarity, of_error;      // per window, per value
 };
 
-// The gradients of a band of rows, and how dissimilar the windows are that begin in it. Rows count from REACH above the
-// band, where the first windows begin that reach into it.
+// The gradients of a band of rows, and the dissimilarity of the windows that begin in it. Rows are counted from REACH
+// above the band, where the first windows that reach into it begin.
 class Band {
   public:
     Band(const Images& images, int64_t first, int64_t count, std::vector<float>& scratch)
         : images(images), top(first - REACH), rows(count + REACH), step(images.channels),
           row_floats(images.width * step), reach(REACH * step), windows(row_floats - reach),
           margin(whole_vectors(reach)) {
-        // Rows have room for a window's reach on both sides, and for whole vectors.
+        // Rows have space for a window's reach on both sides, and for whole vectors.
         const int64_t stride = margin + whole_vectors(row_floats + reach) + LANES;
         scratch.assign(size_t((7 * KEPT + 4 * ROWS + 2) * stride + LANES), 0.0f);
         float* at = scratch.data();
@@ -110,7 +110,7 @@ class Band {
         }
     }
 
-    // Writes what is measured of each row and, unless `gradient` is null, the derivative.
+    // Writes the measures of each row and, unless `gradient` is null, the derivative.
     void run(Measure& measure, float* gradient) {
         for (int64_t row = 0; row < REACH; row++) read(row, measure.error.data());
         for (int64_t row = 0; row < rows; row += ROWS) {
@@ -125,7 +125,7 @@ class Band {
     // Sum and difference of a row of both images, and their squares, blurred along.
     void read(int64_t row, double* error) {
         const int64_t y = top + row;
-        if (y < 0 || y >= images.height) return;  // no window that counts has it
+        if (y < 0 || y >= images.height) return;  // not in any window that counts
         const float *a = images.image + y * row_floats, *b = images.target + y * row_floats;
         for (int64_t i = 0; i < row_floats; i++) {
             sums[i] = (a[i] - 0.5f) + (b[i] - 0.5f);
@@ -143,7 +143,7 @@ class Band {
         }
     }
 
-    // Of the differences of a row.
+    // For the differences of a row.
     double absolute_sum() const {
         Floats lanes = splat(0);
         int64_t i = 0;
@@ -165,7 +165,7 @@ class Band {
         }
     }
 
-    // The slopes of ROWS rows of windows, and how dissimilar those are.
+    // The derivatives of ROWS rows of windows, and their dissimilarity.
     void compare(int64_t row, double* dissimilarity) {
         const float* from[4][KEPT];
         for (int m = 0; m < 4; m++) moments[m].pointers(row, from[m]);
@@ -186,7 +186,7 @@ class Band {
                 const Floats per_light = 1.0f / light, per_contrast = 1.0f / contrast;
                 const Floats darker = square * per_light, flatter = of_difference * per_contrast;
                 const Floats similar = 1.0f - darker;
-                // Twice the derivatives by E[u^2] and E[v^2], and the one by the means, of which variances depend too.
+                // Twice the derivatives by E[u^2] and E[v^2], and the one by the means, on which variances depend too.
                 const Floats by_sum = similar * flatter * per_contrast;
                 const Floats by_difference = by_sum - 2.0f * similar * per_contrast;
                 const Floats by_mean =
@@ -247,15 +247,15 @@ class Band {
     Rows slopes[3];             // by the mean, and twice those by the means of both squares, after `margin` zeros
     Rows blurred[3];            // the slopes, blurred down
     float *sums, *differences;  // of a row of both images
-    float* inside[ROWS];        // 1 where a row has a window that counts, 0 elsewhere
+    float* inside[ROWS];        // 1 where a row has a window that counts, otherwise 0
 };
 
 }  // namespace
 
-// out: 1 - ssim_weight times the mean absolute error, and ssim_weight times 1 - the mean similarity, of image and target
-// (height, width, channels), of 11 pixels at least along each side; counted (height - 10, width - 10): the windows over
-// which the similarity is averaged, one at least, all if null; gradient (height, width, channels): its derivative by the
-// image, unless null.
+// out: 1 - ssim_weight times the mean absolute error, and ssim_weight times 1 - the mean similarity, of image and
+// target (height, width, channels), with at least 11 pixels along each side. counted (height - 10, width - 10): windows
+// over which the similarity is averaged, at least one; null for all. gradient (height, width, channels): derivative by
+// the image, unless null.
 EXPORT int photometric(const float* image, const float* target, int64_t height, int64_t width, int64_t channels,
                        float ssim_weight, float c1, const bool* counted, float* gradient, int threads, double* out) {
     return guarded([&] {
@@ -264,14 +264,14 @@ EXPORT int photometric(const float* image, const float* target, int64_t height, 
         const int64_t windows = (height - REACH) * (width - REACH);
         const double count = double(counted ? std::count(counted, counted + windows, true) : windows) * double(channels);
         const double values = double(height) * double(width) * double(channels);
-        // Neighbours both read the rows between them, so there are no more bands than threads have use for. What a row
-        // gets does not depend on them: each begins at a multiple of ROWS, and sums are of rows first, then of all.
+        // Neighbouring bands both read the rows between them, so there are no more bands than useful threads. Results
+        // do not depend on the bands: each begins at a multiple of ROWS, and sums are over rows first.
         const int64_t bands = threads > 1 ? 2 * threads : 1;
         const int64_t rows = std::max<int64_t>(((height + bands - 1) / bands + ROWS - 1) / ROWS * ROWS, 4 * ROWS);
         const std::vector<double> zeros(size_t(height), 0.0);
         Measure measure{zeros, zeros, float(-ssim_weight / count), float((1 - ssim_weight) / values)};
-        static thread_local std::vector<std::vector<float>> kept;  // for fresh memory costs page faults
-        std::vector<std::vector<float>>& scratch = kept;           // the caller's, whichever thread works
+        static thread_local std::vector<std::vector<float>> kept;  // reused: new memory costs page faults
+        std::vector<std::vector<float>>& scratch = kept;           // the caller's, on whichever thread the work runs
         const size_t slots = size_t(std::max(threads, 1));
         if (scratch.size() < slots) scratch.resize(slots);
         for_chunks(threads, (height + rows - 1) / rows, [&](int64_t chunk, int slot) {

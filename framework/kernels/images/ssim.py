@@ -1,4 +1,4 @@
-"""Structural similarity (SSIM) of an image and its target, and the loss on whole images that is made of it.
+"""Structural similarity (SSIM) of an image and its target, and the loss on whole images based on it.
 
 Definition: Wang, Bovik, Sheikh and Simoncelli 2004, "Image quality assessment: from error visibility to structural
 similarity". Each window p has 11 x 11 pixels, weighted by a Gaussian g of sigma 1.5. With the means m, variances s and
@@ -6,16 +6,16 @@ the covariance s_xy in it of an image x and its target y:
 
     S(p) = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_xx + s_yy + C2))
 
-The compiled form works on the sum u = x + y - 1 and the difference v = x - y, in which the same reads:
+The compiled form uses the sum u = x + y - 1 and the difference v = x - y, with which
 
     S(p) = (1 - m_v^2 / (m_x^2 + m_y^2 + C1)) (1 - s_vv / ((s_uu + s_vv) / 2 + C2))
 
-Only u, v, u^2 and v^2 have to be blurred, and 1 - S is small without cancellation where the images are alike. The
-derivative by a pixel q, with E for the blurred squares, is a sum over the windows that the pixel lies in:
+Only u, v, u^2 and v^2 are blurred, and 1 - S is small without cancellation if the images are similar. The derivative by
+a pixel q, with E for the blurred squares, is a sum over the windows that contain the pixel:
 
     sum_p g(q - p) (dS/dm(p) + 2 u(q) dS/dE[u^2](p) + 2 v(q) dS/dE[v^2](p))
 
-The loss is a number, so its incoming gradient is one too: the derivative is computed together with the value, while
+The loss is a single number, and so is its incoming gradient. The derivative is computed together with the value, while
 rows are in the processor's cache, and the backward pass only multiplies it.
 """
 
@@ -42,14 +42,14 @@ C1, C2 = 0.01**2, 0.03**2
 def ssim(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the mean structural similarity of an image and its target: 1 where they are equal.
 
-    The definition is that of `nerfloom.evaluation.metrics.ssim`, which is for measuring: in float64, without gradient.
-    Values that are NaN make the result NaN.
+    This is `nerfloom.evaluation.metrics.ssim`, which is for measurements: in float64, without gradient. A NaN among the
+    values makes the result NaN.
 
     Args:
-        image: (H, W, C) values whose range is taken to be [0, 1]. Compiled with its first derivative.
-        target: (H, W, C) values to compare with. A gradient to it takes the slow reference.
-        counted: (H - 10, W - 10) bool, the windows that count, by their first pixel (`windows_inside`); all that lie
-            inside the image if None. With it, only the reference has a gradient.
+        image: (H, W, C) values, assumed to be in [0, 1]. Compiled with its first derivative.
+        target: (H, W, C) values to compare with. A gradient of the target uses the slow reference.
+        counted: (H - 10, W - 10) bool, the windows that count, by their first pixel (`windows_inside`); None for all
+            inside the image. With it, only the reference has a gradient.
 
     Returns:
         The mean over channels and over the windows that count, a tensor without dimensions.
@@ -66,7 +66,7 @@ def ssim(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor
 
 
 def windows_inside(kept: Tensor) -> Tensor:
-    """Return which windows have no pixel but kept ones, (H - 10, W - 10) bool, each at the place of its first pixel.
+    """Return the windows with kept pixels only, (H - 10, W - 10) bool, each at the position of its first pixel.
 
     Args:
         kept: (H, W) bool; each side has at least 11 pixels.
@@ -95,12 +95,12 @@ def _check_window(image: Tensor, counted: Tensor | None = None) -> None:
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     """Return the loss of an image: (1 - w) times the mean absolute error, plus w times (1 - SSIM).
 
-    Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", equation 7. Compiled, both and
-    their derivative take one sweep over the images.
+    Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", equation 7. The compiled form
+    computes both terms and their derivative in one sweep over the images.
 
     Args:
-        image: (H, W, C) values whose range is taken to be [0, 1]. Compiled with its first derivative.
-        target: (H, W, C) values to compare with. A gradient to it takes the slow reference.
+        image: (H, W, C) values, assumed to be in [0, 1]. Compiled with its first derivative.
+        target: (H, W, C) values to compare with. A gradient of the target uses the slow reference.
         ssim_weight: w, between 0 and 1. An image smaller than the window has no SSIM: its loss is the error alone.
 
     Returns:
@@ -140,14 +140,14 @@ def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
 
 
 def structure(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
-    """Return the mean of S without its first factor, which compares means: what is left of contrast and structure.
+    """Return the mean of S without its first factor, which compares means; contrast and structure remain.
 
-    SSIM at several scales (Wang, Simoncelli and Bovik 2003) takes it of all scales but the coarsest. With NaN the
+    SSIM at several scales (Wang, Simoncelli and Bovik 2003) uses it for all scales but the coarsest. With NaN the
     result is NaN.
 
     Args:
-        image, target: (H, W, C) values whose range is taken to be [0, 1]. Compiled without a derivative.
-        counted: as for `ssim`.
+        image, target: (H, W, C) values, assumed to be in [0, 1]. Compiled without a derivative.
+        counted: as in `ssim`.
 
     Returns:
         The mean over channels and over the windows that count, a tensor without dimensions.
@@ -167,8 +167,8 @@ def similarity_reference(image: Tensor, target: Tensor, counted: Tensor | None, 
     Args:
         image: (H, W, C) values, on any device, of any float type.
         target: (H, W, C) values to compare with.
-        counted: (H - 10, W - 10) bool, the windows that count; all if None.
-        of_means: whether the first factor of S, which compares means, counts: `ssim`; else `structure`.
+        counted: (H - 10, W - 10) bool, the windows that count; None for all.
+        of_means: whether to include the first factor of S, which compares means (`ssim`); otherwise `structure`.
     """
     by_means, by_variances = _similarities(image, target)
     similar = by_means * by_variances if of_means else by_variances
@@ -185,7 +185,7 @@ def _similarities(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _blurred(values: Tensor) -> Tensor:
-    """Return the weighted sums of values (H, W, C) over each window that lies inside, (H - 10, W - 10, C)."""
+    """Return the weighted sums of values (H, W, C) over each window inside the image, (H - 10, W - 10, C)."""
     weights = [math.exp(-((offset - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for offset in range(WINDOW)]
     line = [weight / math.fsum(weights) for weight in weights]
     for dim in (0, 1):
@@ -203,7 +203,7 @@ _photometric = native.Function("photometric", "ppqqqffppi", "d")
 
 
 class _Photometric(torch.autograd.Function):
-    """The compiled sweep over an image, which computes the value and the derivative."""
+    """The compiled sweep over an image; it computes the value and the derivative."""
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, learned: bool) -> Tensor:
@@ -221,7 +221,7 @@ class _Photometric(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
         (derivative,) = ctx.saved_tensors
-        # As a term of a loss has a gradient of 1, the usual step needs no pass over the image.
+        # A term of a loss has a gradient of 1, so the usual step needs no pass over the image.
         return derivative if float(grad) == 1 else derivative * grad, None, None, None
 
 

@@ -1,7 +1,7 @@
 """Structural similarity and its derivative, in Triton. `kernels.images.ssim` has the reference and the equations.
 
-The window's Gaussian is a product of two lines. So rows are blurred first, then columns, of the four maps that count;
-the derivative is blurred in the same way, of three maps. An element of a map is a value of the image, its channel last.
+The window's Gaussian is a product of two lines. So four maps are blurred along rows, then along columns; the derivative
+blurs three maps in the same way. An element of a map is a value of the image, with the channel last.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
@@ -21,7 +21,7 @@ from nerfloom.kernels.images.ssim import C1, C2, SIGMA, WINDOW
 from nerfloom.kernels.triton_launch import blocks, launch
 
 BLOCK = 256
-"""Elements that are taken together."""
+"""Elements per program."""
 
 
 @functools.lru_cache(maxsize=4)
@@ -57,7 +57,7 @@ def _rows(image, target, line, maps, count, row, shorter, channels, WINDOW: tl.c
 
 @triton.jit
 def _windows(maps, line, sums, slopes, size, count, row, c1, c2, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
-    """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S, if asked for."""
+    """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S if requested."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     mean_u = tl.zeros([BLOCK], tl.float32)
@@ -87,7 +87,7 @@ def _windows(maps, line, sums, slopes, size, count, row, c1, c2, WINDOW: tl.cons
 
 @triton.jit
 def _columns_back(slopes, line, maps, size, count, row, windows, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
-    """Sum three maps of `size` elements, in `windows` rows, over the windows that reach each row of the image."""
+    """Sum three maps of `size` elements, in `windows` rows, over the windows that cover each row of the image."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     y = i // row
@@ -110,7 +110,7 @@ def _rows_back(
     maps, line, image, target, derivative, size, count, row, shorter, channels, scale, WINDOW: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sum the maps over the windows that reach each value of the image, and write the derivative."""
+    """Sum the maps over the windows that cover each value of the image, and write the derivative."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     y, x = i // row, i % row

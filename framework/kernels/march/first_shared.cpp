@@ -1,4 +1,4 @@
-// The first place along a ray that enough images show. See ../first_shared.py for the reference.
+// The first position along a ray that enough images show. See ../first_shared.py for the reference.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -6,7 +6,7 @@
 
 namespace {
 
-struct Space {  // nested boxes around `box` (2, 3), and which of their cells are not shared
+struct Space {  // nested boxes around `box` (2, 3), and their unshared cells
     const uint8_t* unshared;
     int levels, cells;
     float centre[3], half[3], largest = 0;
@@ -28,7 +28,7 @@ struct Space {  // nested boxes around `box` (2, 3), and which of their cells ar
         int level = 0;
         float size = 1;
         for (; level < levels && !(farthest <= size); size *= 2) level++;
-        if (level == levels || !(unit[0] + unit[1] + unit[2] < INFINITY)) return true;  // NaN is nowhere
+        if (level == levels || !(unit[0] + unit[1] + unit[2] < INFINITY)) return true;  // NaN is in no cell
         int64_t index = level;
         for (int a = 0; a < 3; a++) {
             const float place = (unit[a] / size + 1) * (float(cells) / 2);
@@ -38,16 +38,16 @@ struct Space {  // nested boxes around `box` (2, 3), and which of their cells ar
     }
 };
 
-// As torch.lerp.
+// Like torch.lerp.
 float between(float a, float b, float share) {
     return share < 0.5f ? a + share * (b - a) : b - (b - a) * (1 - share);
 }
 
 }  // namespace
 
-// `out` (rays): the distance of the first of `steps` places that is shared, between the near end of each ray and
-// `reach` half edges of the box behind it, or its far end; of the step before it, in `parts`, the first end of a part
-// that is shared. The near end where none is.
+// `out` (rays): the distance of the first shared one of `steps` positions between the near end of each ray and `reach`
+// half edges of the box behind it, or its far end. The step before it is divided into `parts`, and the first shared
+// part counts. The near end if there is none.
 EXPORT int first_shared(const float* origins, const float* directions, const float* nears, const float* fars,
                         int64_t rays, const float* box, const uint8_t* unshared, int levels, int cells, int steps,
                         float reach, int parts, float* out, int threads) {

@@ -1,4 +1,4 @@
-"""The first place along a ray that enough images show, by the cells that they do not show (`scene/shared_space.py`)."""
+"""The first position along a ray that enough images show, from the unshared cells (`scene/shared_space.py`)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
 
 LEVELS, CELLS = 3, 32
-"""Nested boxes, each twice as large as the one before, and cells along an axis of each; beyond, all is shared."""
+"""Number of nested boxes, each twice as large as the one before, and of cells along an axis; space beyond is shared."""
 STEPS, REACH, PARTS = 64, 4.0, 16
-"""Places along a ray that are looked up, the distance of the last from its near end in half edges of the box, and parts
-of the step before the first that is shared, whose ends are looked up then."""
+"""Number of positions tested along a ray; distance of the last one from the near end, in half edges of the box; and
+number of parts of the step before the first shared position, tested in turn."""
 
 
 @torch.no_grad()
@@ -29,14 +29,14 @@ def first_shared_reference(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
         return ~unshared[_cells(positions.view(-1, 3), box)].view(t.shape)
 
     first = shared(t).int().argmax(1, keepdim=True)  # index 0 if there is no other
-    # Up to a whole step of what images do show is left out otherwise.
+    # Otherwise up to a whole step of visible space would be skipped.
     parts = torch.linspace(1 / PARTS, 1, PARTS, device=ends.device, dtype=ends.dtype)
     within = torch.lerp(t.gather(1, (first - 1).clamp(min=0)), t.gather(1, first), parts)
     return within.gather(1, shared(within).int().argmax(1, keepdim=True)).squeeze(1)
 
 
 def _cells(positions: Tensor, box: Tensor) -> Tensor:
-    """Return the index (N,) of the smallest box's cell around each of `positions` (N, 3); the last one is beyond."""
+    """Return the index (N,) of the smallest box's cell around each of `positions` (N, 3); the last is beyond."""
     unit = (positions - box.mean(0)) / ((box[1] - box[0]) / 2)
     level = unit.abs().amax(-1).clamp(min=1).log2().ceil().clamp(max=LEVELS)
     x, y, z = ((unit * torch.exp2(-level)[:, None] + 1) * (CELLS / 2)).long().clamp(0, CELLS - 1).unbind(-1)
@@ -44,13 +44,13 @@ def _cells(positions: Tensor, box: Tensor) -> Tensor:
 
 
 def first_shared(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
-    """Return the distance (R,) of the first place along each ray that is shared; its near end if none is.
+    """Return the distance (R,) of the first shared position along each ray; its near end if there is none.
 
     Args:
-        rays: R rays, to which no gradient goes.
+        rays: R rays; they get no gradient.
         box: (2, 3) corners of the smallest box, scene units.
-        unshared: (`LEVELS` * `CELLS`^3 + 1,) bool, box by box; the last one stands for all of space beyond the boxes,
-            and is False.
+        unshared: (`LEVELS` * `CELLS`^3 + 1,) bool, box by box; the last entry stands for all space beyond the boxes and
+            is False.
     """
     rays = rays.detached()
     return FIRST_SHARED((rays.origins, rays.directions, rays.nears, rays.fars, box), rays, box, unshared)

@@ -1,9 +1,9 @@
 """Marching into a fixed number of slots, so that Python need not know how many samples there are.
 
-A GPU that is asked how many samples a march has found stands still until Python has gone on. Here the number of slots
-is given, and the device alone counts: slots that are left over are shared out among the rays, behind their samples, as
-intervals of length 0, which stop no light and have no gradient. So what follows needs no case of its own. Where the
-slots do not suffice, rays are left out whole, from the end of the batch, and counted.
+Reading the number of samples from a GPU would make it wait for Python. Here the number of slots is fixed, and only the
+device counts. Unused slots are distributed among the rays, after their samples, as intervals of length 0, which stop no
+light and have no gradient. So later operations need no special case. If the slots do not suffice, whole rays are
+dropped, from the end of the batch, and counted.
 
 Letters: R rays, C slots.
 """
@@ -27,22 +27,22 @@ from nerfloom.kernels.triton_backend import later
 
 @dataclass(frozen=True)
 class Slots:
-    """C slots that are shared out among R rays: first those of a ray's items, then empty ones."""
+    """C slots distributed among R rays: first those of a ray's items, then empty ones."""
 
     owners: Tensor
     """(C,) int64 ray of each slot, in ascending order."""
     ranks: Tensor
-    """(C,) int64 number of slots in front of each on its ray."""
+    """(C,) int64 number of slots before each on its ray."""
     offsets: Tensor
     """(R + 1,) int64 first slot of each ray; the last entry is C."""
     counts: Tensor
-    """(R,) int64 items of each ray; 0 if the ray was left out."""
+    """(R,) int64 items of each ray; 0 if the ray was dropped."""
     left_out: Tensor
-    """() int64 number of rays that were left out, since there was no room for their items."""
+    """() int64 number of rays dropped for lack of slots."""
 
 
 def share_out(counts: Tensor, capacity: int) -> Slots:
-    """Share out slots among rays.
+    """Distribute slots among rays.
 
     Args:
         counts: (R,) int64 items of each ray, R > 0.
@@ -63,11 +63,12 @@ def share_out(counts: Tensor, capacity: int) -> Slots:
 class Placed:
     """Intervals along rays in slots.
 
-    Those of empty slots have the length 0, at the end of the ray's last interval, or at 0 on a ray that has none.
+    Intervals of empty slots have length 0. They are at the end of the ray's last interval, or at 0 on a ray without
+    any.
     """
 
     slots: Slots
-    """What the slots are for."""
+    """The slots."""
     t_starts: Tensor
     """(C,) distance at the start of each interval."""
     t_ends: Tensor
@@ -75,13 +76,13 @@ class Placed:
 
     @classmethod
     def of(cls, starts: Tensor, ends: Tensor, firsts: Tensor, slots: Slots) -> Placed:
-        """Put intervals into slots.
+        """Place intervals into slots.
 
         Args:
             starts: (N,) distance at the start of each interval, finite; N > 0.
-            ends: (N,) distance at its end, likewise.
-            firsts: (R,) int64 index of the first interval of each ray, which are one after another.
-            slots: the slots of as many intervals of each ray.
+            ends: (N,) distance at the end of each interval, finite.
+            firsts: (R,) int64 index of the first interval of each ray; those of a ray are consecutive.
+            slots: slots for that many intervals of each ray.
         """
         held = slots.counts.index_select(0, slots.owners)
         places = firsts.index_select(0, slots.owners) + torch.minimum(slots.ranks, held - 1).clamp(min=0)
@@ -91,27 +92,27 @@ class Placed:
         return cls(slots, its_starts, its_ends)
 
     def first(self, counts: Tensor, capacity: int) -> Placed:
-        """Return the first `counts` (R,) intervals of each ray in as many slots as `capacity`."""
+        """Return the first `counts` (R,) intervals of each ray in `capacity` slots."""
         slots = share_out(counts, capacity)
         return Placed.of(self.t_starts, self.t_ends, self.slots.offsets[:-1], slots)
 
 
 @dataclass(frozen=True)
 class Filled:
-    """The candidates of a march in slots, and what would have had to fit."""
+    """The candidates of a march in slots, and the required capacity."""
 
     placed: Placed
     """The candidates."""
     runs: Tensor
-    """() int64 number of runs of steps near an occupied cell; 0 if they need no room."""
+    """() int64 number of runs of steps near an occupied cell; 0 if runs need no capacity."""
     candidates: Tensor
-    """() int64 number of candidates, of all rays whose runs had room."""
+    """() int64 number of candidates on all rays whose runs fitted."""
     left_out: Tensor
-    """() int64 number of rays that were left out."""
+    """() int64 number of dropped rays."""
 
 
 def most_steps(num_steps: int) -> int:
-    """Return the largest number of steps on a ray through a box whose diagonal is `num_steps` steps long."""
+    """Return the maximum number of steps on a ray through a box whose diagonal is `num_steps` steps long."""
     return num_steps + 2  # one is cut off at each end
 
 
@@ -119,17 +120,17 @@ def most_steps(num_steps: int) -> int:
 def fill(
     rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, room: tuple[int, int]
 ) -> Filled:
-    """Return the steps of rays whose middle is in an occupied cell of one box, in a fixed number of slots.
+    """Return the steps of rays whose middle is in an occupied cell, in a fixed number of slots.
 
-    They are those of `nerfloom.kernels.march.waves.candidates`, for even steps.
+    They are the steps of `nerfloom.kernels.march.waves.candidates`, for even steps.
 
     Args:
         rays: R rays, R > 0.
-        occupancy: the grid, of one box, or with slices of time, for which rays need times.
+        occupancy: the grid, of one box, or with time slices, for which rays need times.
         step: length of a step, scene units.
         num_steps: number of steps along the diagonal of the box.
-        shift: (R,) fraction of a step by which the first step starts in front of the box; None for 0.
-        room: numbers of runs of 8 steps that are looked at more closely (not all forms do), and of slots.
+        shift: (R,) fraction of a step by which the first step starts before the box; None for 0.
+        room: capacity for runs of 8 steps that are examined more closely (not in all forms), and number of slots.
     """
     tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
     return FILL(tensors, rays, occupancy, step, num_steps, shift, room)
@@ -145,7 +146,7 @@ def fill_reference(
     count, device, (room_of_runs, capacity) = len(rays), rays.origins.device, room
     enter, leave, first, steps = step_range(rays, occupancy, step, 0.0, shift)
     slices = occupancy.slices_of(rays.times)
-    # All runs of all rays that any could have: a look-up each, and then one place each for those that count.
+    # All possible runs of all rays: one look-up each, then one position each for those that count.
     most = math.ceil(most_steps(num_steps) / RUN)
     owners = torch.arange(count, device=device).repeat_interleave(most)
     run = torch.arange(most, device=device).repeat(count)
@@ -173,8 +174,8 @@ def fill_reference(
 
 
 def _places(mask: Tensor, capacity: int) -> Tensor:
-    """Return the first places (C,) int64 in which `mask` (N,) is True, as many as `capacity`; 0 if there are fewer."""
-    ranks = torch.where(mask, mask.cumsum(0) - 1, capacity).clamp(max=capacity)  # the others behind the end
+    """Return the first `capacity` positions (C,) int64 at which `mask` (N,) is True; 0 for missing ones."""
+    ranks = torch.where(mask, mask.cumsum(0) - 1, capacity).clamp(max=capacity)  # the others go past the end
     places = ranks.new_zeros(capacity + 1).scatter_(0, ranks, torch.arange(len(mask), device=mask.device))
     return places[:capacity]
 
@@ -185,7 +186,7 @@ def _of_rays(values: Tensor | None, owners: Tensor) -> Tensor | None:
 
 @torch.no_grad()
 def reach(placed: Placed, sigma: Tensor, early_stop: float, num_steps: int) -> Tensor:
-    """Return how many of its intervals (R,) int64 the light of each ray reaches.
+    """Return the number (R,) int64 of intervals that the light of each ray reaches.
 
     Args:
         placed: intervals in C slots.
@@ -204,7 +205,7 @@ def reach_reference(placed: Placed, sigma: Tensor, budget: float, num_steps: int
     `placed`, `sigma` and `num_steps` are as in `reach`; `budget` is the optical depth at which a ray ends.
     """
     slots = placed.slots
-    tau = optical_depth(sigma, placed.t_ends - placed.t_starts).nan_to_num(nan=0.0)  # a broken sample hides nothing
+    tau = optical_depth(sigma, placed.t_ends - placed.t_starts).nan_to_num(nan=0.0)  # a NaN sample hides nothing
     longest = longest_ray(slots, num_steps)
     before = bounded_sum(tau, slots.owners, slots.ranks, len(slots.counts), longest)
     reached = (slots.ranks < slots.counts.index_select(0, slots.owners)) & (before < budget)
@@ -212,7 +213,7 @@ def reach_reference(placed: Placed, sigma: Tensor, budget: float, num_steps: int
 
 
 def longest_ray(slots: Slots, num_steps: int) -> int:
-    """Return an upper bound of the number of slots of a ray, as `slots` of `fill` with `num_steps` are shared out."""
+    """Return an upper bound of the number of slots of a ray, for `slots` of `fill` with `num_steps`."""
     return most_steps(num_steps) + len(slots.owners) // len(slots.counts) + 1
 
 

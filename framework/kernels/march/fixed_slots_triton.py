@@ -1,7 +1,7 @@
-"""Marching into a fixed number of slots, in Triton. `nerfloom.kernels.march.fixed_slots` says what is computed.
+"""Marching into a fixed number of slots, in Triton. `nerfloom.kernels.march.fixed_slots` has the definition.
 
-Rays are marched twice, once to count their samples and once to write them down where the counts say; each thread takes
-a ray. The host waits for nothing.
+Rays are marched twice, first to count their samples and then to write them at the counted positions; each thread
+processes a ray. The host waits for nothing.
 """
 
 # Triton gives the kernels' arguments their types.
@@ -31,7 +31,7 @@ def fill(
     counts = found.long()
     slots = share_out(counts, capacity)
     firsts = slots.counts.cumsum(0) - slots.counts
-    starts, ends = (marched.spent.new_zeros(capacity) for _ in range(2))  # what is never written to is read too
+    starts, ends = (marched.spent.new_zeros(capacity) for _ in range(2))  # unwritten slots are read too
     marched.next.zero_()
     marched.go_on(limit, found, starts, ends, firsts, slots.counts)
     placed = Placed.of(starts, ends, firsts, slots)
@@ -49,7 +49,7 @@ def _reach(sigma, starts, ends, offsets, counts, reached, budget, rays, BLOCK: t
         n = first + found
         length = tl.load(ends + n, mask=going, other=0.0) - tl.load(starts + n, mask=going, other=0.0)
         tau = optical_depth(tl.load(sigma + n, mask=going, other=0.0), length)
-        depth += tl.where(tau == tau, tau, 0.0)  # what is NaN hides nothing
+        depth += tl.where(tau == tau, tau, 0.0)  # NaN hides nothing
         found += going.to(tl.int64)
         going = going & (found < count) & (depth < budget)
     tl.store(reached + r, found, mask=here)

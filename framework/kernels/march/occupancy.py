@@ -1,8 +1,8 @@
-"""The occupancy grid of a march: its cells, in the forms in which they are looked up, and when they are occupied.
+"""The occupancy grid of a march: its cells, the forms used for look-ups, and the update of occupied cells.
 
-A grid has one box, or several that are nested, each of twice the size and with as many cells (Instant-NGP, Mueller et
-al. 2022, appendix E.2). A position belongs to the smallest box that it lies in, so the cells in the middle of a larger
-box are never looked up. A grid of one box may have slices of time, each with cells of its own.
+A grid has one box, or several nested boxes, each twice as large with the same number of cells (Instant-NGP, Mueller et
+al. 2022, appendix E.2). A position belongs to the smallest box that contains it, so the cells in the middle of a larger
+box are never looked up. A grid of one box may have time slices, each with its own cells.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.triton_backend import later
 
 BLOCK = 4
-"""Cells along an edge of a block, which is a cell of the coarser level."""
+"""Cells along an edge of a block; a block is a cell of the coarser level."""
 ROUNDING = 1e-5
 """Relative tolerance of the mean opacity, so that rounding errors do not empty a grid whose cells are all equal."""
 
@@ -49,10 +49,9 @@ class Occupancy:
 
     @cached_property
     def filled(self) -> Tensor:
-        """(L, n, n, n) or (T, n, n, n) `occupied`, where the middle of a larger box says what the smaller one holds.
+        """(L, n, n, n) or (T, n, n, n) `occupied`, with the middle of each larger box filled in from the smaller one.
 
-        A cell there is occupied if one of the eight is that it consists of, so that a box can be crossed by what its
-        own cells say.
+        A cell there is occupied if one of its eight smaller cells is, so that a box can be traversed by its own cells.
         """
         n = self.resolution
         boxes = self.occupied.view(self.levels * self.slices, n, n, n)
@@ -90,9 +89,9 @@ class Occupancy:
         return torch.cat([find(cells.flatten(), self.resolution) for cells in self.filled])
 
     def refresh(self) -> None:
-        """Compute again what was computed from `occupied`, which has changed.
+        """Recompute everything derived from `occupied`, which has changed.
 
-        What is on a device that runs ahead of Python stays where it is, for recorded steps look for it there.
+        On a device that runs ahead of Python, tensors keep their memory, because captured steps refer to it.
         """
         for name in ("filled", "packed"):
             vars(self).pop(name, None)
@@ -105,7 +104,7 @@ class Occupancy:
         """Return the slice (R,) int64 of each of `times` (R,); None if there is only one.
 
         Raises:
-            ValueError: if there are several, and `times` is None.
+            ValueError: if there are several slices and `times` is None.
         """
         if self.slices == 1:
             return None
@@ -119,7 +118,7 @@ class Occupancy:
         return ((self.box[1] - self.box[0]) / self.resolution).min().item()
 
     def near(self, radius: int) -> Tensor:
-        """Return the cells (T n^3,) bool that have an occupied cell within `radius` cells along every axis."""
+        """Return the cells (T n^3,) bool with an occupied cell within `radius` cells along every axis."""
         if radius not in self._near:
             self._near[radius] = dilated(self, radius)
         return self._near[radius]
@@ -129,7 +128,7 @@ class Occupancy:
         return {}
 
     def cells(self, positions: Tensor, slices: Tensor | None = None) -> Tensor:
-        """Return the index (N,) of the cell of each position, or of the nearest cell if it is outside.
+        """Return the index (N,) of the cell of each position; the nearest cell if it is outside.
 
         Args:
             positions: (N, 3) scene coordinates.
@@ -144,7 +143,7 @@ class Occupancy:
         return (x * self.resolution + y) * self.resolution + z
 
     def _nested_cells(self, places: Tensor) -> Tensor:
-        """Return the index (N,) of the cell at each of `places` (N, 3), in cells of the smallest box."""
+        """Return the index (N,) of the cell at each of `places` (N, 3), given in cells of the smallest box."""
         n = self.resolution
         across = places - n / 2
         level = torch.frexp(across.abs().amax(-1) / (n / 2)).exponent.long().clamp(0, self.levels - 1)
@@ -159,7 +158,7 @@ def refresh_occupancy_reference(
     """Compute `refresh_occupancy` of `density`, `occupied`, `decay`, `step`, `threshold` and `elsewhere` in PyTorch."""
     density *= decay
     alpha = -torch.expm1(-density * step)
-    mean = (alpha.nanmean() * (1 - ROUNDING)).nan_to_num(nan=threshold)  # NaN if all are
+    mean = (alpha.nanmean() * (1 - ROUNDING)).nan_to_num(nan=threshold)  # NaN if all values are
     least = mean.clamp(min=elsewhere).clamp(max=threshold)
     occupied.copy_(~(alpha < least))
 
@@ -171,13 +170,13 @@ def refresh_occupancy(
     """Mark, in place, the cells whose opacity over one step is at least a threshold.
 
     Args:
-        density: (n^3,) density of each cell, 1/length, which is multiplied by `decay` in place; infinite if unknown.
-            Cells of NaN are marked, so that a broken field is noticed, and left out of the mean.
-        occupied: (n^3,) bool, to be written.
+        density: (n^3,) density of each cell, 1/length, multiplied by `decay` in place; infinite if unknown. NaN cells
+            are marked, so that a broken field is noticed, and left out of the mean.
+        occupied: (n^3,) bool, written.
         decay: factor of the densities.
         step: length of a step, scene units.
         threshold: minimum opacity, or the mean opacity over all cells if that is less.
-        elsewhere: an opacity that counts for the mean if it is larger, so that a box with nothing in it is emptied.
+        elsewhere: an opacity that replaces the mean if it is larger, so that an empty box is emptied.
     """
     REFRESH_OCCUPANCY((density,), density, occupied, decay, step, threshold, elsewhere)
 
@@ -197,7 +196,7 @@ def _refresh_compiled(
 
 
 def own_cells(levels: int, resolution: int) -> Tensor:
-    """Return the cells (L n^3,) bool of L nested boxes of n^3 cells that are not in the middle, in a smaller box.
+    """Return the cells (L n^3,) bool of L nested boxes of n^3 cells that no smaller box covers.
 
     Args:
         levels: number L of boxes.
@@ -210,7 +209,7 @@ def own_cells(levels: int, resolution: int) -> Tensor:
 
 
 def dilated(occupancy: Occupancy, radius: int) -> Tensor:
-    """Return the cells (T n^3,) bool of one box, `occupancy`, with an occupied one within `radius` along every axis."""
+    """Return the cells (T n^3,) bool of `occupancy`, of one box, with an occupied cell within `radius` on all axes."""
     n = occupancy.resolution
     grid = occupancy.occupied.view(-1, n, n, n)
     for axis in range(1, 4):

@@ -1,4 +1,4 @@
-"""Order of samples by ray, of those that light reached."""
+"""Sorting by ray of the samples that light reached."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def sort_by_ray(owners: Tensor, reached: Tensor, num_rays: int) -> tuple[Tensor,
 
     Args:
         owners: (N,) int64 index of the ray of each sample.
-        reached: (N,) uint8, not 0 for samples that are kept.
+        reached: (N,) uint8, nonzero for samples to keep.
         num_rays: number R of rays.
 
     Raises:

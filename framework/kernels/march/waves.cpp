@@ -1,15 +1,15 @@
-// Marching rays through an occupancy grid, a wave at a time. See ../march.py for the reference.
+// Marching rays through an occupancy grid, one wave at a time. See ../march.py for the reference.
 //
 // A ray's candidates are the steps first + k * step (growing with distance beyond step / cone). A wave finds the next
-// `limit` candidates of every living ray whose middle lies in an occupied cell; blocks of 4^3 empty cells are crossed
-// at once. Of nested boxes, each of twice the size, the smallest that holds the middle says what is there; the middle of
-// a larger box holds what the smaller ones do, so that a box can be crossed by its own blocks up to its faces.
+// `limit` candidates of every active ray whose middle lies in an occupied cell; blocks of 4^3 empty cells are skipped
+// at once. With nested boxes, each twice as large, the smallest box that contains the middle decides. The middle of a
+// larger box covers the smaller ones, so a box can be traversed by its own blocks up to its faces.
 #include "march/waves.h"
 
 using namespace marching;
 
-// One bit a cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at most 255) to a
-// block that holds an occupied cell; from one byte a cell.
+// One bit per cell, and for each block of 4^3 cells its distance (the largest over the axes, in blocks, at most 255) to
+// a block with an occupied cell; computed from one byte per cell.
 EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits, uint8_t* blocks) {
     const int64_t cells = int64_t(resolution) * resolution * resolution, side = (resolution + BLOCK - 1) / BLOCK;
     std::memset(bits, 0, size_t((cells + 7) / 8));
@@ -30,7 +30,7 @@ EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits
             const int64_t b = pass ? side * side * side - 1 - i : i;
             const int64_t at[3] = {b / side / side, b / side % side, b % side};
             int nearest = blocks[b];
-            for (int m = 0; m < 13; m++) {  // the half that this pass has been to
+            for (int m = 0; m < 13; m++) {  // the half that this pass has visited
                 const int n = pass ? 26 - m : m;
                 const int64_t x = at[0] + n / 9 - 1, y = at[1] + n / 3 % 3 - 1, z = at[2] + n % 3 - 1;
                 if (x < 0 || y < 0 || z < 0 || x >= side || y >= side || z >= side) continue;
@@ -41,20 +41,20 @@ EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits
     return DONE;
 }
 
-// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less, for
-// which `elsewhere` stands in if it is larger. The grid of densities is multiplied by `decay` first. NaN is marked and left
-// out of the mean.
+// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. `elsewhere`
+// replaces the mean if it is larger. The grid of densities is multiplied by `decay` first. NaN cells are marked and
+// left out of the mean.
 EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
                              float elsewhere, uint8_t* occupied, int threads) {
     return guarded([&] {
         constexpr int64_t RUN = 32768;
         const int64_t runs = (cells + RUN - 1) / RUN;
-        std::vector<double> opacity(size_t(runs), 0.0);  // of each run, so that the sum does not depend on the threads
+        std::vector<double> opacity(size_t(runs), 0.0);  // per run, so that the sum does not depend on the threads
         std::vector<int64_t> known(size_t(runs), 0);     // cells of each run that are not NaN
         for_ranges(threads, cells, RUN, [&](int64_t i, int64_t end) {
             double& of_run = opacity[size_t(i / RUN)];
             int64_t& numbers_in_run = known[size_t(i / RUN)];
-            const float fade = decay, length = step;  // not captured: what is stored might be they
+            const float fade = decay, length = step;  // copies, because a store might alias captured values
             Floats sum = splat(0);
             Ints numbers = {};
             for (; i + LANES <= end; i += LANES) {
@@ -88,8 +88,8 @@ EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float s
     });
 }
 
-// Where each ray enters and leaves the box, and its first step: `enter` less a share of a step. `hits`: the number of
-// rays that hit the box, whose indices are written to `alive`.
+// The distances at which each ray enters and leaves the box, and its first step: `enter` minus a fraction of a step.
+// `hits`: number of rays that hit the box; their indices are written to `alive`.
 EXPORT int march_begin(const float* origins, const float* directions, const float* nears, const float* fars,
                        const float* shift, int64_t rays, const float* box, float step, float* enter, float* leave,
                        float* first, int64_t* alive, int threads, int64_t* hits) {
@@ -109,7 +109,7 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
                 from = std::max(from, std::min(one, two));
                 to = std::min(to, std::max(one, two));
             }
-            if (nowhere && std::isinf(fars[r])) to = -1;  // a march along it would not end; else its colour shows it
+            if (nowhere && std::isinf(fars[r])) to = -1;  // an infinite march would not end; else the colour is NaN
             enter[r] = std::max(from, nears[r]);
             leave[r] = std::min(to, fars[r]);
             first[r] = enter[r] - (shift ? shift[r] * step : 0);
@@ -121,11 +121,10 @@ EXPORT int march_begin(const float* origins, const float* directions, const floa
     });
 }
 
-// The next samples of each living ray, packed ray by ray. `total`: their number N.
-// box, resolution, levels: the smallest of the nested boxes, cells along an axis of each, and how many there are.
-// slices (R): of a grid of one box, the slice of time that each ray marches through; null if there is one.
-// next (R): the step to go on from, kept up here; counts (A): samples of each living ray.
-// starts, ends (N), owners (N), positions (N, 3) have room for A * limit.
+// The next samples of each active ray, packed ray by ray. `total`: their number N. box, resolution, levels: the
+// smallest nested box, cells along an axis of each box, and number of boxes. slices (R): the time slice of each ray in
+// a grid of one box; null if there is one slice. next (R): the step to continue from, updated here; counts (A): samples
+// of each active ray. starts, ends (N), owners (N), positions (N, 3) have space for A * limit.
 EXPORT int march_wave(const float* origins, const float* directions, const float* enter, const float* leave,
                       const float* first, const int64_t* slices, int32_t* next, const int64_t* alive, int64_t living,
                       int limit, const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
@@ -134,16 +133,16 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
     struct Found {
         std::vector<float> starts, ends;
     };
-    struct Chunk {  // of rays: its samples are found[slot]'s from `begin` on, and belong at `at`
+    struct Chunk {  // of rays: its samples start at found[slot][begin] and are copied to `at`
         int slot;
         int64_t begin, count, at;
     };
     return guarded([&] {
         constexpr int64_t RAYS = 512;
         const int side = (resolution + BLOCK - 1) / BLOCK;
-        const int64_t bytes = (int64_t(resolution) * resolution * resolution + 7) / 8;  // of a slice's bits
-        static thread_local std::vector<Found> kept;  // for fresh memory costs page faults
-        std::vector<Found>& found = kept;             // the caller's, whichever thread looks
+        const int64_t bytes = (int64_t(resolution) * resolution * resolution + 7) / 8;  // of the bits of a slice
+        static thread_local std::vector<Found> kept;  // reused: new memory costs page faults
+        std::vector<Found>& found = kept;             // the caller's, on whichever thread the search runs
         if (found.size() < size_t(threads)) found.resize(size_t(threads));
         for (Found& of_slot : found) of_slot.starts.clear(), of_slot.ends.clear();
         std::vector<Chunk> chunks(size_t((living + RAYS - 1) / RAYS));
@@ -184,8 +183,8 @@ EXPORT int march_wave(const float* origins, const float* directions, const float
     });
 }
 
-// After a wave's densities are known: adds to the optical depth `spent` (R) of each living ray, marks the samples that
-// light still reached, and writes the rays that go on. `left`: the number of those.
+// Called when a wave's densities are known. Adds to the optical depth `spent` (R) of each active ray, marks the samples
+// that light still reached, and writes the rays that continue. `left`: number of these.
 EXPORT int march_advance(const int64_t* alive, int64_t living, const int32_t* counts, int limit, const float* sigma,
                          const float* starts, const float* ends, float budget, float* spent, uint8_t* reached,
                          int64_t* going_on, int64_t* left) {
@@ -194,7 +193,7 @@ EXPORT int march_advance(const int64_t* alive, int64_t living, const int32_t* co
         const int64_t r = alive[i];
         float tau = spent[r];
         for (int s = 0; s < counts[i]; s++, n++) {
-            reached[n] = !(tau >= budget);  // NaN goes on: a broken field must be seen
+            reached[n] = !(tau >= budget);  // NaN continues, so that a broken field is noticed
             tau += sigma[n] * (ends[n] - starts[n]);
         }
         spent[r] = tau;
@@ -204,7 +203,7 @@ EXPORT int march_advance(const int64_t* alive, int64_t living, const int32_t* co
     return DONE;
 }
 
-// Order (M) in which the reached samples of all waves stand ray by ray, and offsets (R + 1). `kept`: M.
+// The order (M) that sorts the reached samples of all waves ray by ray, and offsets (R + 1). `kept`: M.
 EXPORT int sort_by_ray(const int64_t* owners, const uint8_t* reached, int64_t count, int64_t rays, int64_t* order,
                        int64_t* offsets, int64_t* kept) {
     return guarded([&] {
@@ -221,8 +220,8 @@ EXPORT int sort_by_ray(const int64_t* owners, const uint8_t* reached, int64_t co
     });
 }
 
-// Rows of `arrays` arrays, each in `parts` parts that stand one after another; ends holds the number of rows up to the
-// end of each part. Row order[m] of array a, of bytes[a] bytes, becomes row m of out[a]. part[a * parts + p].
+// Rows of `arrays` arrays, each in `parts` consecutive parts; ends holds the number of rows up to the end of each part.
+// Row order[m] of array a, with bytes[a] bytes, becomes row m of out[a]. part[a * parts + p].
 EXPORT int gather_rows(const uint8_t* const* part, const int64_t* bytes, int arrays, const int64_t* ends, int parts,
                        const int64_t* order, int64_t count, uint8_t* const* out, int threads) {
     return guarded([&] {

@@ -1,4 +1,4 @@
-// Rays through an occupancy grid: what the waves of march.cpp and the traces of trace.cpp share. See ../march.py.
+// Rays through an occupancy grid, shared by march.cpp (waves) and trace.cpp (traces). See ../march.py.
 #pragma once
 
 #include "runtime/common.h"
@@ -13,18 +13,18 @@ namespace marching {
 
 constexpr int BLOCK = 4;  // cells along an edge of the coarser level
 
-// x, y, z and a lane that is not used.
+// x, y, z and an unused lane.
 typedef float Four __attribute__((vector_size(16)));
 typedef int32_t FourInts __attribute__((vector_size(16)));
 
 inline Four four(const float* from) { return Four{from[0], from[1], from[2], 0}; }
 
 struct Grid {
-    const uint8_t* bits;    // one bit a cell, 8 cells along z in a byte
-    const uint8_t* blocks;  // one byte a block of 4^3 cells: distance, in blocks, to one that holds an occupied cell
+    const uint8_t* bits;    // one bit per cell, 8 cells along z in a byte
+    const uint8_t* blocks;  // one byte per block of 4^3 cells: distance, in blocks, to one with an occupied cell
     int resolution, side;
 
-    // That of a larger box, `level` times twice the size.
+    // The cell in a box that is 2^level times as large.
     Grid outer(int level) const {
         const int64_t cells = int64_t(resolution) * resolution * resolution, its_blocks = int64_t(side) * side * side;
         return {bits + level * ((cells + 7) / 8), blocks + level * its_blocks, resolution, side};
@@ -39,7 +39,7 @@ struct Grid {
     }
 };
 
-// Where step k of a ray starts: evenly spaced while step > cone * t, then growing by a factor of 1 + cone.
+// Start of step k of a ray: evenly spaced while step > cone * t, then growing by a factor of 1 + cone.
 struct Steps {
     float first, step, inverse, cone;
     float even = std::numeric_limits<float>::infinity();  // steps before they grow
@@ -70,7 +70,7 @@ struct Ray {
         origin = (four(o) - low) * scale;
         direction = four(d) * scale;
         forward = direction > 0;
-        // Along an axis that the ray does not move on, the face behind it is infinitely far ahead.
+        // Along an axis without motion, the face behind is infinitely far ahead.
         inverse = direction == 0 ? Four{} - std::numeric_limits<float>::infinity() : 1 / direction;
     }
     FourInts cell(float t, int resolution) const {
@@ -87,7 +87,7 @@ struct Ray {
         ray.inverse = inverse / size;
         return ray;
     }
-    // The smallest of the nested boxes that holds the place at distance t, or the largest.
+    // The smallest nested box that contains the position at distance t, or the largest box.
     int level(float t, int resolution, int levels) const {
         const Four across = (origin + t * direction - float(resolution) / 2) / (float(resolution) / 2);
         const float farthest = std::max({std::abs(across[0]), std::abs(across[1]), std::abs(across[2])});
@@ -95,25 +95,25 @@ struct Ray {
         std::memcpy(&bits, &farthest, sizeof bits);
         return std::clamp(int(bits >> 23) - 126, 0, levels - 1);
     }
-    // Distance at which the ray leaves the cube of `size` cells that cell c lies in, and `more` cells around it.
+    // Distance at which the ray leaves the cube of `size` cells that contains cell c, plus `more` cells around it.
     float leave(FourInts c, int size, int more) const {
         const FourInts corner = (c & -size) + (forward ? FourInts{} + (size + more) : FourInts{} - more);
         const Four t = (__builtin_convertvector(corner, Four) - origin) * inverse;
         float nearest = std::numeric_limits<float>::infinity();
-        for (int a = 0; a < 3; a++) nearest = std::min(nearest, t[a]);  // the operands' order drops 0 * infinity
+        for (int a = 0; a < 3; a++) nearest = std::min(nearest, t[a]);  // the order of operands drops 0 * infinity
         return nearest;
     }
 };
 
-// Appends the starts and ends of up to `limit` steps; returns how many, and the step to go on from. `smallest` and
-// `first` are the ray and the grid in the smallest of the nested boxes.
+// Appends the starts and ends of up to `limit` steps; returns their number, and the step to continue from. `smallest`
+// and `first` are the ray and the grid in the smallest nested box.
 inline int march_ray(const Ray& smallest, const Steps& steps, const Grid& first, int levels, float enter, float leave, int limit,
               int32_t& next, std::vector<float>& starts, std::vector<float>& ends) {
     int found = 0, level = 0;
     int32_t k = next;
     Ray ray = smallest;
     Grid grid = first;
-    float face = std::numeric_limits<float>::infinity();  // where the ray leaves the box, if there are larger ones
+    float face = std::numeric_limits<float>::infinity();  // where the ray leaves the box, if there are larger boxes
     float start = steps.start(k);
     while (found < limit) {
         const float end = steps.start(k + 1), middle = (start + end) / 2;

@@ -2,10 +2,10 @@
 
 The candidates of a ray are the steps first + k * step, which grow with distance beyond step / cone (Instant-NGP,
 Mueller et al. 2022, appendix E.1). Candidates whose middle lies in an occupied cell are samples. A wave consists of the
-next few samples of every ray that has not ended. When their density is known, `advance` ends rays whose transmittance
-is low, so that hidden samples are never evaluated, and no sample is evaluated twice. In the end, `rest` adds a sample
-for all that is behind the grid. On other devices than the CPU a wave costs more than samples that are evaluated in
-vain: the form in PyTorch takes all in one wave if they are not many.
+next few samples of every active ray. When their density is known, `advance` ends rays with low transmittance. So hidden
+samples are not evaluated, and no sample is evaluated twice. Finally, `rest` adds a sample for all space behind the
+grid. On devices other than the CPU a wave costs more than unnecessary samples: the form in PyTorch takes all samples in
+one wave if they are few.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ RUN = 8
 WAVES = (8, 8, 16, 32, 64, 128)
 """Samples per ray in each wave of a compiled march; the last size repeats."""
 CAPACITY = 2**18
-"""Number of samples up to which the reference takes all candidates in one wave, for the next one means to wait for a
-GPU; about the number in a wave if there are more."""
+"""Number of samples up to which the reference takes all candidates in one wave, because another wave would wait for a
+GPU. With more samples, it is the approximate number per wave."""
 
 
 @dataclass(frozen=True)
 class Wave:
-    """N samples that are evaluated together."""
+    """N samples evaluated together."""
 
     t_starts: Tensor
     """(N,) distance at the start of each interval."""
@@ -74,7 +74,7 @@ class March(ABC):
         self.reached: list[Tensor] = []
         """(N,) uint8 for each wave: 1 for samples in front of which the transmittance is not below `early_stop`."""
         self.longest: int | None = None
-        """Upper bound of the number of samples on a ray; None if finding it would take a pass over them."""
+        """Upper bound of the number of samples on a ray; None if computing it would take a pass over them."""
         self.spent: Tensor
         """(R,) optical depth of the samples so far."""
         self.rested = False
@@ -82,23 +82,23 @@ class March(ABC):
 
     @property
     def next_limit(self) -> int:
-        """The number of samples per ray that the next wave should have at most."""
+        """Maximum number of samples per ray in the next wave."""
         return WAVES[min(len(self.waves), len(WAVES) - 1)]
 
     @abstractmethod
     def wave(self, limit: int) -> Wave | None:
-        """Return up to `limit` samples on each ray that has not ended; None if all have."""
+        """Return up to `limit` samples on each active ray; None if all rays have ended."""
 
     @abstractmethod
     def advance(self, sigma: Tensor) -> None:
-        """End rays whose transmittance is low or that have left the box, by the density `sigma` (N,) of the wave."""
+        """End rays with low transmittance or outside the box, from the densities `sigma` (N,) of the wave."""
 
     @torch.no_grad()
     def rest(self, box: Tensor) -> Wave | None:
-        """Return a last sample on each ray that has light left: all that is behind `box` (2, 3); None if there is none.
+        """Return a last sample, for all space behind `box` (2, 3), on each ray with light left; None if there are none.
 
-        It starts where the ray leaves the box, or where it starts if it misses the box, and ends at the ray's far end,
-        or at three times that distance if this is farther. It is to be called when `wave` has returned None.
+        The sample starts where the ray leaves the box, or where the ray starts if it misses the box. It ends at the
+        ray's far end, or at three times its start if that is farther. Call it when `wave` has returned None.
         """
         owners = (~(self.spent >= self.budget)).nonzero().squeeze(-1)
         if len(owners) == 0:
@@ -189,16 +189,16 @@ class CompiledMarch(March):
 def _chosen(mask: Tensor, owners: Tensor, num_rays: int) -> tuple[Tensor, Tensor, int]:
     """Return indices (M,) of samples, offsets (R + 1,) of their rays, and the maximum number on a ray.
 
-    A device is waited for once, for both numbers, which is as often as by `nonzero`.
+    It waits for the device once, for both numbers, as often as `nonzero` does.
 
     Args:
         mask: (N,) bool, the samples.
-        owners: (N,) int64 ray of each of them, in ascending order.
+        owners: (N,) int64 ray of each sample, in ascending order.
         num_rays: number R of rays.
     """
     counts = owners.new_zeros(num_rays).index_add_(0, owners, mask.long())
     total, longest = torch.stack([counts.sum(), counts.amax()]).tolist() if num_rays else (0, 0)
-    places = torch.where(mask, mask.cumsum(0) - 1, total)  # the others are written behind the end
+    places = torch.where(mask, mask.cumsum(0) - 1, total)  # the others are written past the end
     indices = owners.new_empty(total + 1).scatter_(0, places, torch.arange(len(mask), device=mask.device))[:total]
     return indices, functional.pad(counts.cumsum(0), (1, 0)), longest
 
@@ -218,7 +218,7 @@ class ReferenceMarch(March):
         self.longest, self._in_wave = self._most, 0
         self.spent = rays.origins.new_zeros(len(rays))
         self.alive: Tensor | None = None
-        """(A,) rays that have not ended; None before the first wave, and after one that had all candidates."""
+        """(A,) active rays; None before the first wave, and after a wave with all candidates."""
         self.num_returned = 0
 
     @property
@@ -268,7 +268,7 @@ class ReferenceMarch(March):
     def finish(self) -> tuple[Tensor, Tensor]:
         if self.alive is not None or self.rested or not self.waves:
             return super().finish()
-        # The samples of a single wave are sorted already.
+        # The samples of a single wave are already sorted.
         order, offsets, self.longest = _chosen(self.reached[0] > 0, self.owners, len(self.rays))
         return order, offsets
 
@@ -278,10 +278,10 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
 
     Args:
         rays: R rays.
-        occupancy: the grid, of one box or of several, or with slices of time, for which rays need times.
+        occupancy: the grid, of one or several boxes, or with time slices, for which rays need times.
         step: length of a step near the camera, scene units.
         cone: growth of a step per unit of distance; 0 for even steps.
-        shift: (R,) fraction of a step by which the first step starts in front of the box; None for 0.
+        shift: (R,) fraction of a step by which the first step starts before the box; None for 0.
         early_stop: transmittance below which a ray ends; 0 for never.
     """
     tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
@@ -309,7 +309,7 @@ def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
 def step_range(
     rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return where rays enter and leave the grid, where their first step starts, and how many steps they have.
+    """Return the distances at which rays enter and leave the grid, and of their first step, and the numbers of steps.
 
     `rays`, `occupancy`, `step`, `cone` and `shift` are as in `march`.
 
@@ -344,7 +344,7 @@ def candidates(
     enter, leave, first, counts = step_range(rays, occupancy, step, cone, shift)
     runs_together = cone == 0 and occupancy.levels == 1
     run = RUN if runs_together else 1
-    # The device is waited for three times: for the number of runs, of those near an occupied cell, and of candidates.
+    # Waits for the device three times: for the number of runs, of runs near an occupied cell, and of candidates.
     runs = (counts + run - 1) // run
     owners, k = ranges(runs)
     if runs_together:
@@ -361,9 +361,9 @@ def candidates(
 def _near_occupied(
     rays: Rays, occupancy: Occupancy, step: float, first: Tensor, owners: Tensor, run: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the rays and numbers of the steps in those of the runs, of RUN steps each, that are near an occupied cell.
+    """Return the rays and numbers of the steps near an occupied cell, in runs of RUN steps each.
 
-    `owners` and `run` are ray and number of each run; `rays`, `occupancy`, `step` and `first` are as in `candidates`.
+    `owners` and `run` are ray and index of each run; `rays`, `occupancy`, `step` and `first` are as in `candidates`.
     """
     reach = occupancy.near(math.ceil((RUN - 1) / 2 * step / occupancy.edge))
     middle = first.index_select(0, owners) + (run * RUN + RUN / 2) * step

@@ -1,8 +1,8 @@
-"""Marching through an occupancy grid, in Triton. `nerfloom.kernels.march.waves` says what is computed.
+"""Marching through an occupancy grid, in Triton. `nerfloom.kernels.march.waves` has the definition.
 
-Each thread takes a ray, and crosses empty blocks of cells by their distance to an occupied one, up to the faces of the
-smallest of nested boxes that holds the place. Rays that have ended stay in their places, so that the host waits once a
-wave: for the number of its samples, which has to be known.
+Each thread processes a ray. It skips empty blocks of cells by their distance to an occupied block, up to the faces of
+the smallest nested box that contains the position. Rays that have ended keep their places, so that the host waits once
+per wave: for the number of samples, which it must know.
 """
 
 # Triton gives the kernels' arguments their types.
@@ -25,9 +25,9 @@ from nerfloom.kernels.march.waves import March, Wave
 from nerfloom.kernels.triton_launch import blocks, launch, optical_depth
 
 RAYS, SAMPLES = 32, 256
-"""Rays, and samples, that are taken together."""
+"""Rays, and samples, per program."""
 FARTHEST = 16
-"""Largest distance that is told apart, in blocks."""
+"""Largest distance that is distinguished, in blocks."""
 EDGE = tl.constexpr(CELLS)
 INFINITY = tl.constexpr(math.inf)
 
@@ -54,13 +54,13 @@ def block_distances(occupied: Tensor, resolution: int) -> Tensor:
 
 @triton.jit
 def _slab(origins, directions, box, r, here, axis: tl.constexpr, enter, leave):
-    """Return where rays enter and leave the box, by one axis more."""
+    """Return the distances at which rays enter and leave the box, updated for one more axis."""
     o = tl.load(origins + r * 3 + axis, mask=here, other=0.0)
     d = tl.load(directions + r * 3 + axis, mask=here, other=1.0)
     low, high = tl.load(box + axis), tl.load(box + 3 + axis)
     over = 1 / tl.where(d == 0, 1.0, d)
     one, two = (low - o) * over, (high - o) * over
-    outside = (o < low) | (o > high)  # of a ray parallel to the face
+    outside = (o < low) | (o > high)  # for a ray parallel to the face
     enter = tl.where(d == 0, enter, tl.maximum(enter, tl.minimum(one, two)))
     leave = tl.where(d == 0, tl.where(outside, -1.0, leave), tl.minimum(leave, tl.maximum(one, two)))
     return enter, leave
@@ -88,7 +88,7 @@ def _begin(
 
 @triton.jit
 def _start(first, k, step, even, growth):
-    """Return where steps k start: evenly spaced up to step `even`, then by a factor of 2^growth more each."""
+    """Return the start of steps k: evenly spaced up to step `even`, then growing by a factor of 2^growth each."""
     n = k.to(tl.float32)
     grown = (first + even * step) * tl.exp2((n - even) * growth)
     return tl.where(n <= even, first + n * step, grown)
@@ -103,7 +103,7 @@ def _cell(position, last):
 
 @triton.jit
 def _level(x, y, z, half, levels):
-    """Return the number of the smallest nested box that holds a place, in cells of the smallest of all."""
+    """Return the index of the smallest nested box that contains a position, in cells of the smallest box."""
     far = tl.maximum(tl.maximum(tl.abs(x - half), tl.abs(y - half)), tl.abs(z - half)) / half
     level = (far.to(tl.int32, bitcast=True) >> 23) - 126  # far < 2^level, and not less than half of it
     return tl.minimum(tl.maximum(level, 0), levels - 1)
@@ -111,13 +111,13 @@ def _level(x, y, z, half, levels):
 
 @triton.jit
 def _shrunk(position, size, half):
-    """Return a position in cells of a larger box, where those of the smallest have this size; unchanged if it is 1."""
+    """Return a position in cells of a larger box, whose cells have this size; unchanged if it is 1."""
     return tl.where(size == 1, position, (position - half) * size + half)
 
 
 @triton.jit
 def _leave(position, direction, cell, size, more, resolution):
-    """Return where rays leave the cube of `size` cells of a cell, and `more` around it, or the box, by an axis."""
+    """Return the distance at which rays leave a cell's cube of `size` cells plus `more`, or the box, by an axis."""
     corner = cell - cell % size
     face = tl.where(direction > 0, tl.minimum(corner + size + more, resolution), tl.maximum(corner - more, 0))
     distance = (face.to(tl.float32) - position) / tl.where(direction == 0, 1.0, direction)
@@ -133,7 +133,7 @@ def _wave(
     here = r < rays
     enter, leave = tl.load(enters + r, mask=here, other=0.0), tl.load(leaves + r, mask=here, other=0.0)
     first = tl.load(firsts + r, mask=here, other=0.0)
-    # Where steps begin to grow: at `turn` or where the ray does.
+    # Where steps begin to grow: at `turn`, or at the ray's start.
     even = tl.where(growth > 0, tl.ceil(tl.maximum(turn - first, 0.0) / step), INFINITY)
     base = tl.where(growth > 0, first + even * step, 1.0)
     scale_x = resolution / (tl.load(box + 3) - tl.load(box))
@@ -146,12 +146,12 @@ def _wave(
     dy = tl.load(directions + r * 3 + 1, mask=here, other=0.0) * scale_y
     dz = tl.load(directions + r * 3 + 2, mask=here, other=0.0) * scale_z
     k, found = tl.load(nexts + r, mask=here, other=0), tl.zeros([BLOCK], tl.int32)
-    place, most = r * limit, found + limit  # where a ray's samples are written, and how many at most
+    place, most = r * limit, found + limit  # position of a ray's samples, and their maximum number
     if places is not None:
         place = tl.load(places + r, mask=here, other=0)
         most = tl.load(limits + r, mask=here, other=0).to(tl.int32)
     side, half = (resolution + EDGE - 1) // EDGE, resolution / 2
-    before = tl.zeros([BLOCK], tl.int64)  # slices of time before the ray's, of a grid of one box
+    before = tl.zeros([BLOCK], tl.int64)  # number of time slices before the ray's, for a grid of one box
     if slices is not None:
         before = tl.load(slices + r, mask=here, other=0)
     going = here & (tl.load(alive + r, mask=here, other=0) != 0) & (most > 0)
@@ -170,7 +170,7 @@ def _wave(
         cell = ((box_of * resolution + i) * resolution + j) * resolution + m
         full = going & (distance == 0) & (tl.load(occupied + cell, mask=going, other=0) != 0)
         taken = full & (middle >= enter)
-        if starts is not None:  # else they are counted alone
+        if starts is not None:  # otherwise they are only counted
             tl.store(starts + place + found, start, mask=taken)
             tl.store(ends + place + found, end, mask=taken)
         found += taken.to(tl.int32)
@@ -218,7 +218,7 @@ def _advance(sigma, starts, ends, offsets, counts, spent, alive, reached, budget
     for s in range(limit):
         present = s < count
         n = first + s
-        tl.store(reached + n, tl.where(depth >= budget, 0, 1).to(tl.uint8), mask=present)  # NaN must be seen
+        tl.store(reached + n, tl.where(depth >= budget, 0, 1).to(tl.uint8), mask=present)  # NaN must be noticed
         length = tl.load(ends + n, mask=present, other=0.0) - tl.load(starts + n, mask=present, other=0.0)
         depth += optical_depth(tl.load(sigma + n, mask=present, other=0.0), length)
     tl.store(spent + r, depth, mask=here)
@@ -277,14 +277,14 @@ class TritonMarch(March):
         self, limit: int, counts: Tensor, starts: Tensor | None = None, ends: Tensor | None = None,
         places: Tensor | None = None, limits: Tensor | None = None,
     ) -> None:  # fmt: skip
-        """March on with each ray that has not ended, and write down its samples.
+        """Continue the march of each active ray, and write its samples.
 
         Args:
-            limit: most samples of a ray.
-            counts: (R,) int32, is given the number of samples of each ray.
-            starts, ends: where samples begin and end; None to count them alone.
-            places: (R,) int64 where the samples of a ray are written to; if None, `limit` places a ray.
-            limits: (R,) int64 most samples of each ray, in place of `limit`; with `places`.
+            limit: maximum number of samples per ray.
+            counts: (R,) int32, receives the number of samples of each ray.
+            starts, ends: receive the starts and ends of samples; None to only count them.
+            places: (R,) int64 positions for the samples of each ray; if None, each ray has `limit` positions.
+            limits: (R,) int64 maximum number of samples of each ray, instead of `limit`; with `places`.
         """
         rays = len(self.spent)
         launch(

@@ -1,8 +1,8 @@
 // Small fully connected networks, ReLU between layers, in float32. See ../mlp.py for the reference.
 //
-// Samples go through all layers in blocks that stay in cache; nothing but the result leaves it. The backward pass
-// computes a block's hidden layers again, which costs less than writing them to memory and reading them back. Samples
-// whose incoming gradient is zero (hidden ones) are left out of it.
+// Samples pass through all layers in blocks that stay in cache; only the result leaves it. The backward pass recomputes
+// a block's hidden layers, which costs less than writing them to memory and reading them back. Samples with zero
+// incoming gradient (hidden ones) are skipped.
 #include "networks/mlp_calls.h"
 
 #include <utility>
@@ -12,7 +12,7 @@ using namespace mlp;
 
 namespace {
 
-// y (rows, width) = x (rows, inner) w (inner, width), all row-major; width a whole number of vectors, rows of ROWS.
+// y (rows, width) = x (rows, inner) w (inner, width), all row-major; width is a multiple of a vector, rows of ROWS.
 template <int ROWS, int VECTORS>
 inline void product_tile(const float* x, int ldx, const float* w, int ldw, int inner, float* y, int ldy) {
     Floats sum[ROWS][VECTORS];
@@ -41,7 +41,7 @@ inline void product_columns(const float* x, int ldx, const float* w, int ldw, in
         product_tile<ROWS, VECTORS>(x + r * ldx, ldx, w, ldw, inner, y + r * ldy, ldy);
 }
 
-// How many vectors of a row are summed at once: as many as leave every sum in a register.
+// Number of vectors of a row summed at once: as many as registers hold.
 constexpr int WIDE = LANES == 16 ? 4 : 2;
 
 void product(const float* x, int ldx, const float* w, int inner, int width, float* y, int ldy) {
@@ -83,7 +83,7 @@ inline void outer_columns(const float* x, int ldx, const float* dy, int ldy, int
         outer_tile<INNER, VECTORS>(x + k, ldx, dy, ldy, dw + k * width, width);
 }
 
-// inner is a whole number of vectors.
+// inner is a multiple of a vector.
 void outer_product(const float* x, int ldx, const float* dy, int ldy, int inner, float* dw, int width) {
     int column = 0;
     for (; column + WIDE * LANES <= width; column += WIDE * LANES)
@@ -94,7 +94,7 @@ void outer_product(const float* x, int ldx, const float* dy, int ldy, int inner,
         outer_columns<LANES == 16 ? 16 : LANES == 8 ? 8 : 4, 1>(x, ldx, dy + column, ldy, inner, dw + column, width);
 }
 
-struct Float {  // as mlp_calls.h wants a form
+struct Float {  // a form for mlp_calls.h
     typedef float Value;
     struct Prepared {};
 
@@ -131,7 +131,7 @@ struct Float {  // as mlp_calls.h wants a form
         float* output(const Network& net) { return layer[net.layers]; }
     };
 
-    struct Gradient {  // of one layer and of that before it, in turns
+    struct Gradient {  // of one layer and of the previous one, alternating
         alignas(64) float first[BLOCK * MAX_WIDTH], second[BLOCK * MAX_WIDTH];
     };
 
@@ -186,7 +186,7 @@ std::unique_ptr<Layers> mlp::layers_bf16_of(const int64_t*, int, const float* co
 #endif
 
 // The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
-// density (count), or null: exp of the first output, which is at most exp(15).
+// density (count), or null: exp of the first output, clamped at exp(15).
 EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                        const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
                        int activation, float* out, float* density, int threads) {
@@ -197,7 +197,7 @@ EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, i
 }
 
 // The gradients of the output, `grad`, and of the density may be null.
-// Writes the inputs' gradients (parts that are null are left out) and the weights', (outputs, inputs) like them.
+// Writes the gradients of the inputs (null parts are skipped) and of the weights, (outputs, inputs).
 EXPORT int mlp_backward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                         const int64_t* widths, int layers, const float* const* weights, const float* const* biases,
                         int activation, const float* grad, const float* density, const float* density_grad,

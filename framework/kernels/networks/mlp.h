@@ -1,4 +1,4 @@
-// The parts of both forms of the small networks: mlp.cpp in float32, mlp_bf16.cpp in bfloat16. mlp_calls.h joins them.
+// Shared by both forms of the small networks: mlp.cpp in float32, mlp_bf16.cpp in bfloat16. mlp_calls.h combines them.
 #pragma once
 
 #include "runtime/common.h"
@@ -10,9 +10,9 @@ namespace mlp {
 
 constexpr int BLOCK = 32;
 constexpr int MAX_LAYERS = 8;
-constexpr int MAX_WIDTH = 384;  // K-Planes' explicit basis; D-NeRF's layer that is fed the encoded position again: 328
+constexpr int MAX_WIDTH = 384;  // K-Planes' explicit basis; D-NeRF's skip layer has 328
 
-constexpr int64_t FORWARD_ROWS = 8 * BLOCK;  // that a thread takes through the network before it takes others
+constexpr int64_t FORWARD_ROWS = 8 * BLOCK;  // rows that a thread processes at a time
 
 inline void check_sizes(const int64_t* widths, int layers) {
     if (layers < 1 || layers > MAX_LAYERS) throw std::invalid_argument("a network has 1 to 8 layers");
@@ -33,7 +33,7 @@ inline void activate(float* values, int64_t count, int activation) {
     }
 }
 
-// Rows of a block plus a layer's bias, `wide` long; ReLU behind it where asked for.
+// Adds a layer's bias to the rows of a block, `wide` long, followed by ReLU if requested.
 inline void add_bias(float* values, const float* bias, int wide, bool relu) {
     for (int r = 0; r < BLOCK; r++)
         for (int i = 0; i < wide; i += LANES) {
@@ -50,7 +50,7 @@ inline void add_rows(const float* grad, int wide, float* sums) {
         for (int i = 0; i < wide; i += LANES) store(sums + i, load(sums + i) + load(grad + r * wide + i));
 }
 
-// The density of a block's first rows, if its first output is the logarithm. See ../math.py (truncated_exp).
+// The density of a block's first rows, if the first output is its logarithm. See ../math.py (truncated_exp).
 inline void write_density(const float* output, int wide, int rows, float* density) {
     constexpr float MAX_LOG_DENSITY = 15;
     alignas(64) float values[BLOCK];
@@ -62,7 +62,7 @@ inline void write_density(const float* output, int wide, int rows, float* densit
     std::memcpy(density, values, sizeof(float) * rows);
 }
 
-struct Inputs {  // the network's input, in parts that stand side by side
+struct Inputs {  // the network's input, in parts side by side
     int parts;
     const float* const* part;
     const int64_t* width;
@@ -77,19 +77,19 @@ struct Inputs {  // the network's input, in parts that stand side by side
     }
 };
 
-// A network for other kernels. What a row's backward pass needs, its input and hidden activations, stands in a record.
+// A network for other kernels. A record holds a row's input and hidden activations for the backward pass.
 struct Layers {
     virtual ~Layers() = default;
     virtual size_t record() const = 0;  // bytes
     virtual size_t sums() const = 0;    // floats of the gradients of all weights
-    // Rows of one input (count, inputs) to out (count, outputs) and, unless null, to density (count) and records.
+    // Rows of the input (count, inputs) to out (count, outputs) and, unless null, to density (count) and records.
     virtual void forward(const float* in, int64_t count, int activation, float* out, float* density,
                          char* records) const = 0;
-    // Of up to BLOCK rows, whose records are `rows`: from the gradient (count, outputs) before the activation function
-    // of the output to that of the input (count, inputs). Adds to `sums`.
+    // For up to BLOCK rows with records `rows`: from the gradient (count, outputs) before the output's activation
+    // function to the gradient of the input (count, inputs). Adds to `sums`.
     virtual void backward(const char* records, const int64_t* rows, int count, const float* grad, float* sums,
                           float* input_grad) const = 0;
-    // The weights' gradients, from the sums of all parts.
+    // The gradients of the weights, from the sums of all parts.
     virtual void write(float* sums, int64_t parts, int threads, float* const* weight_grads) const = 0;
 };
 
@@ -102,7 +102,7 @@ inline bool is_zero(const float* values, int count) {
     return true;
 }
 
-struct Incoming {  // gradients of the output, `width` wide, and of the density, which is its own derivative; or null
+struct Incoming {  // gradients of the output, `width` wide, and of the density (its own derivative); or null
     const float *grad, *density, *density_grad;
     int width;
 
@@ -132,7 +132,7 @@ inline void read_output_gradient(const Incoming& incoming, int wide, const int64
     }
 }
 
-// Up to BLOCK rows of [next, end) whose gradient is not zero; the input gradient of the others is set to zero.
+// Up to BLOCK rows of [next, end) with a nonzero gradient; the input gradient of the others is set to zero.
 inline int live_rows(const Incoming& incoming, float* const* input_grads, const Inputs& input, int64_t& next,
                      int64_t end, int64_t* rows) {
     int size = 0;
@@ -147,7 +147,7 @@ inline int live_rows(const Incoming& incoming, float* const* input_grads, const 
     return size;
 }
 
-// Rows of the input's gradient (wide apart) to where they belong.
+// Copies rows of the input's gradient (wide apart) to their positions.
 inline void write_input_gradient(const float* from, int wide, const Inputs& input, const int64_t* rows, int size,
                                  float* const* input_grads) {
     for (int r = 0; r < size; r++) {
@@ -158,8 +158,7 @@ inline void write_input_gradient(const float* from, int wide, const Inputs& inpu
     }
 }
 
-// Where the gradients of all weights and biases are added up: of a layer (wide inputs, wide outputs), and one more row
-// for the bias.
+// Sums of the gradients of all weights and biases: per layer (wide inputs, wide outputs), plus one row for the bias.
 struct Sums {
     int layers;
     const int* wide;  // widths in whole vectors, of the input and each layer
@@ -172,7 +171,7 @@ struct Sums {
             size += size_t(wide[l] + 1) * size_t(wide[l + 1]);
         }
     }
-    // Those of all parts, added in their order, to the gradients of the weights (outputs, inputs) and biases (outputs),
+    // Adds the sums of all parts, in order, to the gradients of the weights (outputs, inputs) and biases (outputs),
     // which may be null.
     void write(float* sums, int64_t parts, int threads, const int* width, float* const* weight_grads,
                float* const* bias_grads) const {
@@ -193,14 +192,14 @@ struct Sums {
     }
 };
 
-// The gradients of all weights and biases, in one sum for each part of the samples: what a part's is does not depend on
-// the threads, and parts are added in their order, so the same bits come out however many threads there are.
+// The gradients of all weights and biases, in one sum per part of the samples. The parts do not depend on the threads
+// and are added in order, so the result has the same bits for any number of threads.
 struct WeightSums : Sums {
-    int64_t parts, rows;  // rows: of a part
+    int64_t parts, rows;  // rows per part
     int threads;
     std::vector<float>& sums;
 
-    // Large networks get fewer parts, for their sums would not stay in cache.
+    // Large networks get fewer parts, because their sums would not stay in cache.
     WeightSums(int64_t count, int layers, const int* wide, int threads)
         : Sums(layers, wide), threads(threads), sums(kept()), count(count) {
         constexpr int64_t ROWS = 1024, FEWEST = 16, FLOATS = 1 << 19;
@@ -222,7 +221,7 @@ struct WeightSums : Sums {
 
 private:
     int64_t count;
-    static std::vector<float>& kept() {  // by each thread that calls, for fresh memory costs page faults
+    static std::vector<float>& kept() {  // per calling thread: new memory costs page faults
         static thread_local std::vector<float> sums;
         return sums;
     }

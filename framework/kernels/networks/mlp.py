@@ -23,7 +23,7 @@ T = TypeVar("T")
 Activation = Literal["none", "relu", "sigmoid"]
 """Activation function of the output."""
 CODES: dict[Activation, int] = {"none": 0, "relu": 1, "sigmoid": 2}
-"""Number of each activation function in the compiled kernels."""
+"""Code of each activation function in the compiled kernels."""
 MAX_WIDTH = 384
 """Maximum number of features of a layer in the compiled kernels."""
 MAX_LAYERS = 8
@@ -64,7 +64,7 @@ _backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppppi")
 class _MLP(torch.autograd.Function):
     """The compiled form of `mlp`, or of `density_mlp` if the plan says so, whose results it returns.
 
-    Backward computes hidden layers again, and skips samples whose gradient is 0.
+    Backward recomputes hidden layers, and skips samples whose gradient is 0.
     """
 
     @staticmethod
@@ -86,7 +86,7 @@ class _MLP(torch.autograd.Function):
         if not plan.density:
             ctx.save_for_backward(*tensors)
             return out
-        # Where the output was taken from a recorded call, so is the density.
+        # If the output comes from a recorded call, so does the density.
         found = result_cache.result(
             ("density",), (out,), (), lambda: split_density(out)[0] if density is None else density
         )
@@ -133,13 +133,13 @@ class _Plan:
     density: bool = False
 
     def split(self, values: Sequence[T]) -> tuple[Sequence[T], Sequence[T], Sequence[T]]:
-        """Return the inputs, the weights, and the biases, of which there is none or one per layer."""
+        """Return the inputs, the weights, and the biases (none, or one per layer)."""
         last = self.inputs + self.layers
         return values[: self.inputs], values[self.inputs : last], values[last:]
 
 
 class _Call:
-    """The checked arguments that forward and backward share; it keeps the C arrays alive."""
+    """The checked arguments shared by forward and backward; it keeps the C arrays alive."""
 
     def __init__(self, plan: _Plan, tensors: Sequence[Tensor]) -> None:
         inputs, weights, biases = plan.split(tensors)
@@ -173,7 +173,7 @@ def mlp(
     CPU has instructions for that, and computes in float32 otherwise.
 
     Args:
-        inputs: parts (N, D_i) of the input, as if concatenated along the features, but without a copy.
+        inputs: parts (N, D_i) of the input, treated as concatenated along the features, without a copy.
         weights: (D_out, D_in) weights of each layer, as in `torch.nn.Linear`.
         activation: activation function of the output.
         biases: (D_out,) biases of each layer; None for no biases.
@@ -218,7 +218,7 @@ def _compiled(
 
 
 def multiplies_bf16() -> bool:
-    """Return whether networks multiply in bfloat16: under autocast, on processors that do."""
+    """Return whether networks multiply in bfloat16: under autocast, on processors that support it."""
     return torch.is_autocast_enabled("cpu") and native.has("mlp_forward_bf16")
 
 
@@ -233,7 +233,7 @@ def density_mlp(
 ) -> tuple[Tensor, Tensor]:
     """Return the density (N,) and the outputs (N, D_out) of a network whose first output is the log-density.
 
-    It is `nerfloom.kernels.math.split_density` of `mlp`, without passes of its own over the outputs and their
+    It equals `nerfloom.kernels.math.split_density` of `mlp`, without separate passes over the outputs and their
     gradient.
 
     Args:

@@ -1,8 +1,8 @@
 // The small networks of mlp.cpp with bfloat16 products and float32 sums, for processors that multiply bfloat16.
 //
-// Activations are rows of bfloat16, weights pairs of rows interleaved, as VDPBF16PS wants them: one instruction adds
-// two products to each of 16 sums. Tiles (AMX), which one processor family has, want the same: one instruction adds 32
-// products to each of 16 x 16 sums.
+// Activations are rows of bfloat16; weights are interleaved pairs of rows, as VDPBF16PS requires: one instruction adds
+// two products to each of 16 sums. Tiles (AMX), which one processor family has, use the same layout: one instruction
+// adds 32 products to each of 16 x 16 sums.
 #include "networks/mlp_calls.h"
 
 #if defined(__AVX512BF16__)
@@ -34,7 +34,7 @@ inline __m512bh pair(const Half* from) {
     return (__m512bh)_mm512_set1_epi32(bits);
 }
 
-// Pairs of rows interleaved, as the sum over rows wants them: to[r / 2][column][r % 2].
+// Interleaves pairs of rows, for the sum over rows: to[r / 2][column][r % 2].
 void interleave(const Half* from, int width, Half* to) {
     alignas(64) static const uint16_t ORDER[2][32] = {
         {0, 32, 1, 33, 2, 34, 3, 35, 4, 36, 5, 37, 6, 38, 7, 39, 8, 40, 9, 41, 10, 42, 11, 43, 12, 44, 13, 45, 14, 46,
@@ -54,13 +54,13 @@ void interleave(const Half* from, int width, Half* to) {
 
 #if defined(__AMX_BF16__)
 
-// How many inner products a layer's are rounded up to, which are of zeros.
+// The inner products of a layer are padded with zeros to a multiple of this number.
 constexpr int DEPTH = 32;
 
-// What was written so far is in memory: GCC's instructions for tiles do not say all that they read.
+// Everything written so far is in memory: GCC's tile instructions do not declare all that they read.
 inline void written(const void* at = nullptr) { __asm__ volatile("" ::"r"(at) : "memory"); }
 
-// The processor's tiles, which a thread has to set up, and to leave so that others need not save them.
+// The processor's tiles. A thread must configure them, and release them so that others need not save them.
 struct Tiles {
     Tiles() {
         struct alignas(64) {
@@ -76,7 +76,7 @@ struct Tiles {
     Tiles& operator=(const Tiles&) = delete;
 };
 
-// y (BLOCK, width) float = x (BLOCK, inner) bf16 times w, whose rows are interleaved in pairs: w[k / 2][column][k % 2].
+// y (BLOCK, width) float = x (BLOCK, inner) bf16 times w with interleaved pairs of rows: w[k / 2][column][k % 2].
 // width is a multiple of 16, inner of DEPTH.
 void product(const Half* x, int ldx, const Half* w, int width, int inner, float* y, int ldy) {
     written();
@@ -134,7 +134,7 @@ inline void transpose(const Half* from, int64_t from_row, Half* to, int64_t to_r
         a[i + 2] = _mm512_unpacklo_epi64(b[i + 1], b[i + 3]);
         a[i + 3] = _mm512_unpackhi_epi64(b[i + 1], b[i + 3]);
     }
-    // a[4 i + c] has of columns c, c + 4, c + 8, c + 12 (a quarter of the vector each) the rows 4 i to 4 i + 3.
+    // a[4 i + c] has the rows 4 i to 4 i + 3 of columns c, c + 4, c + 8, c + 12 (a quarter of the vector each).
 #pragma GCC unroll 4
     for (int c = 0; c < 4; c++) {
         const __m512i even = _mm512_shuffle_i32x4(a[c], a[4 + c], 0x88), odd = _mm512_shuffle_i32x4(a[c], a[4 + c], 0xdd);
@@ -171,7 +171,7 @@ constexpr int DEPTH = 2;
 
 struct Tiles {};
 
-// y (BLOCK, width) float = x (BLOCK, inner) bf16 times w, whose rows are interleaved in pairs: w[k / 2][column][k % 2].
+// y (BLOCK, width) float = x (BLOCK, inner) bf16 times w with interleaved pairs of rows: w[k / 2][column][k % 2].
 template <int ROWS, int VECTORS>
 inline void product_columns(const Half* x, int ldx, const Half* w, int width, int inner, float* y, int ldy) {
     for (int first = 0; first < BLOCK; first += ROWS) {
@@ -258,7 +258,7 @@ void add_halves(const Half* grad, int rows, int columns, float* sums) {
         }
 }
 
-// Rows of float (columns wide) to rows of bf16 (rows wide), where `keep` is positive if it is given.
+// Rows of float (columns wide) to rows of bf16 (rows wide), where `keep`, if given, is positive.
 void to_halves(const float* from, int columns, Half* to, int rows, bool relu, const Half* keep) {
     const __m512 zero = _mm512_setzero_ps();
     for (int r = 0; r < BLOCK; r++)
@@ -278,15 +278,15 @@ void to_halves(const float* from, int columns, Half* to, int rows, bool relu, co
         }
 }
 
-struct Bfloat16 {  // as mlp_calls.h wants a form
+struct Bfloat16 {  // a form for mlp_calls.h
     typedef Half Value;
     typedef Tiles Prepared;
 
     struct Network {
         int layers;
         int width[MAX_LAYERS + 1] = {};
-        int rows[MAX_LAYERS + 1] = {};     // width in whole pairs of vectors: of a row of activations
-        int columns[MAX_LAYERS + 1] = {};  // width in whole vectors: of what is summed
+        int rows[MAX_LAYERS + 1] = {};     // width of a row of activations, in whole pairs of vectors
+        int columns[MAX_LAYERS + 1] = {};  // width of a row of sums, in whole vectors
         std::vector<Half> forward[MAX_LAYERS], backward[MAX_LAYERS];
         std::vector<float> bias[MAX_LAYERS];  // of whole vectors, or none
 
@@ -319,7 +319,7 @@ struct Bfloat16 {  // as mlp_calls.h wants a form
     struct Block {
         alignas(64) Half layer[MAX_LAYERS][BLOCK * MAX_WIDTH];  // the input and hidden activations
         alignas(64) float last[BLOCK * MAX_WIDTH];              // the output
-        alignas(64) float scratch[BLOCK * MAX_WIDTH];           // what a layer gives, on both ways
+        alignas(64) float scratch[BLOCK * MAX_WIDTH];           // a layer's result, forward and backward
 
         float* output(const Network&) { return last; }
     };
@@ -379,7 +379,7 @@ std::unique_ptr<Layers> mlp::layers_bf16_of(const int64_t* widths, int layers, c
     return without_biases<Bfloat16>(widths, layers, weights);
 }
 
-// As mlp_forward and mlp_backward.
+// Like mlp_forward and mlp_backward.
 EXPORT int mlp_forward_bf16(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                             const int64_t* widths, int layers, const float* const* weights,
                             const float* const* biases, int activation, float* out, float* density, int threads) {

@@ -1,4 +1,4 @@
-// What can be asked of a network, written once for both forms (mlp.cpp in float32, mlp_bf16.cpp in bfloat16).
+// The calls of a network, written once for both forms (mlp.cpp in float32, mlp_bf16.cpp in bfloat16).
 //
 // A form has
 //   Value, the type of an activation;
@@ -16,8 +16,8 @@
 
 namespace mlp {
 
-// The rows [begin, end) of the input to those of the output, and of the density, which may be null. each(first, size,
-// block) sees every block.
+// Computes the output and the density, which may be null, of the rows [begin, end) of the input. each(first, size,
+// block) is called for every block.
 template <typename Form, typename Each>
 void take_through(const typename Form::Network& net, const Inputs& input, int64_t begin, int64_t end, int activation,
                   float* out, float* density, const Each& each) {
@@ -46,7 +46,7 @@ struct LayersOf final : Layers {
 
     typename Form::Network net;
     Sums places;
-    size_t values = 0;  // of a record
+    size_t values = 0;  // values in a record
 
     LayersOf(const int64_t* widths, int layers, const float* const* weights, const float* const* biases)
         : net(widths, layers, weights, biases), places(layers, net.columns) {
@@ -98,7 +98,7 @@ std::unique_ptr<Layers> without_biases(const int64_t* widths, int layers, const 
     return std::make_unique<LayersOf<Form>>(widths, layers, weights, none);
 }
 
-// As mlp_forward.
+// Like mlp_forward.
 template <typename Form>
 void forward(const Inputs& input, int64_t count, const int64_t* widths, int layers, const float* const* weights,
              const float* const* biases, int activation, float* out, float* density, int threads) {
@@ -110,7 +110,7 @@ void forward(const Inputs& input, int64_t count, const int64_t* widths, int laye
     });
 }
 
-// As mlp_backward.
+// Like mlp_backward.
 template <typename Form>
 void backward(const Inputs& input, int64_t count, const int64_t* widths, int layers, const float* const* weights,
               const float* const* biases, int activation, const float* grad, const float* density,

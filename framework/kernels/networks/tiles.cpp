@@ -1,4 +1,4 @@
-// Linux gives a process the processor's tiles (AMX), 8 KiB of registers a thread, when it asks for them.
+// Requests the processor's tiles (AMX) from Linux: 8 KiB of registers per thread.
 #include "runtime/common.h"
 
 #if defined(__AMX_TILE__)
@@ -6,7 +6,7 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-// What is in the way, as where the system is too old, or some thread's stack for signals has no room; null if nothing is.
+// The obstacle, such as an old system or a signal stack that is too small on some thread; null if there is none.
 EXPORT const char* ask_for_tiles() {
     constexpr int REQUEST = 0x1023, TILE_DATA = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
     if (syscall(SYS_arch_prctl, REQUEST, TILE_DATA) == 0) return nullptr;

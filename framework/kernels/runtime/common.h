@@ -1,7 +1,7 @@
-// What every kernel shares: the exported C interface, vectors.
+// Shared by all kernels: the exported C interface, and vectors.
 //
-// The code uses the compiler's vectors of LANES floats (GCC and Clang on any processor); the library is built once for
-// each instruction set and the right one is chosen when it is loaded (framework/kernels/native.py).
+// The code uses the compiler's vectors of LANES floats (GCC and Clang on any processor). The library is built once for
+// each instruction set, and framework/kernels/native.py loads the right one.
 #pragma once
 
 #include "runtime/parallel.h"
@@ -41,7 +41,7 @@ static inline Floats load(const float* from) {
 
 static inline void store(float* to, Floats value) { std::memcpy(to, &value, sizeof value); }
 
-// a > b ? a : b, so b where one is NaN, and a < b ? a : b: one instruction, which compilers make two of.
+// a > b ? a : b, so b if one is NaN, and a < b ? a : b: one instruction, where compilers generate two.
 static inline Floats larger(Floats a, Floats b) {
 #if defined(__AVX512F__)
     return (Floats)_mm512_max_ps((__m512)a, (__m512)b);
@@ -95,7 +95,7 @@ static inline Floats exponential(Floats x) {
     return x == x ? value : x;  // NaN stays NaN
 }
 
-// 1 - exp(-x), where subtracting would leave nothing of x below 6e-8.
+// 1 - exp(-x); a subtraction would lose all of x below 6e-8.
 static inline Floats opacity_of(Floats x) {
     Floats power, rest;
     split_exponential(-x, power, rest);
@@ -105,7 +105,7 @@ static inline Floats opacity_of(Floats x) {
 
 constexpr float MAX_OPTICAL_DEPTH = 1e3f, MAX_FLOAT = 3.402823466e38f;
 
-// Of an interval; see ../compositing.py.
+// Optical depth of an interval; see ../compositing.py.
 static inline float optical_depth(float sigma, float delta) {
     const float density = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
     const float length = delta > MAX_FLOAT ? MAX_FLOAT : delta;
@@ -113,7 +113,7 @@ static inline float optical_depth(float sigma, float delta) {
     return tau > MAX_OPTICAL_DEPTH ? MAX_OPTICAL_DEPTH : tau;
 }
 
-// Its derivative by sigma: 0 where it is cut off, and in an interval without end.
+// Its derivative by sigma: 0 if it is clamped, and for an infinite interval.
 static inline float depth_slope(float sigma, float delta) {
     return sigma * delta > MAX_OPTICAL_DEPTH || delta > MAX_FLOAT ? 0 : delta;
 }

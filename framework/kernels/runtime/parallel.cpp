@@ -1,5 +1,5 @@
-// The threads of parallel.h. They start when first asked for, stay, and are never joined: at the process's end the
-// system takes them.
+// The threads of parallel.h. They start when first needed and stay. They are never joined: the system ends them with
+// the process.
 #include "runtime/parallel.h"
 
 #include <atomic>
@@ -22,12 +22,12 @@ namespace {
 typedef std::chrono::steady_clock Clock;
 using std::chrono::microseconds;
 
-// How long a thread looks out for work, or for the end of a region, before it sleeps. Where it has a core to itself,
-// longer than most gaps between the regions of a step: being woken takes tens of microseconds. Where another program
-// wants the core, looking out uses up the time that the system would give us later.
+// Time for which a thread polls for work, or for the end of a region, before it sleeps. If a thread has a core to
+// itself, this is longer than most gaps between the regions of a step, because a wake-up takes tens of microseconds. If
+// another program needs the core, polling uses up time that the system would otherwise give us later.
 constexpr microseconds PATIENCE(2000), CROWDED_PATIENCE(10);
 
-// A look at the clock that takes longer than this means that the thread was not running meanwhile.
+// Reading the clock takes longer than this only if the thread was not running meanwhile.
 constexpr microseconds INTERRUPTION(100);
 constexpr auto CROWDED_FOR = std::chrono::milliseconds(100);  // after an interruption
 
@@ -41,7 +41,7 @@ inline void relax() {
 #endif
 }
 
-// Whether `ready` came true while one could wait for it awake.
+// Whether `ready` came true while polling.
 template <typename Ready>
 bool soon(const Ready& ready) {
     const auto start = Clock::now();
@@ -60,7 +60,7 @@ bool soon(const Ready& ready) {
     }
 }
 
-// Sleeping until something has come about, which whoever brings it about makes known by `wake`.
+// Sleeps until an event; the thread that causes the event calls `wake`.
 class Bed {
     std::mutex mutex;
     std::condition_variable changed;
@@ -71,7 +71,7 @@ public:
     void wait(const Ready& ready) {
         if (soon(ready)) return;
         std::unique_lock<std::mutex> lock(mutex);
-        asleep.store(true);  // before `ready` looks: it sees the change, or `wake` sees that somebody sleeps
+        asleep.store(true);  // before `ready` is called: it sees the change, or `wake` sees a sleeping thread
         changed.wait(lock, ready);
         asleep.store(false);
     }
@@ -83,9 +83,9 @@ public:
 };
 
 class Pool {
-    // What is left to take: threads that may take part in the upper half, chunks that nobody has begun in the lower.
-    // Whoever lowers it by one owns a chunk of the present region, which cannot end before that chunk is done; the
-    // fields below are of the present region for as long.
+    // Remaining work: threads that may take part in the upper half, unstarted chunks in the lower half. A thread that
+    // decrements it owns a chunk of the current region, which cannot end before that chunk is done. Until then the
+    // fields below belong to that region.
     std::atomic<uint64_t> left{0};
     std::atomic<int64_t> done{0};
     int64_t chunks = 0;
@@ -95,7 +95,7 @@ class Pool {
     std::exception_ptr error;
     std::mutex error_mutex;
     Bed caller;
-    std::vector<std::unique_ptr<Bed>> beds;  // of each thread but the caller
+    std::vector<std::unique_ptr<Bed>> beds;  // one per thread except the caller
     std::mutex region;
 
     bool may_take(int slot) const {
@@ -103,7 +103,7 @@ class Pool {
         return uint32_t(state) > 0 && int(state >> 32) > slot;
     }
 
-    // Takes chunks until there are none.
+    // Takes chunks until none are left.
     void work(int slot) {
         for (uint64_t state = left.load(); uint32_t(state) > 0 && int(state >> 32) > slot;) {
             if (!left.compare_exchange_weak(state, state - 1)) continue;
@@ -129,14 +129,14 @@ class Pool {
         }
     }
 
-    // As many threads as there can be, up to `threads` with the caller's.
+    // Starts up to `threads` threads, including the caller's.
     void start(int threads) {
         while (int(beds.size()) + 1 < threads) {
             beds.emplace_back(new Bed);
             const int slot = int(beds.size());
             try {
                 std::thread([this, slot] { stay(slot); }).detach();
-            } catch (const std::system_error&) {  // a limit of the system's: fewer do
+            } catch (const std::system_error&) {  // a system limit: fewer threads suffice
                 beds.pop_back();
                 return;
             }
@@ -144,11 +144,11 @@ class Pool {
     }
 
 public:
-    Pool() { beds.reserve(MOST); }  // threads keep references to their own
+    Pool() { beds.reserve(MOST); }  // threads keep references to their own beds
 
     static constexpr int MOST = 4096;
 
-    // False where another thread of the process is in a region.
+    // False if another thread of the process is in a region.
     bool run(int threads, int64_t count, ChunkFunction what, const void* on) {
         const std::unique_lock<std::mutex> lock(region, std::try_to_lock);
         if (!lock.owns_lock()) return false;
@@ -170,7 +170,7 @@ public:
     }
 
 private:
-    // Signals are for the threads of the program, not for these.
+    // Signals are handled by the program's threads, not by these.
     void start_quietly(int threads) {
         if (int(beds.size()) + 1 >= threads) return;
 #if !defined(_WIN32)
@@ -187,7 +187,7 @@ private:
 
 std::atomic<Pool*> pool{nullptr};
 
-// Of a process that was forked, which has none of its parent's threads: it begins anew.
+// In a forked process, which has none of its parent's threads: start anew.
 void forget_pool() { pool.store(nullptr); }
 
 Pool& the_pool() {

@@ -1,9 +1,9 @@
-// Sharing work out over threads: chunks that whichever thread is free takes.
+// Distribution of work over threads: each chunk is taken by whichever thread is free.
 //
-// A region's result never depends on who takes which chunk, so the same bits come out on any number of threads, on
-// threads that come late, and on none at all but the caller's: it takes chunks like the others, and waits only for
-// chunks that others have begun. So a thread that the system does not run, because another program has its core, holds
-// up a region by one chunk at most, not by its share of the whole. Threads that wait do so briefly, then they sleep.
+// A region's result never depends on which thread takes which chunk, so it has the same bits for any number of threads,
+// for late threads, and for the caller's thread alone. The caller takes chunks like the others, and waits only for
+// chunks that others have started. So a thread that does not run, because another program has its core, delays a region
+// by one chunk at most, not by its share of the whole. Waiting threads poll briefly and then sleep.
 #pragma once
 
 #include <algorithm>
@@ -11,8 +11,8 @@
 
 typedef void (*ChunkFunction)(const void* body, int64_t chunk, int slot);
 
-// Calls function(body, chunk, slot) for each of `chunks` chunks on up to `threads` threads. `slot` is that of the
-// thread, below `threads`: no two threads have the same at a time. Rethrows the first exception of a chunk.
+// Calls function(body, chunk, slot) for each of `chunks` chunks on up to `threads` threads. `slot`, below `threads`, is
+// the thread's: no two threads have the same slot at a time. Rethrows the first exception of a chunk.
 void run_chunks(int threads, int64_t chunks, ChunkFunction function, const void* body);
 
 // body(chunk, slot) for each chunk, in any order.
@@ -27,7 +27,7 @@ inline void for_chunks(int threads, int64_t chunks, const Body& body) {
         [](const void* of, int64_t chunk, int slot) { (*static_cast<const Body*>(of))(chunk, slot); }, &body);
 }
 
-// body(begin, end) for parts of [0, count) of `grain` items each, the last one smaller.
+// body(begin, end) for parts of [0, count) with `grain` items each; the last part may be smaller.
 template <typename Body>
 inline void for_ranges(int threads, int64_t count, int64_t grain, const Body& body) {
     for_chunks(threads, (count + grain - 1) / grain, [&](int64_t chunk, int) {

@@ -1,4 +1,4 @@
-// The words of the last failure of each thread (see status.h), and which sources this library was built from.
+// The message of the last failure of each thread (see status.h), and the fingerprint of the library's sources.
 #include "runtime/common.h"
 
 #include <string>
@@ -17,5 +17,5 @@ void bad_index(int64_t index, int64_t count, const char* what) {
 
 EXPORT const char* last_error() { return words; }
 
-// The fingerprint of ../sources.py, so that a library that a checkout has outlived is not called with other arguments.
+// The fingerprint of ../sources.py, so that an outdated library is not called with other arguments.
 EXPORT int64_t built_from() { return NERFLOOM_SOURCES; }

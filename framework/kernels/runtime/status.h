@@ -1,6 +1,6 @@
-// How an exported function says that it failed: no exception crosses the C interface.
+// Error reporting of exported functions: no exception crosses the C interface.
 //
-// Each returns a Status; what went wrong in words is last_error()'s. ../native.py turns them into Python's exceptions.
+// Each returns a Status; last_error() returns the message. ../native.py converts them to Python exceptions.
 #pragma once
 
 #include <cstdint>
@@ -12,7 +12,7 @@ enum Status { DONE = 0, NO_MEMORY = 1, BAD_INDEX = 2, BAD_VALUE = 3, FAILED = 4 
 
 int remember(Status status, const char* what) noexcept;
 
-// Runs body(): an exported function's.
+// Runs body(), the body of an exported function.
 template <typename Body>
 int guarded(const Body& body) noexcept {
     try {

@@ -1,4 +1,4 @@
-"""Rendering of traced rays in one compiled call, where no gradient is asked for.
+"""Rendering of traced rays in one compiled call, if no gradient is needed.
 
 The readable form traces rays, evaluates the colour network and composites. The compiled one takes a block of rays
 through all of that while it is in cache (`squared_error.cpp`), so that no sample is ever written to memory.
@@ -49,10 +49,10 @@ class TracedColors(NamedTuple):
 
 
 def traced_colors(marched: March, density: GridDensity, color: GridColor, background: Tensor) -> TracedColors:
-    """Return what traced rays show.
+    """Return the colours and depths of traced rays.
 
     Args:
-        marched: the march of R rays, before its first wave; no gradient goes to these.
+        marched: the march of R rays, before its first wave; the rays get no gradient.
         density: the density along the rays.
         color: the colour along the rays.
         background: (R, 3) colour behind each ray.
@@ -81,7 +81,7 @@ TRACED_COLORS = Operation("traced_colors", traced_colors_reference)
 
 
 def has_compiled_networks(marched: March, density: GridDensity, color: GridColor) -> bool:
-    """Return whether march, hash grid and both networks run compiled, with the derivatives that are asked for.
+    """Return whether march, hash grid and both networks run compiled, with the required derivatives.
 
     Args:
         marched: the march, before its first wave.

@@ -1,9 +1,9 @@
-// What traced rays show, and the squared error of that with its gradient, each in one call. See ../traced_error.py and
+// The colours of traced rays, and their squared error with its gradient, each in one call. See ../traced_error.py and
 // ../traced_colors.py for the references.
 //
-// A block of rays goes all the way on one thread while it is in cache: through trace_block, the colour network,
-// compositing and the error, and back through both networks, whose activations were recorded on the way there. What
-// leaves the cache is the gradient of the encoding, for the hash table, and the sums of the weights' gradients.
+// A block of rays stays on one thread and in cache: through trace_block, the colour network, compositing and the error,
+// and back through both networks, whose activations were recorded on the forward pass. Only the gradient of the
+// encoding, for the hash table, and the sums of the weights' gradients leave the cache.
 #include "encodings/harmonics.h"
 #include "traced/trace.h"
 
@@ -13,9 +13,9 @@ using namespace tracing;
 
 namespace {
 
-constexpr int64_t BLOCK_RAYS = 64;  // whose samples fit the second cache; with 256 a step takes 1.1 times as long
-constexpr int64_t PARTS = 64;     // at most, each with sums of its own
-constexpr size_t KEPT = 1 << 25;  // floats that a thread keeps between calls, for fresh memory costs faults
+constexpr int64_t BLOCK_RAYS = 64;  // their samples fit the L2 cache; with 256 a step takes 1.1 times as long
+constexpr int64_t PARTS = 64;     // at most, each with its own sums
+constexpr size_t KEPT = 1 << 25;  // floats kept per thread between calls: new memory costs page faults
 
 struct Shown {  // by rays: colour over the background (R, 3), opacity, first moment of t, and median of t
     const float *background, *fars;
@@ -40,9 +40,9 @@ struct Networks {
     int harmonics;
 };
 
-struct Part {  // of the rays, that a thread takes
+struct Part {  // of the rays, processed by a thread
     int slot = 0;
-    int64_t begin = 0, count = 0;  // of its gradients among those of the thread
+    int64_t begin = 0, count = 0;  // range of its gradients within the thread's
     int64_t samples = 0;
     double error = 0;
 };
@@ -58,11 +58,11 @@ struct Scratch {  // of a thread
     std::vector<int64_t> order, live;
     std::vector<float> values, inputs, rgb, by_rgb;
     std::vector<char> records;
-    std::vector<float> units, by_encoded;  // what is taken in the end
+    std::vector<float> units, by_encoded;  // the results to be taken
     int64_t used = 0;
 };
 
-// Pseudo-random bits of a number: SplitMix64 (Steele et al. 2014).
+// Pseudo-random bits from an integer: SplitMix64 (Steele et al. 2014).
 inline uint64_t scrambled(uint64_t x) {
     x += 0x9e3779b97f4a7c15u;
     x = (x ^ x >> 30) * 0xbf58476d1ce4e5b9u;
@@ -70,20 +70,20 @@ inline uint64_t scrambled(uint64_t x) {
     return x ^ x >> 31;
 }
 
-// A block of rays, there and back. Samples are those that light reached, ray by ray.
+// A block of rays, forward and backward. Samples are those reached by light, ray by ray.
 struct Block {
     const Path& path;
     const Networks& nets;
     Scratch& own;
     const int64_t base, rays;
-    const bool learns;  // whether there is a way back, for which activations are recorded
+    const bool learns;  // whether activations are recorded for a backward pass
 
     int64_t first[RAYS + 1] = {}, count = 0;  // of each ray's samples; of all samples
-    int64_t* order = nullptr;                 // which of the evaluated samples each is
-    // Of each sample: its optical depth and that in front of it, the latter's derivative by sigma, its weight, the
-    // transmittance behind it, and the gradient of the logarithm of its density.
+    int64_t* order = nullptr;                 // index of each among the evaluated samples
+    // Of each sample: its optical depth and the one in front of it, the derivative by sigma, its weight, the
+    // transmittance behind it, and the gradient of its log-density.
     float *tau, *depth, *slope, *weight, *behind, *by_log;
-    float *rgb, *by_rgb;  // and the gradient of what comes before the sigmoid
+    float *rgb, *by_rgb;  // and the gradient before the sigmoid
     float grads[RAYS * 3], opacity[RAYS];
 
     Block(const Path& path, const Networks& nets, Scratch& own, int64_t base, int64_t rays, bool learns)
@@ -124,7 +124,7 @@ struct Block {
         nets.color.forward(inputs, count, mlp::SIGMOID, rgb, nullptr, records);
     }
 
-    // As in compositing.cpp, with the exponentials of a whole vector at once.
+    // As in compositing.cpp, with vectorised exponentials.
     void weigh() {
         for (int64_t r = 0; r < rays; r++) {
             float sum = 0;
@@ -136,7 +136,7 @@ struct Block {
                 slope[n] = depth_slope(sigma, delta);
             }
         }
-        for (int64_t n = 0; n < count; n += LANES) {  // the rows have room for a whole last vector
+        for (int64_t n = 0; n < count; n += LANES) {  // rows have space for a whole last vector
             const Floats before = load(depth + n), here = load(tau + n);
             store(weight + n, exponential(-before) * opacity_of(here));
             store(behind + n, exponential(-(before + here)));
@@ -180,8 +180,8 @@ struct Block {
         return error;
     }
 
-    // That of the pixel of ray r and those behind it, times its weight and summed over channels. Writes its colour,
-    // and the derivative of the mean over all pixels and channels to each ray's `grad`.
+    // The squared error of the pixel of ray r and the following rays, times its weight and summed over channels. Writes
+    // its colour, and the derivative of the mean over all pixels and channels to each ray's `grad`.
     double pixel_error(const Pixels& pixels, int64_t r, const float* colors, float* grad) const {
         const int64_t each = pixels.per_pixel, p = (base + r) / each;
         const float factor = pixels.weights ? pixels.weights[p] : 1;
@@ -198,7 +198,7 @@ struct Block {
         return error;
     }
 
-    // Back to density and colour of each sample.
+    // Back to the density and colour of each sample.
     void to_samples(const Pixels& pixels) {
         for (int64_t r = 0; r < rays; r++) {
             const float *g = grads + r * 3, *back = pixels.background + (base + r) * 3;
@@ -222,8 +222,8 @@ struct Block {
         }
     }
 
-    // Which samples go on through the networks: those with a gradient, but of those whose gradient is below `floor`
-    // times the mean only a share in proportion to it, whose gradient is enlarged as much.
+    // Selects the samples that continue through the networks: those with a gradient. If a gradient is below `floor`
+    // times the mean, the sample is kept with a proportional probability, and its gradient is scaled up accordingly.
     int64_t thin(const Thinning& thinning) {
         int64_t *live = room(own.live, size_t(count)), living = 0;
         float* size = depth;
@@ -235,7 +235,7 @@ struct Block {
         const float bound = count ? thinning.floor * float(sum / double(count)) : 0;
         for (int64_t n = 0; n < count; n++) {
             if (size[n] == 0) continue;
-            if (size[n] < bound) {  // false for NaN, which must be seen
+            if (size[n] < bound) {  // false for NaN, which must be noticed
                 const float chance = size[n] / bound;
                 const uint64_t bits = scrambled(thinning.seed ^ uint64_t(base) << 32 ^ uint64_t(n));
                 if (!(float(bits >> 40) * 0x1p-24f < chance)) continue;
@@ -274,7 +274,7 @@ struct Block {
     }
 };
 
-struct Learnt {  // what a caller has computed and not yet taken
+struct Learnt {  // results that the caller has not taken yet
     std::vector<Scratch> scratch;  // of each thread
     std::vector<Part> parts;
     std::vector<float> density_sums, color_sums;
@@ -300,9 +300,9 @@ Networks networks(const Density& density, const mlp::Layers& color, const int64_
 
 // The rays, their grid and the density are as in trace_rays. The colour is a network on the density network's outputs
 // and `bands` bands of harmonics of the direction. background (R, 3); target (P, 3) and pixel_weights (P), which may be
-// null, of the pixels of `per_pixel` consecutive rays. floor, seed: see Block::thin. Writes rgb (P, 3), the weighted
-// mean of squares `error` (1), the gradients of the weights of both networks, and `samples` (1): how many light reached.
-// `total`: how many have a gradient, which traced_error_take returns.
+// null, for pixels of `per_pixel` consecutive rays. floor, seed: see Block::thin. Writes rgb (P, 3), the weighted mean
+// square `error` (1), the gradients of the weights of both networks, and `samples` (1): number of samples reached by
+// light. `total`: number of samples with a gradient, which traced_error_take returns.
 EXPORT int traced_error(const float* origins, const float* directions, const float* enter, const float* leave,
                         const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
                         const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
@@ -363,7 +363,7 @@ EXPORT int traced_error(const float* origins, const float* directions, const flo
     });
 }
 
-// Of the samples with a gradient: where they are, unit (N, 3), and the gradient of their encoding (N, E).
+// For the samples with a gradient: their positions, unit (N, 3), and the gradient of their encoding (N, E).
 EXPORT int traced_error_take(int64_t total, float* unit, float* grad, int threads) {
     return guarded([&] {
         Learnt& all = learnt();
@@ -384,8 +384,9 @@ EXPORT int traced_error_take(int64_t total, float* unit, float* grad, int thread
     });
 }
 
-// What the rays show: the arguments up to `bands` are as in traced_error; background (R, 3), fars (R). Writes colour over
-// the background (R, 3), opacity, first moment of t, and median of t (R). `samples`: how many light reached.
+// The colours of rays. The arguments up to `bands` are as in traced_error; background (R, 3), fars (R). Writes colour
+// over the background (R, 3), opacity, first moment of t, and median of t (R). `samples`: number of samples reached by
+// light.
 EXPORT int traced_colors(const float* origins, const float* directions, const float* enter, const float* leave,
                          const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
                          const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,

@@ -1,14 +1,14 @@
-"""The squared error of what traced rays show, and its gradient, in one compiled call.
+"""The squared error of traced rays' colours, and its gradient, in one compiled call.
 
 The readable form (`traced_error_reference`) traces rays, evaluates the colour network, composites, and takes the mean
-of squares. Where the loss is this mean alone, its gradient is known as soon as the colours are. The compiled form takes
-a block of rays there and back while it is in cache, and keeps the networks' activations for the way back
+square. If the loss is this mean alone, its gradient is known as soon as the colours are. The compiled form processes a
+block of rays forward and backward in cache, and keeps the networks' activations for the backward pass
 (`kernels/traced/squared_error.cpp`).
 
-Most samples have hardly a gradient: they lie in space that is empty already, or behind a surface. The compiled form can
-leave most of these out (`thin`): a sample whose gradient is a share p < 1 of a threshold takes part with the
-probability p, and then its gradient counts 1 / p times. The expectation of the sum stays, as in Russian roulette of
-light paths (Arvo and Kirk 1990, "Particle transport and image synthesis").
+Most samples have almost no gradient: they lie in space that is already empty, or behind a surface. The compiled form
+can skip most of these (`thin`). A sample whose gradient is a fraction p < 1 of a threshold is kept with probability p,
+and its gradient is then multiplied by 1 / p. The expectation of the sum is unchanged, as in Russian roulette of light
+paths (Arvo and Kirk 1990, "Particle transport and image synthesis").
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from nerfloom.kernels.traced.colors import GridColor, has_compiled_networks, tra
 from nerfloom.kernels.traced.trace import DENSITY, PATH, GridDensity, arguments, network_arguments
 
 MAX_RAYS = 256
-"""Maximum number of rays of a pixel in the compiled form."""
+"""Maximum number of rays per pixel in the compiled form."""
 
 
 class TracedError(NamedTuple):
@@ -59,12 +59,12 @@ def traced_error(
     """Return the mean squared error of the colours of traced rays.
 
     Args:
-        marched: the march of R rays, before its first wave; no gradient goes to these.
+        marched: the march of R rays, before its first wave; the rays get no gradient.
         density: the density along the rays.
         color: the colour along the rays.
-        pixels: what the rays should show.
-        thin: samples whose gradient is below this times the mean of some dozen rays' samples are left out at random;
-            0 for none. The reference leaves out none.
+        pixels: target colours.
+        thin: samples with gradients below this factor times a mean (over samples of some dozen rays) are skipped at
+            random; 0 skips none. The reference skips none.
     """
     tensors = (marched.rays.origins, density.table, *density.weights, *color.weights, *pixels)
     return TRACED_ERROR(tensors, marched, density, color, pixels, thin)
@@ -88,7 +88,7 @@ TRACED_ERROR = Operation("traced_error", traced_error_reference)
 
 
 def _fits(marched: March, density: GridDensity, color: GridColor, pixels: PixelTargets, thin: float = 0.0) -> bool:
-    """Return whether all single operations would run compiled, and gradients go to table and weights alone."""
+    """Return whether all single operations would run compiled, with gradients for table and weights only."""
     if not torch.is_grad_enabled() or any(tensor is not None and tensor.requires_grad for tensor in pixels):
         return False
     if not 0 < len(marched.rays) <= MAX_RAYS * len(pixels.target):
@@ -117,14 +117,14 @@ def _compiled(
     )  # fmt: skip
     unit, by_encoded = torch.empty(total, 3), torch.empty(total, density.weights[0].shape[1])
     _take(total, unit.data_ptr(), by_encoded.data_ptr(), native.threads())
-    with result_cache.given(hash_grid=by_encoded):  # its values do not matter: it is there for the table's gradient
+    with result_cache.given(hash_grid=by_encoded):  # the values do not matter, only the table's gradient
         encoded = hash_grid(unit, density.table, density.layout, density.deferred)
     known = (by_encoded, *grads[0], *grads[1])
     return TracedError(_Known.apply(error, known, encoded, *networks[0], *networks[1]), rgb, int(samples))
 
 
 class _Known(torch.autograd.Function):
-    """A value whose gradients are known already."""
+    """A value whose gradients are already known."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, grads: Sequence[Tensor], *inputs: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 // Tracing rays: marching, encoding and the density network in one call. See ../trace.py for the reference.
 //
-// A block of rays goes through all of its waves on one thread, so that nothing but the samples that light reached leaves
-// the cache, and no thread waits for another between waves. A sample's values do not depend on what it is computed with,
-// so neither do results on blocks or threads.
+// A block of rays passes through all its waves on one thread, so that only samples reached by light leave the cache,
+// and no thread waits for another between waves. A sample's values do not depend on the rest of its batch, so results
+// do not depend on blocks or threads.
 #include "traced/trace.h"
 
 #include <numeric>
@@ -11,14 +11,14 @@ using namespace tracing;
 
 namespace {
 
-constexpr size_t KEPT = 1 << 25;  // floats that a thread's samples keep between calls, for fresh memory costs faults
+constexpr size_t KEPT = 1 << 25;  // floats kept per thread between calls: new memory costs page faults
 
 struct Block {
     int slot = 0;
     int64_t begin = 0, count = 0;
 };
 
-struct Traced {  // what a caller has traced and not yet taken
+struct Traced {  // traced results that the caller has not taken yet
     std::vector<Samples> samples;  // of each thread
     std::vector<Block> blocks;
     std::vector<int32_t> counts;  // (R) samples that light reached
@@ -33,9 +33,9 @@ Traced& traced() {
 
 }  // namespace
 
-// Samples of all waves, as march_wave and march_advance find them, with the density of a network on a hash grid
-// (grid_density.h). `total`: samples that light reached, which trace_take returns. The other parameters are as
-// in march_wave, hash_grid_forward and mlp_forward. keep: whether trace_take will be asked for features.
+// Samples of all waves, as in march_wave and march_advance, with the density of a network on a hash grid
+// (grid_density.h). `total`: number of samples reached by light, which trace_take returns. The other parameters are as
+// in march_wave, hash_grid_forward and mlp_forward. keep: whether trace_take will be called with features.
 EXPORT int trace_rays(const float* origins, const float* directions, const float* enter, const float* leave,
                       const float* first, const int64_t* slices, int64_t rays, const int64_t* limits, int waves,
                       const float* box, float step, float cone, const uint8_t* bits, const uint8_t* blocks,
@@ -66,8 +66,8 @@ EXPORT int trace_rays(const float* origins, const float* directions, const float
     });
 }
 
-// What trace_rays has found, ray by ray: offsets (R + 1), starts, ends, owners and density (N), unit (N, 3), outputs
-// (N, D) and, unless null, features (N, E).
+// The result of trace_rays, ray by ray: offsets (R + 1), starts, ends, owners and density (N), unit (N, 3), outputs (N,
+// D) and, unless null, features (N, E).
 EXPORT int trace_take(int64_t rays, int64_t total, int64_t* offsets, float* starts, float* ends, int64_t* owners,
                       float* unit, float* features, float* outputs, float* density, int threads) {
     return guarded([&] {

@@ -1,4 +1,4 @@
-// Tracing blocks of rays: marching, encoding and the density network. What trace.cpp and traced_error.cpp share.
+// Tracing of blocks of rays: marching, encoding and the density network. Shared by trace.cpp and traced_error.cpp.
 #pragma once
 
 #include "grids/grid_density.h"
@@ -20,7 +20,7 @@ struct Path {  // rays, and the grid of occupied cells; see march_wave
     float budget;
 };
 
-struct Samples {  // that a thread has evaluated
+struct Samples {  // evaluated by a thread
     std::vector<float> starts, ends, unit, features, outputs, density;
     std::vector<char> records;  // of the network, if they are kept
     std::vector<int32_t> rays;
@@ -41,8 +41,8 @@ struct Samples {  // that a thread has evaluated
     }
 };
 
-// Appends the samples of rays [base, last), RAYS at most, with what is to be kept of the features and the network's
-// records; adds how many light reached to `reached` of each ray.
+// Appends the samples of rays [base, last), RAYS at most, with the features and network records to be kept; adds the
+// number of samples reached by light to `reached` of each ray.
 inline void trace_block(const Path& path, const Density& of, int64_t base, int64_t last, bool features, bool records,
                         Samples& to, int32_t* reached) {
     const int side = (path.resolution + marching::BLOCK - 1) / marching::BLOCK;
@@ -82,7 +82,7 @@ inline void trace_block(const Path& path, const Density& of, int64_t base, int64
             const int ray = alive[i];
             float tau = spent[ray];
             for (int s = 0; s < counts[i]; s++, n++) {
-                const bool lit = !(tau >= path.budget);  // NaN goes on: a broken field must be seen
+                const bool lit = !(tau >= path.budget);  // NaN continues, so that a broken field is noticed
                 to.reached.push_back(lit);
                 reached[ray] += lit;
                 tau += to.density[size_t(n)] * (to.ends[size_t(n)] - to.starts[size_t(n)]);

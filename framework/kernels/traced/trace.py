@@ -1,8 +1,8 @@
 """All waves of a march in one compiled call: marching, hash grid and density network of a block of rays.
 
-`OccupancySampler` marches wave by wave, evaluates the field and ends rays whose light is spent. Where the density is a
-small network on a hash grid, `trace` does that (`trace_reference` in its readable form). The compiled form computes it
-block by block in cache, without Python, copies and waiting between waves (`kernels/traced/trace.cpp`).
+`OccupancySampler` marches wave by wave, evaluates the field and ends rays without light. If the density is a small
+network on a hash grid, `trace` does this (`trace_reference` is its readable form). The compiled form works block by
+block in cache, without Python, copies or waits between waves (`kernels/traced/trace.cpp`).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, density_mlp, multipli
 from nerfloom.kernels.rows import gather_rows
 
 WAVES = (4, 4, 4, 4, 8, 16, 32, 128)
-"""Samples per ray in each wave of a trace; the last size repeats. They begin smaller than those of a march: within one
-call a wave costs next to nothing, and less is evaluated behind a surface."""
+"""Samples per ray in each wave of a trace; the last size repeats. They start smaller than those of a march: within one
+call a wave costs next to nothing, and fewer samples behind a surface are evaluated."""
 
 PATH, DENSITY = "ppppppqpipffppiif", "ppppippipip"
-"""Kinds of the arguments of compiled traces that stand for a march, and of those that stand for a density."""
+"""Types of the arguments of compiled traces that describe a march, and of those that describe a density."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class GridDensity:
     scale: Tensor
     """(3,) factor of positions in scene units."""
     shift: Tensor
-    """(3,) what is added to these."""
+    """(3,) shift added after scaling."""
     table: Tensor
     """(E, F) entries of all levels."""
     layout: HashGridLayout
@@ -49,7 +49,7 @@ class GridDensity:
     weights: Sequence[Tensor]
     """(D_out, D_in) weights of each layer, without biases."""
     box: Tensor | None = None
-    """(2, 3) corners of the box around which space is contracted by `contract_to_unit`; None if it is not."""
+    """(2, 3) corners of the box around which space is contracted by `contract_to_unit`; None without contraction."""
 
     def at(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the density (N,) and the outputs (N, D) of the network at `positions` (N, 3), scene units."""
@@ -75,16 +75,16 @@ class Traced:
     sigma: Tensor
     """(N,) density, with its gradient if gradients are enabled."""
     features: Tensor
-    """(N, D) outputs of the network, likewise."""
+    """(N, D) outputs of the network, with their gradient if gradients are enabled."""
     longest: int | None = None
-    """Upper bound of the number of samples on a ray; None if finding it would take a pass over them."""
+    """Upper bound of the number of samples on a ray; None if computing it would take a pass over them."""
 
 
 def trace(marched: March, density: GridDensity) -> Traced:
     """Return the samples of a march up to its early stop, with density and features.
 
     Args:
-        marched: the march of R rays, before its first wave; no gradient goes to these.
+        marched: the march of R rays, before its first wave; the rays get no gradient.
         density: the density along the rays.
     """
     return TRACE((marched.rays.origins, density.table, *density.weights), marched, density)
@@ -115,7 +115,7 @@ TRACE = Operation("trace", trace_reference)
 
 
 def is_compiled(marched: March, density: GridDensity) -> bool:
-    """Return whether march, hash grid and network run compiled, with the derivatives that are asked for.
+    """Return whether march, hash grid and network run compiled, with the required derivatives.
 
     Args:
         marched: the march, before its first wave.
@@ -127,11 +127,11 @@ def is_compiled(marched: March, density: GridDensity) -> bool:
 
 
 def has_compiled_parts(positions: Tensor, density: GridDensity) -> bool:
-    """Return whether hash grid and network run compiled, with the derivatives that are asked for.
+    """Return whether hash grid and network run compiled, with the required derivatives.
 
     Args:
-        positions: (N, 3), of which type and gradient count.
-        density: the density there.
+        positions: (N, 3); their type and gradient matter.
+        density: the density at the positions.
     """
     table, weights = density.table, density.weights
     grid = HASH_GRID.choose((positions, table), positions, table, density.layout, density.deferred)
@@ -151,7 +151,7 @@ def _compiled(marched: March, density: GridDensity) -> Traced:
         rays, total, offsets.data_ptr(), starts.data_ptr(), ends.data_ptr(), owners.data_ptr(), unit.data_ptr(),
         None if encoded is None else encoded.data_ptr(), outputs.data_ptr(), sigma.data_ptr(), native.threads(),
     )  # fmt: skip
-    if encoded is not None:  # the operations that made these values add their gradients
+    if encoded is not None:  # the operations of these values add their gradients
         with result_cache.given(hash_grid=encoded, mlp=outputs, density=sigma):
             found = hash_grid(unit, density.table, density.layout, density.deferred)
             sigma, outputs = density_mlp((found,), density.weights)
@@ -159,10 +159,10 @@ def _compiled(marched: March, density: GridDensity) -> Traced:
 
 
 def arguments(marched: March, density: GridDensity) -> tuple[Any, ...]:
-    """Return the arguments of compiled traces, checked.
+    """Check the arguments of compiled traces and return them.
 
     Args:
-        marched: the rays and their grid, for which `is_compiled` holds.
+        marched: the rays and their grid; `is_compiled` must hold.
         density: the density along the rays.
     """
     assert isinstance(marched, CompiledMarch)
@@ -176,7 +176,7 @@ def arguments(marched: March, density: GridDensity) -> tuple[Any, ...]:
 
 
 def density_arguments(density: GridDensity) -> tuple[Any, ...]:
-    """Return the arguments of compiled calls that evaluate `density`, checked."""
+    """Check the arguments of compiled calls that evaluate `density`, and return them."""
     layout, features, box = density.layout, density.table.shape[1], density.box
     return (
         native.pointer(density.scale, "the scale", (3,)), native.pointer(density.shift, "the shift", (3,)),
@@ -187,7 +187,7 @@ def density_arguments(density: GridDensity) -> tuple[Any, ...]:
 
 
 def network_arguments(weights: Sequence[Tensor]) -> tuple[Any, ...]:
-    """Return a network's arguments of compiled traces: its widths, number of layers, and `weights`, checked."""
+    """Check a network's arguments of compiled traces, and return widths, number of layers and `weights`."""
     widths = (weights[0].shape[1], *(weight.shape[0] for weight in weights))
     shapes = [(widths[layer + 1], widths[layer]) for layer in range(len(weights))]
     checked = [native.pointer(weight, "weights", shape) for weight, shape in zip(weights, shapes, strict=True)]

@@ -175,7 +175,7 @@ def kept(row: Row, file: Path) -> Result | None:
     made_by = found.get("run", {}).get("label", row.job.contender.label)
     if made_by != row.job.contender.label:
         raise ConfigError(
-            f"{file}: {row.name} is of '{made_by}', not of '{row.job.contender.label}'; remove it, or rename the row"
+            f"{file}: {row.name} belongs to '{made_by}', not to '{row.job.contender.label}'; remove or rename it"
         )
     return found
 

@@ -127,7 +127,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @property
     def device(self) -> torch.device:
-        """The device of the parameters."""
+        """Return the device of the parameters."""
         return next(self.parameters()).device
 
     @property
@@ -138,7 +138,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @property
     def background(self) -> Tensor:
-        """The background colour (3,) of training; if that is random or automatic, white if images have alpha."""
+        """Return the background colour (3,) of training; if it is random or automatic, white if images have alpha."""
         asked = self.config.background
         white = asked == "white" or (asked != "black" and self.scene.has_alpha)
         return torch.full((3,), float(white), device=self.device)

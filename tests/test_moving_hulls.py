@@ -121,7 +121,7 @@ def test_of_too_few_images_no_speed_is_found_and_nothing_carved(count: int, tmp_
 def test_a_method_of_still_scenes_takes_the_speed_too() -> None:
     """It keeps the data's box, and cells that are occupied at any time."""
     dataset, _ = photographed(thrown_ball(1.5), 40, size=40)
-    found, _, made = decided("instant-ngp", load_method("instant-ngp").config, dataset)
+    found, _, made = decided(instant_ngp := load_method("instant-ngp"), instant_ngp.config, dataset)
     assert found.travel is not None
     assert torch.equal(found.scene.box, BOX)
     assert made[0].option == "motion"

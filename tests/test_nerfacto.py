@@ -162,7 +162,7 @@ def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: 
     before = {name: value.clone() for name, value in model.state_dict().items()}
     found = {}
     for choice in ("mean", "half"):
-        model.config = dataclasses.replace(model.config, eval_appearance=choice)
+        model.field.appearance.held_out = choice
         found[choice] = evaluate(model, trainer.train_set, max_images=2).per_image[0]["psnr"]
     assert found["half"] > found["mean"] + 2
     assert all(torch.equal(before[name], value) for name, value in model.state_dict().items())

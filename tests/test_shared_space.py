@@ -14,6 +14,7 @@ from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
+from nerfloom.methods.nerfacto import METHOD
 from nerfloom.registry import load_dataparser
 from nerfloom.scene.shared_space import SharedSpace, share_cut_off, times_seen
 from nerfloom.training.data_folder import find_data
@@ -162,7 +163,7 @@ def test_without_points_what_cameras_look_at_decides_whether_rays_start_late(
     trainer = small(tmp_path)
     dataset = seen_by(trainer.train_set, cameras)
     config = dataclasses.replace(trainer.config, rays_shared_by="auto")
-    _, settings, made = decided("nerfacto", config, dataset)
+    _, settings, made = decided(METHOD, config, dataset)
     assert settings.rays_shared_by == (2 if reason is None else 0)
     said = [decision.line() for decision in made if decision.option == "rays start"]
     assert len(said) == (reason is not None)
@@ -177,7 +178,7 @@ def test_without_points_scenes_that_move_and_several_start_at_the_near_ends(
     still = seen_by(trainer.train_set, around(1.0, *range(0, 360, 30)))
     other = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **changed))
     config = dataclasses.replace(trainer.config, rays_shared_by="auto")
-    _, settings, made = decided("nerfacto", config, other)
+    _, settings, made = decided(METHOD, config, other)
     assert settings.rays_shared_by == 0
     assert [decision for decision in made if decision.option == "rays start" and UNKNOWN in decision.line()]
 
@@ -231,14 +232,14 @@ def test_known_points_decide_whether_rays_start_late(distance: float, least: int
     trainer = small(tmp_path)
     dataset = with_points(trainer.train_set, distance)
     config = dataclasses.replace(trainer.config, rays_shared_by="auto")
-    _, settings, made = decided("nerfacto", config, dataset)
+    _, settings, made = decided(METHOD, config, dataset)
     assert settings.rays_shared_by == least
     said = [decision.line() for decision in made if decision.option == "rays start"]
     assert len(said) == (not least)
     assert all("at their near ends" in line and "% of the points" in line for line in said)
     for chosen in (0, 2):  # what one asks for is done
         asked = dataclasses.replace(config, rays_shared_by=chosen)
-        assert decided("nerfacto", asked, dataset)[1].rays_shared_by == chosen
+        assert decided(METHOD, asked, dataset)[1].rays_shared_by == chosen
 
 
 def test_the_share_of_what_is_cut_off() -> None:

@@ -14,8 +14,7 @@ from nerfloom.cli.run_flags import OPENS, RunFlags
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerFlags(RunFlags):
-    """Look at a trained run or a file of Gaussians in a browser. It shows newer checkpoints as they are written; Ctrl-C
-    ends it."""
+    """Look at a trained run or a file of Gaussians in a browser. It shows newer checkpoints at once; Ctrl-C ends it."""
 
     websocket_host: str = ViewerConfig.websocket_host
     """Interface to listen on; 0.0.0.0 for all, from which other machines can connect. There is no password."""

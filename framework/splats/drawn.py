@@ -43,7 +43,7 @@ class DrawnGaussians(Renderable):
         return (NORMALS,)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
-        """Return the Gaussians, which are the same at any time."""
+        """Return the Gaussians, which are the same at any `time`."""
         return self._redrawn.gaussians
 
     def look(self) -> Look:

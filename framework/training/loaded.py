@@ -1,4 +1,4 @@
-"""What a command or a notebook has opened: a trained run or a file of Gaussians, to render and to evaluate."""
+"""A trained run or a file of Gaussians, opened by a command or a notebook to be rendered and evaluated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nerfloom.training.run import Run
 
 @dataclass(frozen=True, repr=False)
 class Loaded:
-    """Something to look at, and where it comes from: what `nerfloom.load` returns."""
+    """Something to look at, and where it comes from, as `nerfloom.load` opens it."""
 
     model: Renderable
     """What is looked at, on its device: a `nerfloom.Model` in evaluation mode, or Gaussians."""
@@ -44,7 +44,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """Whether it is a run, with a folder of its own, and no file of Gaussians."""
+        """True if it is a run, with a folder of its own, and no file of Gaussians."""
         return self.origin != self.checkpoint
 
     @property

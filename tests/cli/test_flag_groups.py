@@ -104,7 +104,7 @@ def test_the_everyday_flags_are_shown_with_their_defaults() -> None:
 def test_the_help_of_a_command_with_few_flags_shows_them_all() -> None:
     short, all_flags = (called("ns-eval", flag) for flag in ("--help", "--help-all"))
     assert short.stdout == all_flags.stdout
-    assert set(boxes(short.stdout)["options"]) == set(flags_of(EvalFlags(Path("run"))))
+    assert set(boxes(short.stdout)["options"]) == set(flags_of(EvalFlags(load_config=Path("run"))))
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in FORMATS])

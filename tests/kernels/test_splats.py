@@ -39,7 +39,9 @@ def threads() -> Iterator[Callable[[int], None]]:
 
 
 def test_cpp_has_the_same_columns_of_a_record() -> None:
-    declared = re.search(r"enum Record \{(.*?)\};", (SOURCES / "splat.h").read_text(encoding="utf-8"), re.DOTALL)
+    declared = re.search(
+        r"enum Record \{(.*?)\};", (SOURCES / "splats" / "splat.h").read_text(encoding="utf-8"), re.DOTALL
+    )
     assert declared is not None
     names = re.sub(r"//.*", "", declared[1]).replace(",", " ").split()
     assert names == [*(column.name for column in Record), "RECORD"]

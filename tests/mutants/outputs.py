@@ -5,17 +5,14 @@ from tests.mutants.mutant import Mutant
 # fmt: off
 MUTANTS = {
     "nerfloom.cli.export": [
-        Mutant("normals-in-scene-frame", "_points", "placement.original_directions(A)", "A.double()",
+        Mutant("normals-in-scene-frame", "_points", "loaded.placement.original_directions(A)", "A.double()",
             "normals are in another frame than their points",
             "truth/test_export.py::test_exported_points_normals_and_colours_are_in_the_captures_frame"),
-        Mutant("exported-poses-unrefined", "_cameras", "refined_cameras(trained.model, A)", "A",
+        Mutant("exported-poses-unrefined", "_cameras", "refined_cameras(loaded.model, A)", "A",
             "ns-export cameras writes the poses that came in",
             "truth/test_export.py::test_refined_cameras_are_exported_where_they_are_believed_to_be"),
     ],
     "nerfloom.cli.render": [
-        Mutant("depth-in-scene-units", "_render", "1 / float(trained.content['scale'])", "1.0",
-            "depth files of a capture are in units of the scene, not of the input",
-            "cli/test_render_outputs.py::test_depth_is_in_units_of_the_input"),
         Mutant("frames-of-other-cameras", "_facts", "hash_of_tensors(*A, B)", '""',
             "a render of another camera path goes on with frames of the one that was stopped",
             "cli/test_render_outputs.py::test_pictures_of_another_camera_path_are_left_alone"),
@@ -46,10 +43,6 @@ MUTANTS = {
             "truth/test_training.py::test_rays_of_pictures_end_at_the_error_that_is_allowed"),
     ],
     "nerfloom.evaluation.evaluator": [
-        Mutant("background-of-photographs", "evaluation_background",
-            "A or (asked != 'white' and (not model.scene.has_alpha))", "A",
-            "captures without alpha are judged before white, as they were trained before black",
-            "evaluation/test_evaluator.py::test_pictures_are_over_what_training_was_over"),
         Mutant("judged-whole", "_judged", "(right_half(A), right_half(B))", "(A, B)",
             "with --eval-appearance half the half that was learnt from is judged too",
             "truth/test_training.py::test_the_half_on_which_light_is_found_is_not_judged"),
@@ -206,5 +199,16 @@ MUTANTS = {
         Mutant("interrupted-counts-as-done", "is_done", "A or summary.get('interrupted') is not False or B", "A or B",
             "a run that was stopped half way is compared with whole ones",
             "comparison/test_measures.py::test_a_run_is_done_once_it_was_judged_and_is_finite"),
+    ],
+    "nerfloom.training.loaded": [
+        Mutant("depth-in-scene-units", "Loaded.unit", "1 / self.placement.scale", "1.0",
+            "depth files of a capture are in units of the scene, not of the input",
+            "cli/test_render_outputs.py::test_depth_is_in_units_of_the_input"),
+    ],
+    "nerfloom.model": [
+        Mutant("background-of-photographs", "Model.background",
+            "A or (asked != 'black' and self.scene.has_alpha)", "asked != 'black'",
+            "captures without alpha are judged before white, as they were trained before black",
+            "evaluation/test_evaluator.py::test_pictures_are_over_what_training_was_over"),
     ],
 }

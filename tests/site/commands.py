@@ -109,7 +109,9 @@ class Checker:
             return
         status = status_of(import_module(scripts[name])._command, rest)
         assert status in (0, None), "it does not understand its flags"
-        begun_without_working = status is None or rest[-1] == "--help" or name in ("ns-new-method", "ns-stress")
+        begun_without_working = (
+            status is None or rest[-1] in ("--help", "--help-all") or name in ("ns-new-method", "ns-stress")
+        )
         assert begun_without_working, "it ended without beginning"
 
 

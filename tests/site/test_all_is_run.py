@@ -8,6 +8,7 @@ from tests.site.test_run_photographs import COMPARED, PROCESSED
 
 ELSEWHERE = {
     r"make (demo|test|test-fast|test-all|lint|sanitize)$": ".ci/run",
+    r"make mutants": "tests/mutants/test_mutants.py",
     r"make docs": "tests/site/test_site.py",
     r"make (release-check|test-versions)": "tests/release/__main__.py",
     r"python3 -m venv|\. \.venv|pip install .*-e (\.|'\.|\"\.)": "tests/release/install.py",

@@ -16,9 +16,9 @@ import torch
 
 from nerfloom import DataError, DataParser, ParsedScene
 from nerfloom.base.console import say
+from nerfloom.base.splits import Split
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.dataset import Split
 from nerfloom.dataparsers.captured import placed_cameras
 from nerfloom.dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_region
 from nerfloom.dataparsers.renders import Renders, read_renders

@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from nerfloom import Cameras, DataError, ParsedScene
-from nerfloom.cameras.cameras import LENSES
+from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import Placement, estimate_near, held_out
-from nerfloom.data.dataset import Split, existing_files, image_size
+from nerfloom.data.dataset import existing_files
+from nerfloom.data.image_files import image_size
 from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
 from nerfloom.dataparsers.placing import Applied, placement_of
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.sparse_points import sparse_points
+from nerfloom.geometry.lenses import LENSES
 
 LARGEST_SIDE = 1600
 """Images with a longer side above this, pixels, are reduced by default."""

@@ -8,7 +8,7 @@ from pathlib import Path, PurePath
 from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
-from nerfloom.data.dataset import Split
+from nerfloom.base.splits import Split
 from nerfloom.data.names_on_disk import has_images, on_disk
 from nerfloom.data.tracks import Tracks, doubts_about
 from nerfloom.dataparsers.captured import captured_scene, has_transforms

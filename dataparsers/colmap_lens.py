@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError
-from nerfloom.cameras.cameras import LENSES
 from nerfloom.cameras.colmap import PARAMETERS, Intrinsics, from_colmap
 from nerfloom.dataparsers.colmap_model import SparseCamera
+from nerfloom.geometry.lenses import LENSES
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerfloom import DataError, ParsedScene
-from nerfloom.data.dataset import Split
+from nerfloom.base.splits import Split
 from nerfloom.dataparsers.blender import TRANSFORMS, Blender, has_times
 
 

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError
-from nerfloom.base.errors import nearest
+from nerfloom.base.errors import nearest, shown
 from nerfloom.dataparsers.captured import sizes_of
-from nerfloom.dataparsers.reading import number, numbers, shown, side_or_none
+from nerfloom.dataparsers.reading import number, numbers, side_or_none
 
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
 """Projection, and the file's names of its coefficients in the order of `LENSES`."""

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
 from nerfloom.base.console import say
+from nerfloom.base.errors import shown
 from nerfloom.base.evenly_spaced import evenly_spaced
-from nerfloom.data.dataset import Split
+from nerfloom.base.splits import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import nearest_on_disk, on_disk, spelled
 from nerfloom.data.ply import read_points
@@ -25,7 +26,7 @@ from nerfloom.dataparsers.colmap_beside import names_in_model, tracks_beside
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid, shown
+from nerfloom.dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid
 
 TRANSFORMS = "transforms.json"
 """File that identifies the format."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
-from nerfloom.data.dataset import Split
+from nerfloom.base.splits import Split
 from nerfloom.data.names_on_disk import spelled
 from nerfloom.dataparsers.captured import captured_scene, has_transforms
 from nerfloom.dataparsers.colmap import read_images

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from nerfloom import ParsedScene
 from nerfloom.base.console import say
+from nerfloom.base.splits import Split
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement, enlargement, place
-from nerfloom.data.dataset import Split
 from nerfloom.dataparsers.camera_spread import SMALL, camera_spread, warning
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.geometry.local_origin import local_origin, rounding

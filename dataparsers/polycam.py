@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from nerfloom import DataError, ParsedScene
-from nerfloom.data.dataset import Split
+from nerfloom.base.splits import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.data.scene import PoseSource

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError
-from nerfloom.base.errors import shown as shown
+from nerfloom.base.errors import shown
 from nerfloom.cameras.cameras import LARGEST_SIDE, check_pose
 from nerfloom.dataparsers.rotations import nearest_rotation
 

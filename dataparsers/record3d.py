@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
-from nerfloom.data.dataset import Split, existing_files
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import existing_files
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.captured import captured_scene, has_transforms

@@ -12,7 +12,9 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.console import say
-from nerfloom.data.dataset import Split, existing_files, image_size
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import existing_files
+from nerfloom.data.image_files import image_size
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.posed_images import PosedImages

@@ -15,7 +15,7 @@ from nerfloom.model import Model
 from nerfloom.ray_model import RayModel
 from nerfloom.renderable import RendersFromImages
 from nerfloom.rendering.renderer import Renderer
-from nerfloom.rendering.volume import volume_renderer as volume_renderer
+from nerfloom.rendering.volume import volume_renderer
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import SamplingConfig, sampler_choice
 from nerfloom.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON

@@ -20,7 +20,7 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.tensor import CP, VM, TensorField
 from nerfloom.geometry.bounds import box_around_cells, cubic_vertices
-from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.table_memory import require
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.term import LossTerm, RenderedBatch

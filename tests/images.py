@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.dataset import ParsedScene
+from nerfloom.data.parsed_scene import ParsedScene
 
 
 def noise(width: int, height: int, seed: int, channels: int = 3) -> np.ndarray:

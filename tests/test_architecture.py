@@ -201,14 +201,30 @@ def test_nothing_is_at_the_root_of_the_framework_but_what_joins_the_rooms() -> N
     assert found - rooms <= {"__init__", "py", "templates"}
 
 
-def test_no_import_circles_in_the_framework() -> None:
-    names = {module_of(f): f for f in FILES if f.parts[len(ROOT.parts)] == "framework" and f.name != "__init__.py"}
+FRONTS = ("nerfloom", "nerfloom.testing")
+"""Packages that gather names from elsewhere, for notebooks and authors of plugins."""
 
-    def top_level(file: Path) -> set[str]:
-        body = [n for n in tree(file).body if isinstance(n, (ast.Import, ast.ImportFrom))]
-        return {name for node in body for name in imports(node) if name in names}
 
-    edges = {name: top_level(file) for name, file in names.items()}
+def test_names_are_imported_from_the_file_that_defines_them() -> None:
+    files = {module_of(file).removesuffix(".__init__"): file for file in FILES}
+    elsewhere = []
+    for file in [*FILES, *(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
+        for node in ast.walk(tree(file)):
+            if not isinstance(node, ast.ImportFrom) or node.module not in files or node.module in FRONTS:
+                continue
+            body = ast.walk(tree(files[node.module]))
+            borrowed = {name.asname or name.name for n in body if isinstance(n, ast.ImportFrom) for name in n.names}
+            named = {alias.name for alias in node.names if f"{node.module}.{alias.name}" not in files}
+            elsewhere += [
+                f"{file.relative_to(ROOT)}: {node.module} borrows {name}" for name in sorted(named & borrowed)
+            ]
+    assert elsewhere == []
+
+
+def test_no_import_circles() -> None:
+    """At whatever place in a file: an import in a function is late, and hides a circle."""
+    names = {module_of(file): file for file in FILES if file.name != "__init__.py"}
+    edges = {name: _runtime_imports(tree(file)) & names.keys() for name, file in names.items()}
     finished: set[str] = set()
 
     def visit(name: str, path: tuple[str, ...]) -> None:

@@ -14,7 +14,9 @@ import torch
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import machine_memory
 from nerfloom.base.errors import ConfigError, DataError
-from nerfloom.data.dataset import Dataset, ParsedScene, load_dataset, read_image
+from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.image_files import read_image
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import MAGIC, PixelMemory, unpack
 from nerfloom.data.pixels.store import FileStore
 from tests.forked import Forks, Program

@@ -8,7 +8,7 @@ import torch
 
 from nerfloom.base.checked import checked
 from nerfloom.data.scene import Scene
-from nerfloom.training.trainer import State
+from nerfloom.training.state import State
 
 BOX = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
 POSES = torch.eye(4)[:3].repeat(5, 1, 1)

@@ -12,8 +12,9 @@ import torch
 from PIL import Image
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import assemble, existing_files, image_size, load_dataset, read_image
+from nerfloom.data.dataset import assemble, existing_files, load_dataset
 from nerfloom.data.decoding import from_arrays
+from nerfloom.data.image_files import image_size, read_image
 from nerfloom.data.masks import read_mask
 from nerfloom.data.pixels.batch import background_colors, composite
 from nerfloom.dataparsers.blender import Blender

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.data.dataset import DataParser
+from nerfloom.data.parsed_scene import DataParser
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.procedural import Procedural
 from nerfloom.evaluation.evaluator import evaluate

@@ -12,7 +12,8 @@ from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.travel import Travel
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.kernels.images.silhouettes import hold_balls
-from nerfloom.kernels.march.waves import Occupancy, candidates
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import candidates
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
 from nerfloom.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 from nerfloom.scene.speed import travel_of

@@ -19,7 +19,7 @@ from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import MLP
 from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.grids.hash_grid_layout import MAX_RESOLUTION, HashGridLayout
-from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.table_memory import table
 from nerfloom.registry import load_method, registered
 from nerfloom.samplers.occupancy import OccupancySampler

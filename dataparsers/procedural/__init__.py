@@ -14,8 +14,8 @@ from torch import Tensor
 
 from nerfloom import DataError, DataParser, ParsedScene
 from nerfloom.base.console import say, track
+from nerfloom.base.splits import Split
 from nerfloom.base.user_cache import cache_folder
-from nerfloom.data.dataset import Split
 from nerfloom.dataparsers.blender import Blender
 
 VERSION = 1

@@ -20,13 +20,16 @@ from nerfloom.kernels.compositing.density import composite, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid
-from nerfloom.kernels.grids.planes import PlanesLayout, planes
+from nerfloom.kernels.grids.hash_grid import hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.planes import planes
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms.intervals import interval_weights, proposal_excess, resample
 from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.march.fixed_slots import Placed, fill, reach, share_out
 from nerfloom.kernels.march.occupancy import Occupancy
-from nerfloom.kernels.march.waves import march, sort_by_ray
+from nerfloom.kernels.march.ray_order import sort_by_ray
+from nerfloom.kernels.march.waves import march
 from nerfloom.kernels.splats.blend import blend
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference

@@ -31,12 +31,15 @@ from nerfloom.kernels.adam.adam import sparse_adam, sparse_adam_reference
 from nerfloom.kernels.compositing.density import composite, composite_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.multisampled_grid import multisampled_grid, multisampled_grid_reference
-from nerfloom.kernels.grids.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.grids.planes import planes, planes_reference
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms.step_functions import blurred_excess, blurred_excess_reference
 from nerfloom.kernels.images.ssim import photometric_loss, photometric_reference
-from nerfloom.kernels.march.waves import March, Occupancy, ReferenceMarch, march
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import March, ReferenceMarch, march
 from nerfloom.kernels.networks.mlp import Activation, mlp, mlp_reference
 from nerfloom.training.machine import machine
 

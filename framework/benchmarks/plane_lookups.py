@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 
 
 def layouts() -> list[tuple[str, PlanesLayout, int]]:

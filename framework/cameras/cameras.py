@@ -17,8 +17,7 @@ from torch import Tensor
 
 from nerfloom.base.device import runs_ahead
 from nerfloom.base.errors import DataError
-from nerfloom.geometry.lenses import DISTORTED, Distortion, LensRays, iterations_needed, project, unproject
-from nerfloom.geometry.lenses import LENSES as LENSES
+from nerfloom.geometry.lenses import DISTORTED, LENSES, Distortion, LensRays, iterations_needed, project, unproject
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.argument_checks import check_indices, is_followed

@@ -19,7 +19,7 @@ from nerfloom.registry import registered
 from nerfloom.training.signals import exit_status, orderly_end
 
 if TYPE_CHECKING:
-    from nerfloom.data.dataset import DataParser
+    from nerfloom.data.parsed_scene import DataParser
 
 K = TypeVar("K")
 

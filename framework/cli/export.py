@@ -15,7 +15,7 @@ from nerfloom.cli.flags import read_flags
 from nerfloom.cli.run_flags import OPENS
 
 if TYPE_CHECKING:
-    from nerfloom.data.dataset import ParsedScene
+    from nerfloom.data.parsed_scene import ParsedScene
     from nerfloom.training.loaded import Loaded
 
 USAGE = """\

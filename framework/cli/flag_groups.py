@@ -22,7 +22,7 @@ from tyro.constructors import (
 
 from nerfloom.base.config import AppearanceConfig, RayConfig, TrainConfig
 from nerfloom.cli.flag_help import plain_flags
-from nerfloom.data.dataset import DataParser
+from nerfloom.data.parsed_scene import DataParser
 from nerfloom.losses.few_images import FewImagesConfig
 from nerfloom.samplers.background import BackgroundConfig
 from nerfloom.samplers.choice import HierarchicalConfig, SamplingConfig

@@ -25,8 +25,9 @@ from nerfloom.cli.render_flags import (
     SpiralFlags,
     TimeFlags,
 )
-from nerfloom.data.dataset import Dataset, ParsedScene
+from nerfloom.data.dataset import Dataset
 from nerfloom.data.image_files import reduce_image
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.paths import (
     arc_of,

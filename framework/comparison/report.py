@@ -15,13 +15,13 @@ from typing import Any
 
 from rich.table import Table
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.comparison import plots
 from nerfloom.comparison.crops import views
 from nerfloom.comparison.measures import SAME_TIME, Measured, Row, pareto
 from nerfloom.comparison.plan import Conditions, Plan
 from nerfloom.evaluation.images import ERROR_AT_WHITE
 from nerfloom.evaluation.lpips import NETWORK
-from nerfloom.training.checkpoint import write_atomically
 
 
 @dataclass(frozen=True)

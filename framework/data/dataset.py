@@ -15,7 +15,6 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
-from nerfloom.base.splits import Split as Split
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.cameras.poses import Placement
@@ -23,14 +22,9 @@ from nerfloom.cameras.view import View
 from nerfloom.data.coverage import pixels_with_rays
 from nerfloom.data.decoding import Decoded, ImageFiles, decode
 from nerfloom.data.depths import read_depths
-from nerfloom.data.image_files import image_size as image_size
-from nerfloom.data.image_files import one_line as one_line
-from nerfloom.data.image_files import read_image as read_image
-from nerfloom.data.image_files import reduce_image as reduce_image
 from nerfloom.data.light import APPEARANCE_STOPS, light_spread
 from nerfloom.data.names_on_disk import nearest_on_disk
-from nerfloom.data.parsed_scene import DataParser as DataParser
-from nerfloom.data.parsed_scene import ParsedScene as ParsedScene
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.pixels.mapped import MappedPixels
 from nerfloom.data.pixels.pixel_set import PixelSet

@@ -8,7 +8,7 @@ from fractions import Fraction
 import torch
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.data.dataset import ParsedScene
+from nerfloom.data.parsed_scene import ParsedScene
 
 
 def evenly_spread(total: int, count: int) -> list[int]:

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from nerfloom.base.config import Range, TrainConfig
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.opening import Opening
-from nerfloom.kernels.grids.hash_grid import LOOK_UP, HashGridLayout, hash_grid
-from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.kernels.grids.hash_grid import LOOK_UP, hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION, HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.table_memory import table
 

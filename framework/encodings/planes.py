@@ -13,7 +13,8 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.opening import Opening
 from nerfloom.kernels.grids.drawn_bands import drawn_bands
 from nerfloom.kernels.grids.plane_bands import Band, band_variation, plane_bands, variation
-from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout, planes
+from nerfloom.kernels.grids.planes import PlanesGradient, planes
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.table_memory import table
 
 BANDS = 16

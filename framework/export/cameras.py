@@ -12,10 +12,11 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.splits import Split
-from nerfloom.cameras.cameras import LENSES, Cameras, join_cameras
+from nerfloom.cameras.cameras import Cameras, join_cameras
 from nerfloom.cameras.carried import carried_poses
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.dataset import ParsedScene
+from nerfloom.data.parsed_scene import ParsedScene
+from nerfloom.geometry.lenses import LENSES
 from nerfloom.renderable import RefinesPoses, Renderable
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import ConfigError
 from nerfloom.export.cameras import PosedFiles, coefficients, rational
-from nerfloom.training.checkpoint import write_atomically
 
 ORDERS = {
     "PINHOLE": (),

@@ -11,13 +11,13 @@ from typing import Any, BinaryIO, Literal
 import numpy as np
 from torch import Tensor
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
 from nerfloom.data.offsets import write_offset
 from nerfloom.data.ply import coordinate_columns, in_full, write_columns
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.texture import Texture
 from nerfloom.geometry.local_origin import local_origin
-from nerfloom.training.checkpoint import write_atomically
 
 MeshFormat = Literal["ply", "obj", "glb"]
 """Suffix of a file that meshes are written to."""

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.ply import write_points
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.samplers.base import SkipsCells
-from nerfloom.training.checkpoint import write_atomically
 
 GREY = 0.6
 """Colour of cells."""

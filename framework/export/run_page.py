@@ -8,6 +8,7 @@ from statistics import fmean
 
 import torch
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError, FlagError, printable
 from nerfloom.cameras.cameras import Cameras
@@ -36,7 +37,6 @@ from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_ca
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.transform import transformed
-from nerfloom.training.checkpoint import write_atomically
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
 

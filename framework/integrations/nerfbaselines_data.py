@@ -19,9 +19,10 @@ from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras, check_pose, join_cameras
 from nerfloom.cameras.colmap import PARAMETERS, from_colmap
 from nerfloom.cameras.poses import NEAR, Placement, estimate_near, nearest_point, place
-from nerfloom.data.dataset import Dataset, Masks, ParsedScene, assemble
+from nerfloom.data.dataset import Dataset, Masks, assemble
 from nerfloom.data.decoding import Decoded, from_arrays
 from nerfloom.data.masks import THRESHOLD
+from nerfloom.data.parsed_scene import ParsedScene
 
 DatasetDict = dict[str, Any]
 """nerfbaselines' `Dataset`. Its `cameras`, `image_paths`, `images`, `masks`, `points3D_xyz` and `metadata` are used."""

@@ -150,7 +150,7 @@ def write(path: Path, value: dict[str, Any]) -> None:
         path: the file.
         value: its content.
     """
-    from nerfloom.training.checkpoint import write_atomically  # imports PyTorch
+    from nerfloom.base.atomic import write_atomically
 
     text = json.dumps(value, indent=2, allow_nan=False)
     write_atomically(path, lambda file: file.write(text.encode()))

@@ -12,7 +12,8 @@ from nerfloom.fields.base import HasAlpha
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.compositing.alpha import alpha_depth
 from nerfloom.kernels.march.fixed_slots import Placed, fill, longest_ray, reach
-from nerfloom.kernels.march.waves import Occupancy, Wave
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import Wave
 from nerfloom.samplers.sample_capacity import Room
 
 SHORTEST = 1e-10

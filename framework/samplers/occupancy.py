@@ -26,8 +26,8 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.argument_checks import is_followed
 from nerfloom.kernels.compositing.alpha import alpha_depth
 from nerfloom.kernels.march.fixed_slots import most_steps
-from nerfloom.kernels.march.occupancy import own_cells
-from nerfloom.kernels.march.waves import RUN, March, Occupancy, Wave, march, refresh_occupancy
+from nerfloom.kernels.march.occupancy import Occupancy, own_cells, refresh_occupancy
+from nerfloom.kernels.march.waves import RUN, March, Wave, march
 from nerfloom.kernels.result_cache import Waves
 from nerfloom.kernels.rows import gather_rows
 from nerfloom.kernels.traced.trace import trace

@@ -15,9 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras, subpixels
-from nerfloom.data.dataset import DataParser, Dataset, Split, load_dataset
+from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.image_files import reduce_image
+from nerfloom.data.parsed_scene import DataParser
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
 from nerfloom.evaluation.evaluator import spread

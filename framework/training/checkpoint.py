@@ -19,7 +19,7 @@ import torch
 from torch.torch_version import TorchVersion
 
 from nerfloom.base.archives import uncompressed_size
-from nerfloom.base.atomic import write_atomically as write_atomically
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
 from nerfloom.base.errors import CheckpointError
 from nerfloom.training.run_path import CHECKPOINTS

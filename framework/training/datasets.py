@@ -6,7 +6,8 @@ import torch
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import Dataset, Split, load_dataset
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run

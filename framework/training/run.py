@@ -26,16 +26,18 @@ from typing import Any
 
 import yaml
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.config import TrainConfig, from_plain, read_yaml, to_plain
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.splits import Split
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.dataset import DataParser, Dataset, ParsedScene, Split
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.parsed_scene import DataParser, ParsedScene
 from nerfloom.data.training_images import chosen_images
 from nerfloom.registry import load_dataparser, load_method
-from nerfloom.training.checkpoint import write_atomically
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.run_path import CONFIG, config_file
 

@@ -13,8 +13,9 @@ from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
-from nerfloom.data.dataset import DataParser, ParsedScene, load_dataset
+from nerfloom.data.dataset import load_dataset
 from nerfloom.data.offsets import offset_file, read_offset
+from nerfloom.data.parsed_scene import DataParser, ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.local_origin import local_origin, rounding

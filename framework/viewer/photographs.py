@@ -18,8 +18,8 @@ from nerfloom.base.errors import NerfloomError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
 from nerfloom.cameras.view import View
-from nerfloom.data.dataset import ParsedScene
 from nerfloom.data.image_files import Content, read_image
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run

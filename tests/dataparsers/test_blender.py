@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import Split, load_dataset, read_image, reduce_image
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.image_files import read_image, reduce_image
 from nerfloom.dataparsers.blender import Blender
 from tests.conftest import EditJson
 

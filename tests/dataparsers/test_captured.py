@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import DataParser, load_dataset
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.parsed_scene import DataParser
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.conftest import write_tiny
 from tests.dataparsers.captures import FX, poses, worst_miss, write_capture, write_images

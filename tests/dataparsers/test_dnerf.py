@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import Split, load_dataset
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.dnerf import DNeRF
 from nerfloom.training.data_folder import find_data

@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import Split, load_dataset
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.dataparsers.captures import (
     CX,

@@ -16,8 +16,10 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
+from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.dataset import ParsedScene, Split, load_dataset
+from nerfloom.data.dataset import load_dataset
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.dnerf import DNeRF
 from nerfloom.scene.enclosing_box import enclosing_box

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.dataset import DataParser, ParsedScene
+from nerfloom.data.parsed_scene import DataParser, ParsedScene
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap, read_images
 from nerfloom.dataparsers.colmap_model import read_model

@@ -14,13 +14,14 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cli import evaluate as eval_command
 from nerfloom.cli.session import resume
 from nerfloom.cli.session import start as start_session
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.images import write_image
-from nerfloom.training.checkpoint import FOLDER, write_atomically
+from nerfloom.training.checkpoint import FOLDER
 from nerfloom.training.run import create_folder, read_run, write_report
 from tests.conftest import Refused
 from tests.faults.conftest import Disk

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.cameras.cameras import LENSES, Cameras
+from nerfloom.cameras.cameras import Cameras
 from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
 from nerfloom.evaluation.paths import look_at
 from nerfloom.fields.pixel_aligned import PixelAlignedField
+from nerfloom.geometry.lenses import LENSES
 from nerfloom.geometry.points import Points
 
 SIZES = torch.tensor([[24, 16], [24, 16], [24, 16]])

@@ -20,8 +20,10 @@ from nerfloom.kernels.adam.adam import dense_adam, dense_adam_reference, sparse_
 from nerfloom.kernels.compositing.density import composite, composite_reference, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from nerfloom.kernels.grids.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.planes import planes, planes_reference
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms.intervals import (
     interval_weights,
     interval_weights_reference,
@@ -29,7 +31,8 @@ from nerfloom.kernels.histograms.intervals import (
     resample_reference,
 )
 from nerfloom.kernels.images.ssim import ssim, ssim_reference
-from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarch, refresh_occupancy
+from nerfloom.kernels.march.occupancy import Occupancy, refresh_occupancy
+from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.kernels.networks.mlp import mlp, mlp_reference
 from nerfloom.kernels.splats.blend import blend, blend_reference

@@ -22,11 +22,13 @@ from nerfloom.kernels.dispatch import TRITON, Backend, Operation, derivatives
 from nerfloom.kernels.encodings.contraction import CONTRACT
 from nerfloom.kernels.encodings.frequency import FREQUENCY_ENCODING
 from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
-from nerfloom.kernels.grids.hash_grid import HASH_GRID, HashGridLayout, hash_grid
+from nerfloom.kernels.grids.hash_grid import HASH_GRID, hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.multisampled_grid import MULTISAMPLED_GRID
 from nerfloom.kernels.grids.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
 from nerfloom.kernels.grids.plane_bands import BAND_VARIATION, PLANE_BANDS
-from nerfloom.kernels.grids.planes import PLANES, PlanesGradient, PlanesLayout
+from nerfloom.kernels.grids.planes import PLANES, PlanesGradient
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms.intervals import INTERVAL_WEIGHTS, PROPOSAL_EXCESS, RESAMPLE
 from nerfloom.kernels.histograms.proposals import PROPOSAL_WEIGHTS
 from nerfloom.kernels.histograms.spacing import SPACED
@@ -36,7 +38,8 @@ from nerfloom.kernels.images.ssim import PHOTOMETRIC, SIMILARITY
 from nerfloom.kernels.march.first_shared import CELLS, FIRST_SHARED, LEVELS
 from nerfloom.kernels.march.fixed_slots import FILL, REACH, fill
 from nerfloom.kernels.march.occupancy import REFRESH_OCCUPANCY, Occupancy
-from nerfloom.kernels.march.waves import MARCH, SORT_BY_RAY, March, march
+from nerfloom.kernels.march.ray_order import SORT_BY_RAY
+from nerfloom.kernels.march.waves import MARCH, March, march
 from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, NETWORK
 from nerfloom.kernels.rows import GATHER_ROWS
 from nerfloom.kernels.splats.blend import BLEND

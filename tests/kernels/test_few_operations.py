@@ -12,10 +12,12 @@ from nerfloom.kernels.compositing.density import bounded_sum, segmented_sum
 from nerfloom.kernels.dispatch import FEW_OPERATIONS, Operation
 from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
 from nerfloom.kernels.grids import hash_grid, planes
-from nerfloom.kernels.grids.hash_grid import HASH_GRID, HashGridLayout
+from nerfloom.kernels.grids.hash_grid import HASH_GRID
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.multisampled_grid import MULTISAMPLED_GRID
 from nerfloom.kernels.grids.plane_bands import PLANE_BANDS
-from nerfloom.kernels.grids.planes import PLANES, PlanesLayout
+from nerfloom.kernels.grids.planes import PLANES
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.march.waves import ReferenceMarch
 from nerfloom.kernels.rows import gather_rows
 from nerfloom.kernels.splats import blend

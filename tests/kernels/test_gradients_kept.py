@@ -22,7 +22,8 @@ from nerfloom.kernels.compositing.density import composite, composite_reference,
 from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.multisampled_grid import multisampled_grid, multisampled_grid_reference
 from nerfloom.kernels.grids.multisamples import (
     frustum_balls,
@@ -31,7 +32,8 @@ from nerfloom.kernels.grids.multisamples import (
     unit_multisamples_reference,
 )
 from nerfloom.kernels.grids.plane_bands import Band, band_variation
-from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout, planes, planes_reference
+from nerfloom.kernels.grids.planes import PlanesGradient, planes, planes_reference
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms.intervals import (
     interval_weights,
     interval_weights_reference,

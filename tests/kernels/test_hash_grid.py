@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from nerfloom.encodings.hash_grid import HashGrid
-from nerfloom.kernels.grids.hash_grid import PRIMES, HashGridLayout, corners, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid import PRIMES, corners, hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 
 MIXED = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=40, log2_table_size=9)
 

@@ -12,7 +12,7 @@ from nerfloom.data.pixels.batch import gather_colors
 from nerfloom.fields.appearance import Appearance
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import composite, distortion
-from nerfloom.kernels.march.waves import sort_by_ray
+from nerfloom.kernels.march.ray_order import sort_by_ray
 from nerfloom.kernels.rows import gather_rows, take_rows
 
 SIX = torch.full((2,), 6)

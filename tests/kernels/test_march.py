@@ -8,16 +8,9 @@ import torch
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.march.occupancy import refresh_occupancy_reference
-from nerfloom.kernels.march.waves import (
-    CompiledMarch,
-    Occupancy,
-    ReferenceMarch,
-    candidates,
-    refresh_occupancy,
-    sort_by_ray,
-    step_start,
-)
+from nerfloom.kernels.march.occupancy import Occupancy, refresh_occupancy, refresh_occupancy_reference
+from nerfloom.kernels.march.ray_order import sort_by_ray
+from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch, candidates, step_start
 from tests.kernels.compiled import needs_kernels
 
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])

@@ -11,7 +11,8 @@ from nerfloom.geometry.bounds import to_unit_box
 from nerfloom.geometry.multisamples import fixed_pattern, hashed_pattern
 from nerfloom.geometry.points import Frustums
 from nerfloom.kernels.encodings.contraction import contract_to_unit_reference
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid import hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.multisampled_grid import LOOK_UP, multisampled_grid, multisampled_grid_reference
 from nerfloom.kernels.grids.multisamples import (

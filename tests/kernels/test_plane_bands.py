@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerfloom.kernels.grids.plane_bands import Band, band_variation
-from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout
+from nerfloom.kernels.grids.planes import PlanesGradient
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from tests.kernels.compiled import needs_kernels, relative_error
 
 pytestmark = needs_kernels

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from nerfloom.kernels.grids.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.grids.planes import planes, planes_reference
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from tests.kernels.compiled import needs_kernels, relative_error
 
 STILL = PlanesLayout.build(((8, 9, 10), (16, 5, 32)))

@@ -5,8 +5,10 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels.compositing.thinning import thinned
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid
-from nerfloom.kernels.grids.planes import PlanesLayout, planes
+from nerfloom.kernels.grids.hash_grid import hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.planes import planes
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 
 COPIES = 4_000
 

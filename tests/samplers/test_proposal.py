@@ -11,7 +11,8 @@ from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
-from nerfloom.rendering.volume import Rendered, VolumeRenderer
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 from PIL import Image
 
-from nerfloom.base.config import ConfigError
+from nerfloom.base.errors import ConfigError
 from nerfloom.cli.train import _flag_names
 from nerfloom.registry import load_method, registered
 from tests.site.commands import Checker

@@ -11,7 +11,7 @@ from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.tensor import DENSITY_SCALE, DENSITY_SHIFT, TensorField
 from nerfloom.geometry.points import Points
-from nerfloom.kernels.march.waves import refresh_occupancy
+from nerfloom.kernels.march.occupancy import refresh_occupancy
 from nerfloom.kernels.math import MAX_LOG_DENSITY, split_density, truncated_exp
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.stress.backends import FEW, backends

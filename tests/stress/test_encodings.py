@@ -17,8 +17,10 @@ from nerfloom.kernels.compositing.density import composite
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid, hash_grid_reference
-from nerfloom.kernels.grids.planes import PlanesLayout, planes, planes_reference
+from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.planes import planes, planes_reference
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms.intervals import interval_weights, resample
 from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf
 from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity

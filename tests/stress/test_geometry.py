@@ -22,7 +22,8 @@ from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
-from nerfloom.kernels.march.waves import CompiledMarch, Occupancy
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import CompiledMarch
 from nerfloom.kernels.math import safe_normalize
 from tests.stress.backends import COMPILED, FEW, backends
 

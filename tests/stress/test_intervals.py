@@ -17,7 +17,8 @@ from nerfloom.kernels.compositing.density import (
     weights_and_transmittance,
 )
 from nerfloom.kernels.histograms.intervals import interval_weights
-from nerfloom.rendering.volume import Rendered, volume_render
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.rendering.volume import volume_render
 from tests.kernels.test_compositing import EXTREMES, ragged
 from tests.stress.backends import FEW, backends
 

@@ -21,7 +21,7 @@ from nerfloom.evaluation.metrics import MAX_PSNR, psnr, ssim
 from nerfloom.geometry.rays import Histogram, Samples
 from nerfloom.kernels.compositing.density import distortion, distortion_by_pairs
 from nerfloom.kernels.grids.plane_bands import squared_steps, variation
-from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.losses.functions import depth_error, mean_squared_error
 from nerfloom.methods.kplanes import METHOD, KPlanes, KPlanesConfig, PlaneRegularity
 from nerfloom.samplers.proposal import interlevel_loss

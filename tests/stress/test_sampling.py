@@ -14,7 +14,8 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.histograms.intervals import resample
 from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf
 from nerfloom.kernels.histograms.spacing import spacing
-from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarch
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss
 from tests.kernels.test_march import walk

@@ -24,7 +24,8 @@ from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.uniform import UniformSampler
 from nerfloom.training.optim import Adam
-from nerfloom.training.trainer import State, Trainer
+from nerfloom.training.state import State
+from nerfloom.training.trainer import Trainer
 from tests.stress.backends import backends
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 

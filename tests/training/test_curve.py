@@ -29,7 +29,8 @@ from nerfloom.training.curve import (
     rows,
 )
 from nerfloom.training.progress import StepReport
-from nerfloom.training.trainer import State, Trainer
+from nerfloom.training.state import State
+from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from nerfloom import DataParser, ParsedScene
 from nerfloom.base.errors import DataError
-from nerfloom.data.dataset import Split, load_dataset
+from nerfloom.base.splits import Split
+from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.registry import load_method
 from nerfloom.training.run import TRANSFORMS, Run, write_transforms

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from nerfloom import Cameras, ParsedScene
+from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import estimate_near
-from nerfloom.data.dataset import Dataset, Split, load_dataset
+from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.depths import read_depth
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.geometry.rays import Rays

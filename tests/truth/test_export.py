@@ -14,7 +14,7 @@ from torch import Tensor
 from nerfloom.dataparsers.polycam import Polycam
 from nerfloom.export.points import SurfacePoints, joined, surface_points
 from nerfloom.geometry.rays import Rays
-from nerfloom.rendering.volume import Rendered
+from nerfloom.rendering.rendered import Rendered
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import create_folder

@@ -12,7 +12,8 @@ import torch
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.march.waves import CompiledMarch, Occupancy, ReferenceMarch
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch
 
 BOX = np.array([[-1.0, -1.2, -0.9], [1.1, 1.0, 1.3]])
 RESOLUTION, STEP = 48, 0.013

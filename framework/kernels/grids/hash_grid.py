@@ -17,7 +17,7 @@ from torch import Tensor
 from nerfloom.geometry.limits import between
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import FEW_OPERATIONS, TRITON
-from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout as HashGridLayout
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient, fits
 from nerfloom.kernels.triton_backend import later
 

@@ -18,7 +18,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nerfloom.kernels.grids.hash_grid import HashGridLayout
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.triton_launch import blocks, launch
 

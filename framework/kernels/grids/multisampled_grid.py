@@ -17,7 +17,8 @@ from torch import Tensor
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import FEW_OPERATIONS
 from nerfloom.kernels.grids.downweighting import level_weights
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, corners, hash_grid
+from nerfloom.kernels.grids.hash_grid import corners, hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient
 
 

@@ -21,7 +21,7 @@ from nerfloom.kernels.adam.adam import sparse_adam
 from nerfloom.kernels.adam.deferred import Parts, waiting
 from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
 from nerfloom.kernels.grids.plane_bands import Shape, add_variation_gradient
-from nerfloom.kernels.grids.planes_layout import PlanesLayout as PlanesLayout
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.triton_backend import later
 
 MAX_HELD = 2**26

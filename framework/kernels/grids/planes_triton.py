@@ -17,7 +17,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nerfloom.kernels.grids.planes import PlanesGradient, PlanesLayout
+from nerfloom.kernels.grids.planes import PlanesGradient
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.triton_launch import blocks, launch
 
 BLOCK = 32

@@ -24,11 +24,8 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.compositing.density import bounded_sum, optical_depth
 from nerfloom.kernels.dispatch import CPP, TRITON, Operation
-from nerfloom.kernels.march.occupancy import Occupancy as Occupancy
-from nerfloom.kernels.march.occupancy import refresh_occupancy as refresh_occupancy
-from nerfloom.kernels.march.ray_order import SORT_BY_RAY as SORT_BY_RAY
-from nerfloom.kernels.march.ray_order import sort_by_ray as sort_by_ray
-from nerfloom.kernels.march.ray_order import sort_by_ray_reference as sort_by_ray_reference
+from nerfloom.kernels.march.occupancy import Occupancy
+from nerfloom.kernels.march.ray_order import sort_by_ray
 from nerfloom.kernels.triton_backend import later
 
 RUN = 8

@@ -18,7 +18,8 @@ from torch import Tensor
 from nerfloom.kernels import native, result_cache
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.encodings.contraction import contract_to_unit
-from nerfloom.kernels.grids.hash_grid import HASH_GRID, HashGridLayout, hash_grid
+from nerfloom.kernels.grids.hash_grid import HASH_GRID, hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.march.waves import CompiledMarch, March
 from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, density_mlp, multiplies_bf16

@@ -22,8 +22,8 @@ from nerfloom.kernels.adam import adam_triton
 from nerfloom.kernels.compositing import density_triton
 from nerfloom.kernels.encodings import encodings_triton
 from nerfloom.kernels.grids import hash_grid_triton, planes_triton
-from nerfloom.kernels.grids.hash_grid import HashGridLayout
-from nerfloom.kernels.grids.planes import PlanesLayout
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.kernels.histograms import intervals_triton
 from nerfloom.kernels.images import ssim_triton
 from nerfloom.kernels.march import fixed_slots, fixed_slots_triton, waves_triton

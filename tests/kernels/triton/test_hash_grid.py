@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.grids.hash_grid import HashGridLayout, hash_grid
+from nerfloom.kernels.grids.hash_grid import hash_grid
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from tests.kernels.triton.compared import compare
 
 GRID = HashGridLayout.build(2, 4, 40, 8)  # a dense level and a hashed one

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.march.occupancy import own_cells
-from nerfloom.kernels.march.waves import Occupancy, ReferenceMarch, march, sort_by_ray, sort_by_ray_reference
+from nerfloom.kernels.march.occupancy import Occupancy, own_cells
+from nerfloom.kernels.march.ray_order import sort_by_ray, sort_by_ray_reference
+from nerfloom.kernels.march.waves import ReferenceMarch, march
 from tests.kernels.test_march import BOX, occupancy, random_rays, walk
 from tests.kernels.triton.compared import DEVICE, backends
 

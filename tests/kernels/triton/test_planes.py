@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from nerfloom.kernels.grids.planes import PlanesLayout, planes
+from nerfloom.kernels.grids.planes import planes
+from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from tests.kernels.triton.compared import compare
 
 LAYOUTS = {

@@ -100,7 +100,7 @@ def _curves(flags: CurvesFlags) -> None:
 
 
 def _tables(flags: TablesFlags) -> None:
-    """Run what is missing, or list or print what there is.
+    """Run missing rows, or list or print existing ones.
 
     Args:
         flags: the flags of the command.

@@ -47,7 +47,7 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
         data: folder of the data set.
         seconds: seconds of training of each run.
         seeds: number of runs of each variant.
-        target: PSNR, dB, for which the time is reported.
+        target: the time to reach this PSNR is reported, dB.
 
     Returns:
         The machine, the arguments and a row for each variant, as plain data.
@@ -94,7 +94,7 @@ def train(
 
 
 def crossing(curve: list[tuple[float, float]], target: float) -> float | None:
-    """Return the seconds at which a curve first reaches a target, by linear interpolation.
+    """Return the time when a curve first reaches a target, seconds, by linear interpolation.
 
     Args:
         curve: (seconds, PSNR) in the order of time.

@@ -13,7 +13,7 @@ from nerfloom.export.mesh import Mesh
 SignedDistance = Callable[[Tensor], Tensor]
 """Function from positions (N, 3) to signed distances (N,), negative inside a solid."""
 SHELL = 0.01
-"""Half the thickness of the shell in which points are drawn, before they are moved to the surface."""
+"""Half the thickness of the shell where points are drawn, before they are moved to the surface."""
 CHUNK = 2**17
 """Number of positions evaluated at once."""
 MESH_SAMPLES = 1_000_000

@@ -65,7 +65,7 @@ class Shape(Protocol):
         """Return whether `positions` (N, 3) are inside, (N,) bool; the boundary is inside."""
 
     def crossing(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distances (R,) at which rays enter and leave; both are equal for a ray that misses.
+        """Return the distances (R,) where rays enter and leave; equal for rays that miss.
 
         Args:
             origins, directions: (R, 3) rays.
@@ -167,7 +167,7 @@ class Solids(ClosedForm):
 
 
 def mean_place(tau: Tensor) -> Tensor:
-    """Return the mean position, 0 to 1, at which a homogeneous interval of optical depth `tau` stops light.
+    """Return the mean position, 0 to 1, where a homogeneous interval of optical depth `tau` stops light.
 
     It is 1 / tau - 1 / (exp(tau) - 1), and tends to 1/2 for small tau.
     """
@@ -202,8 +202,8 @@ class Gaussian:
 
         Args:
             origins, directions: (R, 3) rays.
-            starts: (R,) distances at which the intervals start.
-            t: (R, B) distances at which they end.
+            starts: (R,) start distances of the intervals.
+            t: (R, B) end distances of the intervals.
         """
         nearest, squared = _nearest(origins, directions, self.center)
         width = self.deviation * math.sqrt(2) / directions.norm(dim=-1)

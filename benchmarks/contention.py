@@ -35,7 +35,7 @@ LOOP = "import time\nend = time.monotonic() + {seconds}\nwhile time.monotonic() 
 WORK = ("training", "rendering")
 """Kinds of work to measure."""
 SETTINGS_FOR = 45.0
-"""Time budget, seconds, for which the method chooses its settings."""
+"""Time budget that the method's settings are chosen for, seconds."""
 STEPS_BEFORE_RENDERING = 300
 """Training steps before rendering is measured."""
 

@@ -29,14 +29,15 @@ class Curve(NamedTuple):
 
 
 def evaluations_needed(evaluations: Sequence[float], errors: Sequence[float], target: float) -> float | None:
-    """Return the evaluations at which a curve first reaches an error, by a power law between neighbouring points.
+    """Return the number of evaluations where a curve first reaches an error, by a power law between neighbouring
+    points.
 
     Args:
         evaluations, errors: coordinates of the points, in the order of the sweep.
         target: the error.
 
     Returns:
-        Evaluations; those of the first point if it reaches the error, None if no point does.
+        Number of evaluations; the first point's if it reaches the error, None if no point does.
     """
     if errors and errors[0] <= target:
         return evaluations[0]

@@ -60,7 +60,7 @@ class AblationFlags:
     seeds: int = 2
     """Number of runs of each variant."""
     target: float = 30.0
-    """PSNR of the validation views, dB, to which the time is reported."""
+    """The time to reach this PSNR of the validation views is reported, dB."""
     output_dir: Path = RESULTS
     """Folder of ablation-DATA.json."""
 
@@ -76,7 +76,7 @@ class StartsFlags:
     seeds: int = 1
     """Number of runs from each start."""
     target: float = 30.0
-    """PSNR of the validation views, dB, to which the time is reported."""
+    """The time to reach this PSNR of the validation views is reported, dB."""
     output_dir: Path = RESULTS
     """Folder of starts-DATA.json."""
 
@@ -133,7 +133,7 @@ class CacheFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class PosesFlags:
-    """Compare poses from ns-process-data with those of a COLMAP model of the same images, by name."""
+    """Compare poses from ns-process-data with a COLMAP model of the same images, by name."""
 
     processed: Path
     """Folder with transforms.json."""
@@ -148,9 +148,9 @@ class PoseRefinementFlags:
     seconds: float = 120.0
     """Seconds of training of each run."""
     degrees: float = 1.0
-    """Angle by which each training camera is rotated, degrees."""
+    """Rotation of each training camera, degrees."""
     percent: float = 1.0
-    """Distance by which each training camera is moved, per cent of its distance from the centre of the scene."""
+    """Shift of each training camera, per cent of its distance from the centre of the scene."""
     method: str = "nerfacto"
     """Name of the method."""
     output_dir: Path = RESULTS
@@ -159,7 +159,7 @@ class PoseRefinementFlags:
 
 @dataclass(frozen=True)
 class MeshFlags:
-    """Export meshes of a run; report their distance from what is known of the surface, their time and memory."""
+    """Export meshes of a run; report their distance from the known surface, their time and memory."""
 
     load_config: Path | None = None
     """Folder of a run; if not given, instant-ngp is trained on the embedded scene."""
@@ -227,6 +227,6 @@ class ProcessesFlags:
     samples: int = 2**15
     """Samples of a training step of one process."""
     targets: tuple[float, ...] = (24.0, 26.0, 28.0)
-    """PSNRs of validation views, dB, to which the time is reported."""
+    """The times to reach these PSNRs of validation views are reported, dB."""
     output_dir: Path = RESULTS
     """Folder of processes-DATA.json."""

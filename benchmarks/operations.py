@@ -3,7 +3,7 @@
 They are counted on the CPU, by torch's dispatcher. All computed tensors are assumed to be on the device, except tensors
 created without naming a device, and results of these alone.
 
-An operation is what the dispatcher passes on to a kernel; views and empty tensors start none. A wait is where Python
+An operation is a kernel call of the dispatcher; views and empty tensors are none. A wait is where Python
 needs a value or a size from the device, or where the device needs a value of Python's: there is no work left for the
 device until Python has gone on. Checks that are made on the CPU alone (`kernels.argument_checks`) are not counted.
 """
@@ -48,7 +48,7 @@ SCENES: dict[str, Callable[[int], Dataset]] = {
 }
 """Scenes for methods that need more than a static one in a box."""
 SIZE, IMAGE_SIZE = 64, 800
-"""Width and height of the images; and the image size for which methods decide their settings, pixels."""
+"""Width and height of the images, and the image size that methods choose their settings for, pixels."""
 SMALLER: dict[str, Any] = {
     "num_rays_per_batch": 16,
     "samples_per_batch": 2**11,
@@ -83,7 +83,7 @@ CPU_ONLY = "framework/kernels/argument_checks.py"
 """File of checks that other devices leave out."""
 PACKAGES = Path(__file__).parents[1]
 OURS = tuple(str(PACKAGES / name) for name in ("framework", "methods"))
-"""Folders of the code in which places are named."""
+"""Folders of the code whose places are named."""
 TOLD = 5
 """Number of places with the most waits to report."""
 
@@ -119,7 +119,7 @@ def measure(methods: Sequence[str], before: int, steps: int) -> dict[str, Any]:
 
     Args:
         methods: names of the methods.
-        before: uncounted training steps at the beginning, in which the occupancy grid finds empty space.
+        before: uncounted initial training steps, while the occupancy grid finds empty space.
         steps: number of counted steps.
 
     Returns:

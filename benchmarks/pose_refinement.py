@@ -42,8 +42,8 @@ def measure(method: str, seconds: float, degrees: float, percent: float) -> dict
     Args:
         method: name of the method.
         seconds: seconds of training of each run.
-        degrees: angle by which each camera is rotated, degrees.
-        percent: distance by which each camera is moved, per cent of its distance from the origin.
+        degrees: rotation of each camera, degrees.
+        percent: shift of each camera, per cent of its distance from the origin.
 
     Returns:
         The machine, the arguments and a row for each run, as plain data.
@@ -150,7 +150,7 @@ def errors(trainer: Trainer, data: Dataset, exact: Dataset, test: Dataset) -> di
 
 
 def carry(cameras: Cameras, truth: Tensor, given: Tensor) -> Cameras:
-    """Transform cameras from the frame of the true poses to that of other poses, by the best similarity.
+    """Transform cameras from the frame of the true poses to the frame of other poses, by the best similarity.
 
     Args:
         cameras: cameras in the frame of `truth`.

@@ -30,7 +30,7 @@ def measure(
         seconds: seconds of training of each run.
         seeds: number of runs of each kind.
         samples: samples per training step of one process.
-        targets: PSNRs of validation views, dB, for which the time is reported.
+        targets: the times to reach these PSNRs of validation views are reported, dB.
 
     Returns:
         The machine, the arguments and a row for each run, as plain data.

@@ -41,9 +41,9 @@ from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.training.machine import machine
 
 TARGETS = (1e-2, 1e-3, 1e-4)
-"""Mean errors for which the number of evaluations is reported."""
+"""The number of evaluations is reported for these mean errors."""
 THRESHOLDS = (1e-1, 1e-2, 1e-3, 1e-4)
-"""Transmittances at which rays end; each is also the bound of the error."""
+"""Transmittances where rays end; each is also the bound of the error."""
 STEPS = 512
 """Steps along the box's diagonal in measurements of skipping; the framework's default."""
 RAYS_AT_ONCE, SKIPPING_RAYS_AT_ONCE = 512, 4096

@@ -33,7 +33,7 @@ WHITE = torch.ones(3)
 DISTANCE, NEAR, FAR = 4.0, 2.0, 6.0
 """Distance of ray origins from the scene's centre, and near and far ends, as in NeRF's synthetic scenes."""
 EARLY_STOP = 1e-4
-"""Transmittance at which the sampler "early stop" ends a ray; the framework's default in rendering."""
+"""The sampler "early stop" ends rays at this transmittance, the default in rendering."""
 GRID_STEPS = 1024
 """Training steps for filling an occupancy grid, four times its warm-up."""
 FIT_RAYS = 1024
@@ -144,7 +144,7 @@ def marched(scene: Field, sampler: OccupancySampler, early_stop: float, rays: Ra
     Args:
         scene: the scene.
         sampler: the filled grid.
-        early_stop: transmittance at which rays end.
+        early_stop: transmittance where rays end.
         rays: R rays.
     """
     sampler.early_stop = early_stop

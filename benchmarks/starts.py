@@ -32,7 +32,7 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
         data: folder of the data set.
         seconds: seconds of training of each run.
         seeds: number of runs from each start.
-        target: PSNR, dB, for which the time is reported.
+        target: the time to reach this PSNR is reported, dB.
 
     Returns:
         The machine, the arguments and a row for each start, as plain data. For a start that the data does not support,

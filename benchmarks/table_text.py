@@ -13,7 +13,7 @@ from nerfloom.evaluation.lpips import NETWORK
 LOADING, EVALUATION = 20.0, 60.0
 """Seconds before a row's training, and after it where nothing is known of its data, in estimates of a row's time."""
 Column = tuple[str, Callable[[Result], float | None], Callable[[float], str]]
-"""Heading of a column, what it shows of a result, and how."""
+"""Heading of a column, its value in a result, and its format."""
 
 
 def columns(table: Table, found: Sequence[Result]) -> list[Column]:
@@ -73,7 +73,7 @@ def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
     Args:
         table: the table.
         results: the file of its results.
-        wanted: what is found in the names of the rows that are shown.
+        wanted: parts of the names of the rows to show.
     """
     lines: dict[tuple[str, str, float], list[tuple[Row, Result]]] = {}
     for row in filter(lambda row: wanted.search(row.name), table.rows):

@@ -27,7 +27,7 @@ from nerfloom.training.report import SUMMARY
 TRIED = 3
 """Number of held-out images to evaluate in a trial, which has other budgets than the table."""
 Result = dict[str, Any]
-"""What is kept of a row: what ns-eval writes, and how it was made, as `run`."""
+"""The stored result of a row: the output of ns-eval and, as `run`, how it was made."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def run_rows(rows: Sequence[Row], root: Path, file: Path) -> dict[str, str]:
 
 
 def result_of(row: Row, root: Path) -> Result:
-    """Return what is kept of a finished row, without paths of the machine.
+    """Return the result of a finished row, without paths of the machine.
 
     Args:
         row: the row.

@@ -46,7 +46,7 @@ class Times:
     per_second: float
     """Pictures of a moving camera per second."""
     finished: float
-    """Seconds from the last request to the finished picture, including the time in which the camera rests."""
+    """Seconds from the last request to the finished picture, including the time that the camera must rest."""
     rays_per_pixel: int
     """Rays per pixel of the finished picture."""
 

@@ -1,10 +1,10 @@
-"""Neural radiance fields: what a notebook, a script, a method or a data format imports.
+"""Neural radiance fields: the names for notebooks, scripts, methods and data formats.
 
-`load` loads a run, to render its views and evaluate it, and `train` trains another (docs/notebooks). An occupancy grid,
-sampling and compositing are for a radiance field and a training loop of your own (docs/plug-and-play.md). A method is a
-`Method`, a data format a `DataParser` (docs/plugins.md).
+`load` loads a run for rendering and evaluation, and `train` trains a method (docs/notebooks). Use the occupancy grid,
+sampling and compositing with your own radiance field and training loop (docs/plug-and-play.md). A plugin declares a
+`Method` or a `DataParser` (docs/plugins.md).
 
-Names are imported on use, so that `import nerfloom` costs nothing.
+Names are imported on first use, so that `import nerfloom` is fast.
 """
 
 from __future__ import annotations
@@ -128,10 +128,9 @@ _HOMES = {
 }
 """Module that holds each name."""
 
-# Waiting threads of torch look for work for milliseconds by default. That takes time from other programs, and from a
-# training beside them, which is then four times slower than its share of the cores would make it. GNU's OpenMP takes
-# the first variable (in rounds, some 20 microseconds), LLVM's and Intel's the second (in milliseconds); both are read
-# when torch is loaded.
+# By default torch's idle threads spin for milliseconds. On a busy machine that makes training up to four times slower
+# than its share of the cores would. GNU's OpenMP reads the first variable (in iterations, about 20 microseconds), those
+# of LLVM and Intel the second (in milliseconds). Both are read when torch is loaded.
 if "torch" not in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     os.environ.setdefault("KMP_BLOCKTIME", "1")

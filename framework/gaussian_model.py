@@ -1,4 +1,4 @@
-"""The model of methods that draw Gaussians: parameters of theirs that grow and move, and pictures of them."""
+"""The model of methods that train and draw Gaussians."""
 
 from __future__ import annotations
 
@@ -35,28 +35,29 @@ from nerfloom.splats.strategy import Strategy
 from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, usual_columns
 
 WITHOUT_IMAGES = 1_000
-"""Maximum number of Gaussians of a model that has seen no images yet."""
+"""Maximum number of Gaussians in a new model."""
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
     "mcmc": lambda config: Mcmc(),
 }
-"""Strategies by the name that the setting `strategy` has for them."""
+"""Strategies by their name in the setting `strategy`."""
 
 
 class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     """A model of Gaussians that are drawn onto whole images.
 
-    A method adds its `start` and `loss`. It may change how images look (`lit`, `camera`), what Gaussians consist of
-    (`declared_columns`), where they are at a time (`at_time`), how they come and go (`make_strategy`), and how they are
-    drawn (`rasteriser`).
+    A method implements `start` and `loss`. It may override the colours of images (`lit`), their cameras (`camera`), the
+    parameters of Gaussians (`declared_columns`), their motion (`at_time`), the strategy (`make_strategy`) and the
+    rasteriser (`rasteriser`).
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
     cameras: ClassVar[tuple[str, ...] | None] = DRAWN
     rasteriser: ClassVar[Rasteriser] = RASTERISER
-    """How Gaussians are drawn."""
+    """The rasteriser."""
     extent: Tensor
-    """Size () of the scene, scene units, in which centres are stored: so their learning rate suits any scene."""
+    """Size () of the scene, scene units. Centres are stored relative to it, so that their learning rate suits any
+    scene."""
 
     def __init__(self, config: SplattingConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
@@ -88,17 +89,17 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     def declared_columns(self) -> dict[str, Column]:
         """Return the parameters of Gaussians by name, each with its shape, learning rate and schedule.
 
-        A method adds columns to these. They grow, move, and are saved as the others are.
+        A method may add columns. They grow, move and are saved like the others.
         """
         config = self.config
         return usual_columns(config.degree, config.rate_factor * config.learning_rate, self.position_rate)
 
     def make_strategy(self) -> Strategy:
-        """Return how Gaussians come and go: here as the setting `strategy` says."""
+        """Return the strategy, by default the one of the setting `strategy`."""
         return STRATEGIES[self.config.strategy](self.config)
 
     def at_time(self, gaussians: Gaussians, time: float | None) -> Gaussians:
-        """Return Gaussians as they are at a time, with gradient: here as they are at rest.
+        """Return the Gaussians at a time, with gradient; by default `gaussians`.
 
         Args:
             gaussians: N Gaussians at rest, with all columns.
@@ -107,11 +108,11 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         return gaussians
 
     def at_rest(self) -> Gaussians:
-        """Return them as their columns hold them, with gradient."""
+        """Return the Gaussians of the columns, with gradient."""
         return as_gaussians(self.columns, self.extent)
 
     def learnt_gaussians(self, time: float | None = None) -> Gaussians:
-        """Return them as they are at a time, with gradient.
+        """Return the Gaussians at a time, with gradient.
 
         Args:
             time: in [0, 1]; None for a still scene.
@@ -119,7 +120,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         return self.at_time(self.at_rest(), time)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
-        """Return them as they are at a time, without gradient.
+        """Return the Gaussians at a time, without gradient.
 
         Args:
             time: in [0, 1]; None for a still scene.
@@ -127,11 +128,11 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         return self.learnt_gaussians(time).map(Tensor.detach)
 
     def look(self) -> Look:
-        """Return how they are drawn."""
+        """Return the settings of drawing."""
         return self.config.look()
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
-        """Replace them.
+        """Replace the Gaussians.
 
         Args:
             gaussians: the new ones at rest, with harmonics of the settings' degree. A column that they lack is 0.
@@ -143,7 +144,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     # -- training ---------------------------------------------------------------------------------------------
 
     def keep_pace(self, pace: Pace) -> None:
-        """Choose the size of the images, and when the number of Gaussians changes, by the time that steps take.
+        """Choose the size of images and the steps between changes from measured step times.
 
         Args:
             pace: the run before a step.
@@ -162,10 +163,10 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         self._redrawn = None
 
     def on_image(self, gaussians: Gaussians, camera: SplatCamera, degree: int) -> Projected:
-        """Return what a training image shows of Gaussians, which the strategy watches.
+        """Project Gaussians to a training image and show them to the strategy.
 
         Args:
-            gaussians: N Gaussians, as many as there are, in their order.
+            gaussians: all N Gaussians, in their order.
             camera: of the image.
             degree: highest degree of the harmonics that count.
         """
@@ -194,7 +195,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         gaussians = self.at_rest()
         if values := self.strategy.reset(gaussians, step):
-            none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, as Adam's state is reset too
+            none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, which resets Adam's state
             columns = {name: self.columns[name] for name in values}
             return [RowChange(c.values, none, c.rows(values[name], self.extent)) for name, c in columns.items()]
         change = self.strategy.grow(gaussians, self.config.num_gaussians, self._extent.of(self.extent))
@@ -206,16 +207,16 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     # -- pictures ---------------------------------------------------------------------------------------------
 
     def lit(self, rgb: Tensor, index: int | None) -> Tensor:
-        """Return colours (..., 3) as an image shows them: here as they are.
+        """Return colours (..., 3) with the appearance of an image; unchanged by default.
 
         Args:
             rgb: (..., 3) drawn colours.
-            index: number of a training image; None for the appearance that is set.
+            index: number of a training image; None for the current appearance.
         """
         return rgb
 
     def camera(self, camera: Cameras) -> SplatCamera:
-        """Return how a camera that is not trained on sees Gaussians: here as its pose says.
+        """Return the camera of a view outside of training; by default with its own pose.
 
         Args:
             camera: one camera.
@@ -231,10 +232,10 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         return self.render_gaussians(self.gaussians(view.time), view, background)
 
     def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
-        """Render given Gaussians, such as some of its own, as `render_view` does all of them.
+        """Render the given Gaussians, such as a part of the model's.
 
         Args:
-            gaussians: what is drawn, in the frame of the scene, at the time of the view.
+            gaussians: Gaussians in the frame of the scene, at the time of the view.
             view, background: as in `render_view`.
         """
         camera = self.camera(view.camera)

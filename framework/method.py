@@ -1,4 +1,4 @@
-"""Declaration of a method: the parts of its model, its settings, and the settings that depend on the data."""
+"""Declaration of a method: the parts of its model, its settings, and decisions that depend on the data."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from nerfloom.samplers.choice import SamplingConfig, sampler_choice
 from nerfloom.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
 
 DEPTH = 0.1
-"""Default weight of the depth loss if there are depth images."""
+"""Default weight of the depth loss with depth images."""
 SPARSE_DEPTH = 0.001
-"""Default weight of the depth loss if there are points of a reconstruction."""
+"""Default weight of the depth loss with points of a reconstruction."""
 SHARED_BY = 2
-"""Default number of images that show where rays start, unless this would cut anything off."""
+"""Default of `rays_shared_by` in unbounded scenes, unless it would cut anything off."""
 
 
 def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
-    """Return the settings unchanged, and no decisions: `Method.decide` of a method that leaves no setting open.
+    """Return the settings unchanged and no decisions: the default of `Method.decide`.
 
     Args:
         config: the method's settings.
@@ -48,11 +48,11 @@ def depth_choice(scene: Scene) -> Choice:
 
 @dataclass(frozen=True)
 class Method:
-    """Declaration of a method. Its summary is the first line of its file.
+    """Declaration of a method. The first line of its file is its summary.
 
-    A method that casts rays declares a field, a sampler and a renderer, each as a function of settings and scene; a
-    plugin replaces one of them by `dataclasses.replace(METHOD, renderer=...)`. A method that draws whole images
-    declares a model only.
+    A method that casts rays declares a field, a sampler and a renderer, each as a function of settings and scene. A
+    plugin replaces one of them with `dataclasses.replace(METHOD, renderer=...)`. A method that draws whole images
+    declares only a model.
     """
 
     config: TrainConfig
@@ -60,7 +60,7 @@ class Method:
     paper: str
     """Publication that describes the method."""
     field: Callable[[Any, Scene], Field] | None = None
-    """Creates the field, from settings and scene; None for a method that casts no rays."""
+    """Creates the field from settings and scene; None for a method that casts no rays."""
     sampler: Callable[[Any, Scene], Sampler] | None = None
     """Creates the sampler, which chooses where the field is evaluated."""
     renderer: Callable[[Any, Scene], Renderer] = volume_renderer
@@ -68,24 +68,24 @@ class Method:
     model: type[Model[Any]] = RayModel
     """Class of the model: called with (config, scene, field, sampler, renderer), or (config, scene) without a field."""
     decide: Callable[[Any, Scene], tuple[Any, list[Decision]]] = nothing_to_decide
-    """Fills in the settings that depend on the data, and gives the reasons (`nerfloom.base.decisions.fill`)."""
+    """Fills in the settings that depend on the data, with reasons (`nerfloom.base.decisions.fill`)."""
     interface: int = 3
     """Version of the plugin interface that the method was written for (`registry.INTERFACE`)."""
     name: str = "unnamed"
-    """Name that it is registered by, that of its entry point; filled in when it is loaded by it."""
+    """Registered name, from the entry point; set when the method is loaded."""
 
     def decided(self, config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
-        """Return settings with nothing left open: those of the method, and those of all methods that cast rays.
+        """Return the settings with all open ones decided, first by the method, then by rules for all ray methods.
 
         Args:
             config: the method's settings.
             scene: properties of the scene.
 
         Returns:
-            The settings, and the decisions that were made.
+            The settings and the decisions.
 
         Raises:
-            ConfigError: if a setting is left to the data that the method does not decide by them.
+            ConfigError: if a setting is still open.
         """
         config, made = self.decide(config, scene)
         if isinstance(config, RayConfig):
@@ -95,7 +95,7 @@ class Method:
                 Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""),
                 Choice("samples_per_batch", None, "steps have a number of rays"),
             )
-            made = made + more * bool(config.depth_loss_mult)  # nothing to learn from needs no words
+            made = made + more * bool(config.depth_loss_mult)  # do not report a weight of 0
         if isinstance(config, SamplingConfig):
             config, more = fill(config, sampler_choice(config, scene.unbounded))
             made = made + more
@@ -108,17 +108,17 @@ class Method:
         """Return the model, with newly initialised parameters.
 
         Args:
-            config: the settings; those that are still open are decided first.
+            config: the settings; open ones are decided first.
             scene: properties of the scene.
 
         Raises:
-            ConfigError: if the settings do not fit the scene or each other, if the model needs more memory than the
-                machine has, or if the data shows several scenes, and the method learns one.
+            ConfigError: if the settings do not fit the scene or each other, if the model does not fit into memory, or
+                if the data shows several scenes and the method learns one.
         """
         if scene.num_scenes > 1 and not issubclass(self.model, RendersFromImages):
             raise ConfigError(
                 f"the data shows {scene.num_scenes} scenes, and {self.name} learns one: choose a method that learns "
-                "from many, such as pixel-nerf, or data of one scene"
+                "several, such as pixel-nerf, or data of one scene"
             )
         try:
             return self._built(config, scene)
@@ -126,7 +126,7 @@ class Method:
             if not is_out_of_memory(error):
                 raise
             raise ConfigError(
-                f"the settings make a model of {self.name} that this machine has no memory for"
+                f"the model of {self.name} does not fit into memory with these settings; make it smaller"
             ) from error
 
     def _built(self, config: TrainConfig, scene: Scene) -> Model[Any]:

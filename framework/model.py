@@ -1,4 +1,4 @@
-"""The interface of models, which the trainer uses: things to look at that learn."""
+"""The interface of models: renderables that can be trained."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ class Loss:
     """The loss of a model on a batch."""
 
     terms: dict[str, Tensor]
-    """Named scalars; their sum is minimised."""
+    """Named scalars; training minimises their sum."""
     rgb: Tensor
-    """Rendered colours, with the shape of the batch's; for the running error and the choice of pixels."""
+    """Rendered colours in the batch's shape, for the running error and the choice of pixels."""
     num_samples: int | Tensor = 0
-    """Number of evaluations of the field, () int64 if the device alone knows it; 0 for a model without a field."""
+    """Number of evaluations of the field, () int64 if still on the device; 0 for a model without a field."""
 
     @property
     def total(self) -> Tensor:
-        """Sum () of the terms, which is minimised."""
+        """Sum () of the terms."""
         return torch.stack(list(self.terms.values())).sum()
 
 
 class Model(nn.Module, Renderable, Generic[ConfigT]):
-    """Base class of models: things to look at that learn.
+    """Base class of models: renderables that can be trained.
 
-    Samples are at random positions if `self.training` is True, and at fixed positions if it is False.
+    Sample positions are random if `self.training` is True and fixed otherwise.
     """
 
     batches: ClassVar[Literal["pixels", "views"]]
-    """Kind of the training batches: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
+    """Kind of training batch: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()
@@ -73,28 +73,28 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
         """
 
     def step_kind(self, step: int) -> StepKind:
-        """Return what a training step computes besides the values of tensors; by default, steps do not repeat.
+        """Return the kind of a training step; by default steps cannot be replayed.
 
         Args:
             step: number of training steps done.
         """
-        return StepKind(varies="the method does not say that its steps repeat each other")
+        return StepKind(varies="the method does not say that its steps repeat")
 
     def read_counts(self) -> None:
-        """Read what was counted on the device, and decide on sizes by it; called where the device is waited for."""
+        """Read counts from the device and adapt sizes to them. The trainer calls this when it waits for the device."""
 
     def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
-        """Do what follows each training step, with its gradients in place, such as to add up what they say.
+        """Run after each training step, while its gradients exist, for example to accumulate statistics of them.
 
         Args:
             step: number of training steps done before this one.
             progress: fraction of the training budget that is spent.
-            finite: whether the step counts; if this is still on the device, () bool, nothing may change where it is
-                False. Steps that Python knows not to count are not followed by anything.
+            finite: whether the step was finite; () bool if still on the device, and then nothing may change where it is
+                False. Not called for steps that are known to be dropped.
         """
 
     def changes_rows(self, step: int, progress: float) -> bool:
-        """Return whether `after_step` may have something to do, for which Python must know whether the step counts.
+        """Return whether `after_step` may change rows; the trainer then waits to know whether the step was finite.
 
         Args:
             step: number of training steps done before this one.
@@ -103,7 +103,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
         return type(self).after_step is not Model.after_step
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
-        """Return rows of parameters to add, drop or reorder; called after a training step if `changes_rows` says so.
+        """Return rows of parameters to add, drop or reorder; called after a training step if `changes_rows` is True.
 
         Args:
             step: number of training steps done before this one.
@@ -117,7 +117,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @property
     def samples_per_step(self) -> int | None:
-        """Number of samples per training step, to which the number of pixels is adapted; None for a fixed one."""
+        """Number of samples per training step, reached by adapting the number of pixels; None for fixed batches."""
         return None
 
     @property
@@ -132,20 +132,20 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @property
     def uses_bfloat16(self) -> bool:
-        """True if networks run in bfloat16: as configured, or else if the device supports it."""
+        """True if networks run in bfloat16: as configured, or if the device supports it."""
         chosen = self.config.mixed_precision
         return has_bfloat16(self.device) if chosen is None else chosen
 
     @property
     def background(self) -> Tensor:
-        """Return the background colour (3,) of training; if it is random or automatic, white if images have alpha."""
+        """Return the background colour (3,): as configured, else white if images have alpha and black if not."""
         asked = self.config.background
         white = asked == "white" or (asked != "black" and self.scene.has_alpha)
         return torch.full((3,), float(white), device=self.device)
 
     @contextmanager
     def rendering(self) -> Iterator[None]:
-        """Within a `with` block, put the model in evaluation mode, with the precision and threads of pictures."""
+        """Set evaluation mode, and the precision and threads for rendering, within a `with` block."""
         with (
             evaluating(self),
             torch_on_one_thread(self.runs_on_kernels),
@@ -160,7 +160,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
 @contextmanager
 def evaluating(model: nn.Module) -> Iterator[None]:
-    """Put a model into evaluation mode within a `with` block, and back into the mode it was in, also after an error.
+    """Set evaluation mode within a `with` block, and restore the previous mode afterwards.
 
     Args:
         model: the model, or a part of one.
@@ -177,27 +177,27 @@ def evaluating(model: nn.Module) -> Iterator[None]:
 
 
 class LearnsMotion:
-    """A model of a moving scene, which uses the times of the images."""
+    """A model of a moving scene; it uses the images' times."""
 
 
 @runtime_checkable
 class StartsFromImages(Protocol):
-    """A model whose parameters are first set by the images, before the first step."""
+    """A model that initialises its parameters from the images, before the first step."""
 
     def start(self, dataset: Dataset) -> None:
-        """Set the parameters of a fresh model.
+        """Initialise the parameters of a new model.
 
         Args:
-            dataset: images to learn from, on the model's device.
+            dataset: training images, on the model's device.
         """
 
 
 @runtime_checkable
 class KeepsPace(Protocol):
-    """A model that chooses sizes by how fast its steps are, in a run with a budget in seconds."""
+    """A model that adapts sizes to the speed of its steps, in a run with a time budget."""
 
     def keep_pace(self, pace: Pace) -> None:
-        """Take the time of the last steps into account; called before each training step.
+        """Adapt sizes to the time of the last steps; called before each training step.
 
         Args:
             pace: the run before the step.

@@ -1,4 +1,4 @@
-"""The model of methods that cast rays into a scene that moves."""
+"""The model of methods that cast rays into a moving scene."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MotionConfigT = TypeVar("MotionConfigT", bound=MotionConfig)
 
 
 class MovingModel(RayModel[MotionConfigT], LearnsMotion, Generic[MotionConfigT], plain=True):
-    """A model that uses the times of the images."""
+    """A ray model that uses the images' times."""
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the terms of `losses` on a batch, with a share of its transparent pixels (`transparent_share`).
+        """Return the terms of `losses` on a batch, with a fraction of its transparent pixels (`transparent_share`).
 
         Args:
             batch: pixels with their true colours.
@@ -28,7 +28,7 @@ class MovingModel(RayModel[MotionConfigT], LearnsMotion, Generic[MotionConfigT],
             return super().loss(batch, step)
         part, kept = thinned(batch, self.config.transparent_share)
         loss = super().loss(part, step)
-        # Nothing is before the background of the pixels that are left out.
+        # Left-out pixels show only the background, so that their true colour stands for the rendered one.
         return replace(loss, rgb=batch.rgb.index_copy(0, kept, loss.rgb.to(batch.rgb)))
 
     def step_kind(self, step: int) -> StepKind:

@@ -38,17 +38,17 @@ RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 
 
 class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
-    """A model that evaluates a field at the positions of a sampler and composites the values with a renderer."""
+    """A model that evaluates a field at a sampler's positions and composites the values with a renderer."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
     losses: ClassVar[Sequence[LossTerm]] = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES)
-    """The objective: terms that are added up, as far as settings and batch have something for them."""
+    """The objective: the sum of the terms that apply to the settings and the batch."""
     steps_repeat: ClassVar[bool] = False
-    """True if field, renderer and losses depend on the training step by the values of tensors alone, so that steps can
-    be recorded wherever the sampler's can."""
+    """True if field, renderer and losses depend on the training step only through values of tensors, so that steps can
+    be captured if the sampler's can."""
     plain: ClassVar[bool] = True
-    """True if rays are rendered by `RayModel.render` as it is here, so that one native call may take its place. A
-    subclass that leaves `render` alone says so: `class M(RayModel, plain=True)`."""
+    """True if `RayModel.render` is not overridden, so that a native call may replace it. A subclass that does not
+    override it says so: `class M(RayModel, plain=True)`."""
 
     def __init_subclass__(cls, plain: bool = False, **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -58,7 +58,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
         self.poses: PoseRefinement | None = None
-        """Refinement of the training cameras' poses; None if they stay as they are."""
+        """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
         self.shared_space = SharedSpace(scene.box) if starts else None
 
@@ -95,7 +95,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         return Loss(values, shown.pixels.rgb.detach(), rendered.num_samples)
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:
-        """Return the mean squared error of a batch's colours, if it is known in one call; None otherwise."""
+        """Return the mean squared error of a batch's colours if a native call can compute it; else None."""
         if not self.plain or self.poses is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
@@ -105,14 +105,14 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def render_view(self, view: View, background: Tensor) -> Picture:
         """Render `view` over `background` (3,) in chunks of `eval_num_rays_per_chunk` rays, in evaluation mode.
 
-        Pixels that are known to show the background alone (`pixels_in_view`) are not rendered.
+        Pixels that only show the background (`pixels_in_view`) are not rendered.
         """
         per_pixel, outputs = view.rays_per_pixel or self.rays_per_pixel, self.outputs
         offsets, grid, times = subpixels(per_pixel, self.device), view.pixels(), view.times()
         chunk, count = max(self.rays_at_once // per_pixel, 1), grid.numel()
         pixels, seen = grid.reshape(-1), self._seen(view)
         places = None if seen is None else seen.reshape(-1).nonzero().squeeze(-1)
-        # Written into as they come: small results kept between a chunk's large ones would break up the heap.
+        # Preallocated: small results between a chunk's large temporaries would fragment the heap.
         rgb, extras = background.to(self.device, torch.float32).repeat(count, 1), empty(outputs, count, self.device)
         depth, median, accumulation = torch.full((3, count), self.scene.far, device=self.device)
         accumulation.zero_()
@@ -121,7 +121,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
                 part: slice | Tensor = slice(start, start + chunk)
                 part = part if places is None else places[part]
                 rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
-                # Index 0 of the view's one camera must not be taken for the index of a training camera.
+                # The view's camera has index 0, which must not stand for a training camera.
                 rendered = self.shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel, outputs)
                 rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
                 accumulation[part] = rendered.accumulation
@@ -139,14 +139,14 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         )
 
     def shown(self, rays: Rays, background: Tensor) -> Rendered:
-        """Return rays of a view as `render` does, without weights and samples where one call knows the rest.
+        """Render rays of a view as `render` does, but without weights and samples if a native call can render them.
 
         Args:
             rays: R rays.
             background: (3,) colour in [0, 1].
 
         Returns:
-            What R rays show.
+            The rendered values of R rays.
         """
         known = None
         if self._renders_plainly and self.shared_space is None:
@@ -154,12 +154,12 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         return self.render(rays, background) if known is None else known
 
     def _seen(self, view: View) -> Tensor | None:
-        """Return the pixels of a view that may show anything but the background; None if that is not known."""
+        """Return the pixels of a view that may show more than the background; None if unknown."""
         return pixels_in_view(self.sampler, view) if self._renders_plainly else None
 
     @property
     def _renders_plainly(self) -> bool:
-        """Whether `render` and the renderer are those from here, and rays those of the view."""
+        """True without refined poses, an overridden `render` or another renderer than `VolumeRenderer`."""
         return self.plain and self.poses is None and type(self.renderer) is VolumeRenderer
 
     def step_kind(self, step: int) -> StepKind:
@@ -192,20 +192,20 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Further outputs of its renderer (`Renderer.outputs`)."""
+        """Further outputs of the renderer (`Renderer.outputs`)."""
         return self.renderer.outputs
 
     @property
     def samples_per_step(self) -> int | None:
-        """Number of samples per training step, as the sampler sets it; None for a fixed number of pixels."""
+        """Number of samples per training step, set by the sampler; None for a fixed number of pixels."""
         return self.sampler.samples_per_step
 
     @property
     def rays_at_once(self) -> int:
-        """Maximum number of rays of a picture that are rendered at once, as configured."""
+        """Maximum number of rays to render at once, as configured."""
         return self.config.eval_num_rays_per_chunk
 
     @property
     def rays_per_pixel(self) -> int:
-        """Number of rays that are averaged for each pixel of an image, as configured."""
+        """Number of rays averaged per pixel, as configured."""
         return self.config.rays_per_pixel

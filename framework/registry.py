@@ -1,6 +1,6 @@
-"""The registry of methods and data formats by name. A module is imported only when its name is asked for.
+"""The registry of methods and data formats by name. A module is imported only when it is loaded by name.
 
-Built-in and third-party entries are registered in the same way, by entry points of the installed package:
+Built-in and third-party packages register their entries in the same way, with entry points:
 
     [project.entry-points."nerfloom.methods"]
     my-method = "my_package.my_method:METHOD"      # a nerfloom.Method
@@ -8,7 +8,7 @@ Built-in and third-party entries are registered in the same way, by entry points
     [project.entry-points."nerfloom.dataparsers"]
     my-format = "my_package.my_format:MyFormat"    # a nerfloom.DataParser
 
-Code that is not installed is registered by environment variables:
+Environment variables register code that is not installed:
 
     NERFLOOM_METHODS="my-method=my_file:METHOD,other=..."  NERFLOOM_DATAPARSERS="my-format=my_file:MyFormat"
 """
@@ -39,7 +39,7 @@ Kind = Literal["methods", "dataparsers"]
 INTERFACE: dict[Kind, int] = {"methods": 3, "dataparsers": 2}
 """Version of the interface that plugins use (docs/plugins.md). A change that breaks plugins raises it."""
 CHANGED = "docs/plugins.md, 'Plugins for an older interface', says what to change"
-"""What to do about a plugin for an older version."""
+"""Advice for a plugin of an older version."""
 VARIABLES = {"methods": "NERFLOOM_METHODS", "dataparsers": "NERFLOOM_DATAPARSERS"}
 CALLED = {"methods": "method", "dataparsers": "data format"}
 
@@ -58,14 +58,14 @@ class Entry:
     module: str
     attribute: str
     package: str
-    """Distribution that registers it, or the environment variable."""
+    """Distribution or environment variable that registers it."""
     problem: str | None = None
-    """Reason why it cannot be used, if that is known before the import."""
+    """Reason why it cannot be used, if known before the import."""
 
 
 @cache
 def registered(kind: Kind) -> dict[str, Entry]:
-    """Return all entries of a kind by name, sorted. One that two packages register differently has a `problem`.
+    """Return all entries of a kind by name, sorted. An entry that two packages register differently has a `problem`.
 
     Args:
         kind: methods or data formats.
@@ -104,7 +104,7 @@ def _entry(name: str, value: str, package: str) -> Entry:
 
 
 def summary(entry: Entry) -> str:
-    """Return the first line of the docstring of the module of `entry`, read without importing it, or what is wrong."""
+    """Return the first line of the docstring of an `entry`'s module without importing it, or the problem with it."""
     if entry.problem is not None:
         return f"({entry.problem})"
     path = _source(entry.module)
@@ -118,7 +118,7 @@ def summary(entry: Entry) -> str:
 
 
 def _source(module: str) -> Path | None:
-    """Return the file of a module. A lookup imports parents, so it ends at the first that is not imported yet."""
+    """Return the file of a module without importing parents: the lookup stops at the first one not imported yet."""
     parts = module.split(".")
     found = 1
     while found < len(parts) and ".".join(parts[:found]) in sys.modules:
@@ -148,7 +148,7 @@ def entry_of(kind: Kind, name: str) -> Entry:
         name: the name that a user typed.
 
     Raises:
-        ConfigError: for an unknown name, with the nearest valid one, or where to get a method of another project.
+        ConfigError: for an unknown name; the message suggests the nearest one, or the project with that method.
     """
     entries = registered(kind)
     if name in entries:
@@ -159,7 +159,7 @@ def entry_of(kind: Kind, name: str) -> Entry:
         raise ConfigError(answer)
     hint = nearest(name, entries)
     if hint.startswith("Known"):
-        hint += f" One of your own has to be installed, or named in {VARIABLES[kind]}."
+        hint += f" Install your own, or name it in {VARIABLES[kind]}."
     raise ConfigError(f"unknown {CALLED[kind]} '{name}'. {hint}")
 
 
@@ -176,20 +176,20 @@ def _load(kind: Kind, name: str) -> Any:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         top = entry.module.split(".")[0]
         if isinstance(error, ModuleNotFoundError) and error.name == top and entry.package == VARIABLES[kind]:
-            reason += f"; PYTHONPATH has to name the folder that {top} is in"
+            reason += f"; add the folder of {top} to PYTHONPATH"
         if _looks_old(error):
-            reason += f". It seems to be for an older plugin interface than {INTERFACE[kind]}: {CHANGED}"
+            reason += f". It seems to use an older plugin interface than {INTERFACE[kind]}: {CHANGED}"
         raise ConfigError(f"{title} cannot be loaded: {reason}") from error
     interface, ours = getattr(loaded, "interface", INTERFACE[kind]), INTERFACE[kind]
     if interface != ours:
         newer = isinstance(interface, int) and interface > ours
         remedy = "upgrade nerfloom" if newer else CHANGED
-        raise ConfigError(f"{title} was written for plugin interface {interface}, and this is {ours}; {remedy}")
+        raise ConfigError(f"{title} uses plugin interface {interface}; this version has {ours}; {remedy}")
     return loaded
 
 
 def _looks_old(error: BaseException) -> bool:
-    """Return whether a plugin failed as one does that was written for the interface before."""
+    """Return whether the error is typical of a plugin for the previous interface."""
     if isinstance(error, ImportError):
         return (error.name or "").split(".")[0] in ("framework", "nerfloom")
     return isinstance(error, TypeError) and "Method.__init__()" in str(error)
@@ -210,7 +210,7 @@ def load_method(name: str) -> Method:
     method = _load("methods", name)
     if not isinstance(method, Method):
         entry = entry_of("methods", name)
-        raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is no nerfloom.Method")
+        raise ConfigError(f"method '{name}': {entry.module}:{entry.attribute} is not a nerfloom.Method")
     return replace(method, name=name)
 
 
@@ -229,5 +229,5 @@ def load_dataparser(name: str) -> type[DataParser]:
     parser = _load("dataparsers", name)
     if not (isinstance(parser, type) and issubclass(parser, DataParser)):
         entry = entry_of("dataparsers", name)
-        raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is no nerfloom.DataParser")
+        raise ConfigError(f"data format '{name}': {entry.module}:{entry.attribute} is not a nerfloom.DataParser")
     return parser

@@ -1,4 +1,4 @@
-"""The interface of what can be looked at, which evaluation, renders, the viewer, exports and Python use."""
+"""The interface of everything that can be rendered; evaluation, renders, the viewer, exports and Python use it."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ PartT = TypeVar("PartT")
 
 
 class Renderable(ABC):
-    """Something that can be looked at: a trained model, a file of Gaussians, or what is put together from others."""
+    """Something that can be rendered: a trained model, a file of Gaussians, or a combination of others."""
 
     scene: Scene
-    """Its frame: box, near and far distance, whether it moves, and whether images tell what is background."""
+    """The scene: its box, near and far distance, and whether it moves and images have alpha."""
     cameras: ClassVar[tuple[str, ...] | None] = None
-    """Camera models that it can draw images of; None for all for which there are rays."""
+    """Supported camera models; None for all with rays."""
 
     @property
     @abstractmethod
     def device(self) -> torch.device:
-        """The device on which pictures are rendered."""
+        """The device that renders pictures."""
 
     @abstractmethod
     def render_view(self, view: View, background: Tensor) -> Picture:
@@ -47,7 +47,7 @@ class Renderable(ABC):
         """
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        """Render the colours (H, W, 3) of an image alone, as `render_view` does; override it if that is faster.
+        """Render only the colours (H, W, 3) of an image, as `render_view` does. Override it with a faster way.
 
         Args:
             view: the camera, on `device`.
@@ -57,21 +57,21 @@ class Renderable(ABC):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Further outputs of its pictures, beside colours, depths and opacity (`Picture.extras`)."""
+        """Outputs besides colours, depths and opacity (`Picture.extras`)."""
         return ()
 
     @property
     def rays_per_pixel(self) -> int:
-        """Number of rays that are averaged for each pixel of an image, if the view does not set it."""
+        """Number of rays averaged per pixel, if the view does not set it."""
         return 1
 
     @property
     def background(self) -> Tensor:
-        """Colour (3,) behind the scene where nothing else is asked for: white if images have alpha, else black."""
+        """Default background colour (3,): white if images have alpha, else black."""
         return torch.full((3,), float(self.scene.has_alpha), device=self.device)
 
     def rendering(self) -> AbstractContextManager[None]:
-        """Return a context in which parts of it, such as a density, are evaluated as they are for pictures."""
+        """Return a context manager that evaluates parts, such as a density, as for pictures."""
         return nullcontext()
 
 
@@ -79,12 +79,12 @@ class Renderable(ABC):
 
 
 class RendersRays(Renderable):
-    """Something whose pictures are made of rays, each of which can be rendered alone."""
+    """A renderable that renders rays independently of each other."""
 
     @property
     @abstractmethod
     def rays_at_once(self) -> int:
-        """Maximum number of rays of a picture to render in one call."""
+        """Maximum number of rays to render in one call."""
 
     @abstractmethod
     def render(self, rays: Rays, background: Tensor) -> Rendered:
@@ -98,17 +98,17 @@ class RendersRays(Renderable):
 
 @runtime_checkable
 class RendersFromImages(Protocol):
-    """A model that renders a scene from images of it, which it is shown: scenes that it never learnt from, too.
+    """A model that renders a scene from images of it, including scenes without training.
 
-    It may learn from images of several scenes (`Scene.num_scenes`), which other models may not.
+    Only such a model may learn from images of several scenes (`Scene.num_scenes`).
     """
 
     def show_images(self, dataset: Dataset) -> None:
-        """Show the model images, before its first step and its first picture; its parameters stay as they are.
+        """Give the model images, before its first step and its first picture. This changes no parameters.
 
         Args:
-            dataset: images on the model's device. Without `source_images`, those that it learns from: each may be
-                rendered from the others. Otherwise further scenes, which are rendered from their source images.
+            dataset: images on the model's device. Without `source_images` they are the training images, and each may be
+                rendered from the others. Otherwise they are further scenes, rendered from their source images.
         """
 
 
@@ -141,10 +141,10 @@ class HasDensity(Protocol):
 
 
 def parts(whole: Renderable | nn.Module, kind: Callable[..., PartT]) -> list[PartT]:
-    """Return the modules of a model that are of a kind, including the model itself.
+    """Return the modules of a kind in a model, including the model itself.
 
     Args:
-        whole: the model; something without modules is its only part.
+        whole: the model; a renderable without modules is its only part.
         kind: a class or a runtime-checkable protocol, as in `parts(model, SkipsCells)`.
     """
     found = whole.modules() if isinstance(whole, nn.Module) else (whole,)

@@ -1,4 +1,4 @@
-"""Training of methods, and loading of what was trained, to render and to evaluate it."""
+"""Functions for notebooks and scripts: train a method, load a run, show an image."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
-"""Type of a device; auto is cuda if it is available, and cpu otherwise."""
+"""Type of a device. auto: cuda if available, else cpu."""
 
 
 def list_methods() -> dict[str, str]:
@@ -31,9 +31,9 @@ def load(path: str | Path, data: str | Path | None = None, device: Device = "aut
     """Load a trained run or a file of Gaussians.
 
     Args:
-        path: folder of the run, its config.yml, a folder above it, whose newest run is taken, or a file of Gaussians
-            (.ply, .spz, .splat).
-        data: new location of the run's data, if it has been moved; the data of a file of Gaussians, if there are any.
+        path: folder of the run, its config.yml, a folder above it (for its newest run), or a file of Gaussians (.ply,
+            .spz, .splat).
+        data: new location of the run's data, if it has moved; optional data for a file of Gaussians.
         device: device of the model.
 
     Raises:
@@ -49,8 +49,8 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
 
     Args:
         method: name of the method; `list_methods()` lists all.
-        data: folder of the data set; the embedded scene if None.
-        format: name of the data format; detected if None.
+        data: folder of the data set; None for the embedded scene.
+        format: name of the data format; None to detect it.
         settings: settings of the method by name, with underscores, as in `max_seconds=60`.
 
     Raises:
@@ -72,12 +72,12 @@ def _text(path: Path | None) -> str | None:
 
 
 def image(picture: Picture, what: str = "rgb") -> Image:
-    """Return a component of a rendered image as a PIL image, which notebooks display.
+    """Return an output of a rendered image as a PIL image, which notebooks display.
 
     Args:
         picture: the rendered image, from `Loaded.render`.
         what: rgb for colour; depth for median depth, from dark (near) to light (far) over the depths of opaque pixels;
-            accumulation for opacity; or the name of another output (`Picture.outputs`), such as normals.
+            accumulation for opacity; or another output's name (`Picture.outputs`), such as normals.
 
     Raises:
         ValueError: if the picture has no such output.

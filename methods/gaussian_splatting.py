@@ -37,12 +37,12 @@ from nerfloom.splats.start import PLACES, first_points, from_points, scene_size,
 from nerfloom.training.optim import learning_rate_factor
 
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
-"""Noise and penalties where Gaussians have to find their places: those of Kheradmand et al. 2024, but for the first
-penalty, which at a few hundred steps of a higher rate left too few of them."""
+"""Noise and penalties unless Gaussians start on surfaces. They are the values of Kheradmand et al. 2024 except the
+opacity penalty: theirs left too few Gaussians after a few hundred steps at a higher learning rate."""
 FIELD_SHARE = 0.2
-"""Maximum share of a budget in seconds that the training of a field to start from takes."""
+"""Maximum share of --max-seconds for training the field that Gaussians start from."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
-"""Of Gaussians on a field's surfaces at the start: opacity, and standard deviation in distances to neighbours."""
+"""Initial opacity of Gaussians on a field's surfaces, and their standard deviation in mean distances to neighbours."""
 
 
 @dataclass(frozen=True)
@@ -58,23 +58,24 @@ class GaussianSplattingConfig(SplattingConfig):
     }
     """Allowed range of each numeric setting."""
     ssim_weight: float = 0.2
-    """Weight of 1 - SSIM in the loss; the absolute error has the rest."""
+    """Weight of 1 - SSIM in the loss; the absolute error has the weight 1 - ssim_weight."""
     appearance: Auto[bool] = AUTO
-    """Whether each training image has a transform of colours of its own. If not given: if light or exposure differ."""
+    """Learn a colour transform for each training image. Default: if light or exposure differ."""
     appearance_rate: float = 1e-3
-    """Learning rate of these transforms."""
+    """Learning rate of the colour transforms."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""
     depth_loss_mult: Auto[float] = AUTO
-    """Weight of the depth loss. If not given: 0.1 if there are depth images, else 0."""
+    """Weight of the depth loss. Default: 0.1 with depth images, else 0."""
     field_depth_mult: Auto[float] = AUTO
-    """Weight of a starting field's distances until half of the budget. If not given: 0.1 if unbounded, else 0."""
+    """Initial weight of the starting field's distances; it falls to 0 at half of the budget. Default: 0.1 if unbounded,
+    else 0."""
 
 
 def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
-    """Return the settings with what the budget and the scene decide, and why.
+    """Fill in the settings that depend on the budget and the scene.
 
     Args:
         config: settings, some of which may be open.
@@ -93,7 +94,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
 
 
 class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
-    """Gaussians that are drawn onto whole images.
+    """A model of Gaussians drawn as whole images.
 
     Args:
         config: the settings, decided.
@@ -101,7 +102,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
     """
 
     found: Tensor
-    """Whether the first Gaussians lay on surfaces, so that none has to look for its place."""
+    """Whether Gaussians started on the surfaces of a field."""
 
     def __init__(self, config: GaussianSplattingConfig, scene: Scene) -> None:
         super().__init__(config, scene)
@@ -135,7 +136,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             first = from_points(found.positions, found.colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             self.found_distances.set(found.images, found.pixels, found.distances)
             if not len(first):
-                say("warning: the field has found no surfaces")
+                say("warning: the field has no surfaces; Gaussians start anywhere in the box")
                 kind = "random"
         if kind != "field":
             points = first_points(kind, dataset, count)
@@ -161,7 +162,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         content = CHANNELS["rgb" if known is None else "distance"]
         drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
         rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
-        if batch.kept is not None:  # what does not count is as it should be
+        if batch.kept is not None:  # masked pixels have no error
             kept = reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
@@ -175,8 +176,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))
 
     def _behind(self, batch: ViewBatch) -> Tensor:
-        """Return the background (3,) of a step. Images without alpha show something everywhere: a background that
-        changes with each step cannot be a part of it."""
+        """Return the background (3,) of a step. For images without alpha it is random, so that Gaussians cannot rely on
+        it."""
         if self.scene.has_alpha or self.config.background != "auto":
             return batch.background
         return torch.rand(3, device=batch.rgb.device)
@@ -189,20 +190,20 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             self.shake(noise * rate * finite if isinstance(finite, Tensor) else noise * rate)
 
     def _chosen(self, given: float | None, otherwise: float) -> float:
-        """Return a setting that is by the start if not given: Gaussians on surfaces need no search for places, but for
-        those far away, where a field that was trained for seconds is mist."""
+        """Return `given` if it is set, 0 if Gaussians started on surfaces in a bounded scene, else `otherwise`. In
+        unbounded scenes the field's distant surfaces are not reliable."""
         on_surfaces = self._found.of(self.found) and not self.scene.unbounded
         return given if given is not None else 0.0 if on_surfaces else otherwise
 
     def lit(self, rgb: Tensor, index: int | None) -> Tensor:
-        """Return colours (..., 3) as an image shows them: a training image, or one with the appearance that is set."""
+        """Return colours (..., 3) in the appearance of a training image, or the current one if `index` is None."""
         if self.appearance is None:
             return rgb
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
     def camera(self, camera: Cameras) -> SplatCamera:
-        """Return the camera of a view that is not trained on, moved as the training cameras around it were."""
+        """Return the camera of a view outside of training, corrected like the training cameras near it."""
         pose = None if self.poses is None else self.poses.carried_pose(camera.camera_to_worlds[0])
         return splat_camera(camera, self.near, self.look(), pose)
 

@@ -50,7 +50,7 @@ def test_every_flag_that_is_named_exists() -> None:
         ),
         (["--optimizers.fields.optimizer.lr", "1e-3"], "here it is --learning-rate"),
         (["--optimizers.camera-opt.optimizer.lr", "1e-3"], "here it is --camera-learning-rate"),
-        (["--viewer.quit-on-train-completion", "True"], "there are --viewer.websocket-host"),
+        (["--viewer.quit-on-train-completion", "True"], "--viewer.websocket-host"),
         (["--vis", "viewer+wandb"], "nerfstudio's; leave it out; the choice here is --vis viewer, tensorboard"),
         (["--machine.num-devices", "2"], "torchrun starts several"),
         (["--load-step", "1000"], "here it is --load-checkpoint"),

@@ -84,8 +84,8 @@ def test_a_broken_plugin_is_named_and_the_rest_goes_on(environment: Callable[...
         ("broken", "method 'broken' of NERFLOOM_METHODS cannot be loaded: RuntimeError: no such luck"),
         ("leaving", "cannot be loaded: SystemExit: 3"),
         ("unreadable", "cannot be loaded: SyntaxError"),
-        ("gone", "'no_such_module_at_all'; PYTHONPATH has to name the folder that no_such_module_at_all is in"),
-        ("wrong", "wrong_plugin:METHOD is no nerfloom.Method"),
+        ("gone", "'no_such_module_at_all'; add the folder of no_such_module_at_all to PYTHONPATH"),
+        ("wrong", "wrong_plugin:METHOD is not a nerfloom.Method"),
     ):
         with pytest.raises(ConfigError, match=re.escape(reason)):
             registry.load_method(name)
@@ -108,9 +108,9 @@ def test_methods_of_the_environment_and_their_interface(environment: Callable[..
     environment(modules, methods="mine = env_plugin:METHOD ,newer=newer_plugin:METHOD,older=older_plugin:METHOD,")
     assert registry.load_method("mine").paper == "none"
     assert registry.summary(registry.registered("methods")["mine"]) == "A method of the environment."
-    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 4, .*3; upgrade nerfloom"):
+    with pytest.raises(ConfigError, match=r"'newer' .* plugin interface 4; .*3; upgrade nerfloom"):
         registry.load_method("newer")
-    with pytest.raises(ConfigError, match=r"'older' .* plugin interface 2, .*3; docs/plugins\.md"):
+    with pytest.raises(ConfigError, match=r"'older' .* plugin interface 2; .*3; docs/plugins\.md"):
         registry.load_method("older")
 
 

@@ -1,1 +1,1 @@
-"""Configs, error messages, devices and the registry of names, on which all other rooms build."""
+"""Configs, errors, devices and other basics that all other rooms use."""

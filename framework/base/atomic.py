@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, also after a kill or on a full disk."""
+"""Atomic writes: a file is complete or absent, even after a kill or on a full disk."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 import sys
 
 SAFE = ("-P",) if sys.version_info >= (3, 11) else ()
-"""Keeps the working folder off the path of Python: a file there may have the name of any package."""
+"""Keeps the working folder off Python's path: a file there could hide a package of the same name."""
 
 
 def python_command(module: str, *arguments: object) -> list[str]:

@@ -1,6 +1,6 @@
 """Configs of methods: flat frozen dataclasses, read from and written to plain YAML.
 
-This module imports neither PyTorch nor any method, so that the command line starts at once.
+This module imports neither PyTorch nor any method, so that commands start quickly.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from nerfloom.base.machine_config import MachineConfig, ViewerConfig
 T = TypeVar("T")
 RaysPerPixel = Literal[1, 4, 9, 16]
 LEFT_TO_DATA = "left to the data"
-"""Marks the types of settings that are."""
+"""Marks the types of settings that may be left to the data."""
 if TYPE_CHECKING:
     Auto = Annotated[T, LEFT_TO_DATA]
 else:
 
     class Auto:
-        """`Auto[T]`: a setting of type T that may be left to the data, by `AUTO`, until `Method.decide` fills it in.
+        """`Auto[T]`: a setting of type T, or `AUTO` until `Method.decide` fills it in.
 
-        Type checkers take it for T: what is built from settings is built after they were decided.
+        Type checkers see T: models are built only after all settings are decided.
         """
 
         def __class_getitem__(cls, kind: Any) -> Any:
@@ -41,7 +41,7 @@ else:
 AUTO: Any = "auto"
 """Value of an `Auto` setting that is left to the data."""
 Range = tuple[float, float]
-"""Minimum and maximum of a setting, both allowed."""
+"""Minimum and maximum of a setting, inclusive."""
 AT_LEAST_0: Range = (0, math.inf)
 SMALLEST_EPS = 1e-37
 """Minimum epsilon of Adam, close to the smallest normal float32. Without epsilon, a gradient of 0 gives 0 / 0."""
@@ -64,27 +64,28 @@ class TrainConfig:
         "lr_warmup_steps": AT_LEAST_0,
         "viewer_share": (0.001, 1),
     }
-    """Allowed ranges; a method's config adds and overrides some. None is in every range, a tuple if each number is."""
+    """Allowed ranges; a method's config adds or overrides some. Every range allows None; each number of a tuple is
+    checked."""
     data: Path | None = None
-    """Folder of the data set; the embedded scene if not given."""
+    """Folder of the data set. Default: the embedded scene."""
     max_train_images: int | None = None
-    """Number of training images, evenly spread over all of them by their order; all if not given."""
+    """Maximum number of training images, evenly spaced. Default: all."""
     train_image_indices: tuple[int, ...] = ()
-    """Training images by number, from 0 in their order, as in 26 86 2; all if not given."""
+    """Indices of the training images to use, from 0, as in 26 86 2. Default: all."""
     cache_limit: float | None = None
-    """Memory for a split's decoded pixels, MB (1e6 bytes); more goes to disk. Half of memory if not given."""
+    """Maximum memory for decoded pixels of a split, MB (1e6 bytes); the rest goes to disk. Default: half of memory."""
     cache_dir: Path | None = None
-    """Folder of decoded pixels on disk; nerfloom in the user's cache folder if not given."""
+    """Folder for decoded pixels on disk. Default: nerfloom in the user's cache folder."""
     output_dir: Path = Path("outputs")
-    """Folder in which the run's folder is created."""
+    """Folder that receives the run's folder."""
     experiment_name: str | None = None
-    """First part of the run folder's path; the data folder's name if not given."""
+    """First part of the run folder's path. Default: the data folder's name."""
     timestamp: str | None = None
-    """Last part of the run folder's path; date and time if not given."""
+    """Last part of the run folder's path. Default: date and time."""
     max_num_iterations: int | None = 30_000
-    """Stop after this many steps; no limit with --max-seconds alone."""
+    """Stop after this many steps; no limit if only --max-seconds is given."""
     max_seconds: float | None = None
-    """Stop after this many seconds of training; evaluation and saving are not counted."""
+    """Stop after this many seconds of training, not counting evaluation and saving."""
     target_psnr: float | None = None
     """Stop when a periodic evaluation of all validation images reaches this PSNR, dB."""
     steps_per_save: int = 2_000
@@ -92,27 +93,27 @@ class TrainConfig:
     seconds_per_save: float = 60.0
     """Maximum seconds of training between checkpoints."""
     save_only_latest_checkpoint: bool = True
-    """Keep the two newest checkpoints, not all."""
+    """Keep only the two newest checkpoints."""
     steps_per_eval_image: int = 500
     """Steps between renders of one held-out image for TensorBoard; more if they would slow training by 10 %."""
     steps_per_eval_all_images: int = 10_000
-    """Steps between evaluations of all validation images; a few of them are evaluated more often."""
+    """Steps between evaluations of all validation images; a few images are evaluated more often."""
     seconds_per_eval_all_images: float | None = None
-    """Seconds of training between evaluations of all images; 15 if --target-psnr is given and this is not."""
+    """Seconds of training between evaluations of all images. Default: 15 with --target-psnr, else off."""
     max_eval_images: int | None = None
-    """Maximum number of evaluated images, evenly spaced; all if not given, none if 0."""
+    """Maximum number of evaluated images, evenly spaced; 0: none. Default: all."""
     eval: Literal["in-time", "all"] = "in-time"
-    """Evaluated images. in-time: as many, evenly spaced, as take half of the time of training at most; all: all."""
+    """Evaluated images. in-time: evenly spaced images that take at most half of the training time; all: all."""
     lpips_weights: Path | None = None
-    """File of weights of LPIPS with AlexNet (.npz), for evaluations; the lpips package's if not given."""
+    """File of LPIPS weights with AlexNet (.npz), for evaluations. Default: those of the lpips package."""
     vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "none"] = "tensorboard"
-    """Where training curves and rendered images are shown: in TensorBoard's files, in a browser, or in both."""
+    """Where to show training curves and rendered images: TensorBoard files, a browser, or both."""
     viewer_share: float = 0.1
-    """Maximum time for the viewer's pictures, as a fraction of the whole; it is not training time."""
+    """Maximum fraction of the total time for the viewer's pictures; it does not count as training time."""
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
     """Address of the viewer."""
     mixed_precision: bool | None = None
-    """Networks in bfloat16, density and compositing in float32; if not given, where the device multiplies it fast."""
+    """Run networks in bfloat16, density and compositing in float32. Default: if the device multiplies bfloat16 fast."""
     load_dir: Path | None = None
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
@@ -132,8 +133,8 @@ class TrainConfig:
     adam_eps: float = 1e-8
     """Adam's epsilon."""
     masks: Literal["auto", "ignored", "empty"] = "auto"
-    """Meaning of masked-out pixels in training. ignored: nothing is known of them; empty: nothing is there, as around
-    what was cut out; auto: empty if masks remove over half of all pixels, not the same of each image."""
+    """Meaning of masked-out pixels in training. ignored: unknown content; empty: empty space, as around a cut-out
+    object; auto: empty if masks remove over half of all pixels and differ between images, else ignored."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation: white or black."""
     machine: MachineConfig = field(default_factory=MachineConfig)
@@ -144,7 +145,7 @@ class TrainConfig:
 
         Args:
             defaults: new defaults by name.
-        Raises: TypeError for a name that is no setting.
+        Raises: TypeError if a name is not a setting.
         """
         super().__init_subclass__()
         for name, value in defaults.items():
@@ -191,35 +192,34 @@ class RayConfig(TrainConfig):
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
-    """Rays per training step; with --max-seconds the maximum, see --steps-per-ray."""
+    """Rays per training step; the maximum with --max-seconds, see --steps-per-ray."""
     steps_per_ray: float = 1.0
-    """With --max-seconds, as measured, a training step has no more rays than steps fit into the time, over this: few
-    steps are better small. 0: always --num-rays-per-batch. Without effect on --samples-per-batch."""
+    """With --max-seconds: rays per step are at most the number of steps that fit into the time, divided by this. 0:
+    always --num-rays-per-batch. No effect with --samples-per-batch."""
     rays_per_pixel: RaysPerPixel = 1
-    """Rays averaged for a pixel, which covers an area, not a point. More rays are more accurate and slower."""
+    """Rays averaged per pixel. More rays are more accurate and slower."""
     train_rays_per_pixel_from: Auto[float] = 1.0
-    """Share of the budget after which training averages as many rays per pixel; before, it uses one."""
+    """Fraction of the budget after which training uses --rays-per-pixel; before, it uses one ray per pixel."""
     samples_per_batch: Auto[int | None] = AUTO
     """Samples per training step; the number of rays is adjusted to reach about this many."""
     draw_by_error: bool = False
     """Draw half of the pixels in proportion to their recent error, with weights that keep the mean loss unbiased."""
     depth_loss_mult: Auto[float] = AUTO
-    """Weight of the depth loss; 0 for none. If not given: 0.1 if there are depth images, 0.001 if there are points of a
-    reconstruction, which some pixels are known to show, else 0."""
+    """Weight of the depth loss; 0: none. auto: 0.1 with depth images, 0.001 with points of a reconstruction, else 0."""
     free_space_loss_mult: float = 0.0
-    """Weight of the penalty on matter right before cameras: nearer than most of the points that a camera sees, or than
-    any other camera sees; 0 for none."""
+    """Weight of the penalty on matter close to a camera: nearer than most points that this camera sees, or nearer than
+    the first position that another camera sees. 0: none."""
     rays_shared_by: Auto[int] = AUTO
-    """Rays start at the first place that so many training images show; 0 for the near end. If not given: 2 if this cuts
-    nothing off, by a reconstruction's points or by what the cameras look at. No effect in boxes (--seen-cells)."""
+    """Start rays at the first position that this many training images see; 0: at the near plane. auto: 2 in unbounded
+    scenes, if that cuts off no reconstructed points and nothing that cameras look at, else 0. No effect in boxes
+    (--seen-cells)."""
     thin_gradients: Auto[float] = 0.0
-    """Samples whose gradient is below this times the mean take part in a step at random, in proportion to it, and count
-    as many times more, so that the mean over steps stays; 0 for all. It has an effect on the CPU alone."""
+    """Drop samples at random if their gradient is below this multiple of the mean, and weight the rest so that the
+    expected gradient stays the same. 0: keep all. CPU only."""
     gradient_scaling: bool = False
-    """Whether gradients near cameras are scaled down, by squared distance up to half of the box's edge, against
-    floaters."""
+    """Scale gradients near cameras down by squared distance, up to half of the box's edge, against floaters."""
     eval_num_rays_per_chunk: int = 8_192
-    """Rays rendered at once in evaluation. This changes memory and speed, never the result."""
+    """Rays rendered at once in evaluation. Affects memory and speed, not the result."""
 
 
 @dataclass(frozen=True)
@@ -229,9 +229,9 @@ class SourceViewsConfig(RayConfig):
     RANGES: ClassVar[dict[str, Range]] = {"num_source_views": (1, 64), "images_per_batch": (1, 1024)}
     """Allowed ranges."""
     num_source_views: int = 3
-    """Images of the scene from which a view is rendered."""
+    """Number of images from which a view is rendered."""
     images_per_batch: int = 4
-    """Images of which the pixels of a training step are; each is rendered from other images of its scene."""
+    """Number of images that a training step draws pixels from; each is rendered from other images of its scene."""
 
 
 @dataclass(frozen=True)
@@ -239,13 +239,12 @@ class AppearanceConfig(TrainConfig):
     """Settings of a method that learns an appearance for each image."""
 
     RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
-    """Allowed range of each numeric setting."""
+    """Allowed ranges."""
     eval_appearance: Literal["mean", "half"] = "mean"
-    """Appearance of held-out images: the mean of the training images', or optimised on the left half of each image,
-    with the right half evaluated (NeRF-W's protocol)."""
+    """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
+    image, with metrics of the right half (NeRF-W's protocol)."""
     mean_appearance_share: float = 0.25
-    """Probability with which an image has the mean appearance in a training step, so that it is learnt what to show
-    with it."""
+    """Probability of training an image with the mean appearance, so that the model learns to render it."""
 
 
 def _check_range(name: str, value: Any, least: float, most: float) -> None:
@@ -264,7 +263,7 @@ def to_plain(value: Any) -> Any:
     """Convert a config to numbers, strings, lists and dictionaries, which the safe YAML dumper writes.
 
     Args:
-        value: a config, or a value of one.
+        value: a config, or a setting's value.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -322,7 +321,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return Path(value)
     if hint is float and isinstance(value, (str, int, float)) and not isinstance(value, bool):
         try:
-            return float(value)  # also of a string, as which YAML 1.1 reads 1e-3
+            return float(value)  # YAML 1.1 reads 1e-3 as a string
         except (ValueError, OverflowError):
             pass
     if isinstance(hint, type) and (_is_count(value) if hint is int else isinstance(value, hint)):
@@ -331,12 +330,12 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
 
 
 def _is_count(value: Any) -> bool:
-    """Return whether a value is an integer of at most 64 bits; bool, which Python counts as an integer, is not."""
+    """Return whether a value is an integer of at most 64 bits, and not a bool."""
     return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases: a few lines of them can expand beyond memory."""
+    """PyYAML's safe loader without aliases: a few lines of aliases can expand beyond memory."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -345,7 +344,7 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping, by the safe loader and without aliases.
+    """Read a YAML file that holds a mapping, with the safe loader and without aliases.
 
     Args:
         path: the file.

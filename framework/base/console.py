@@ -1,6 +1,6 @@
-"""Output on the terminal: messages on standard error, and the progress of operations longer than a second.
+"""Output on the terminal: messages on standard error, and the progress of long operations.
 
-Progress is a bar on a terminal, and elsewhere, as in a file or under another program, a line every ten seconds.
+Progress is a bar on a terminal. Elsewhere, for example in a file, it is a line every ten seconds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nerfloom.base.errors import printable
 from nerfloom.base.meter import Meter
 
 SECONDS_BETWEEN_LINES = 10.0
-"""Seconds between lines of progress where there is no terminal."""
+"""Seconds between lines of progress without a terminal."""
 
 T = TypeVar("T")
 
@@ -35,14 +35,14 @@ def say(message: str) -> None:
 
 
 def track(items: Iterable[T], title: str, total: int, *, done: int = 0, spent: float | None = None) -> Iterator[T]:
-    """Iterate over `items`, and show how far that is and how long it will take.
+    """Iterate over `items`, and show the progress and the time left.
 
     Args:
         items: any iterable.
         title: text in front of the bar or in the line.
-        total: number of items, with those that are done.
-        done: number of items that are done already.
-        spent: seconds that those took; None if that is unknown.
+        total: number of items, including finished ones.
+        done: number of items that are already finished.
+        spent: seconds that the finished items took; None if unknown.
     """
     with _shown(Meter(title, total, done, spent), title, total, done) as advance:
         for item in items:
@@ -52,15 +52,15 @@ def track(items: Iterable[T], title: str, total: int, *, done: int = 0, spent: f
 
 @contextmanager
 def track_bytes(title: str, total: int | None, done: int = 0) -> Iterator[Callable[[int], None]]:
-    """Show how far an operation on bytes is, and how long it will take, within a `with` block.
+    """Show the progress of an operation on bytes, and the time left, within a `with` block.
 
     Args:
         title: text in front of the bar or in the line.
-        total: number of bytes in the end; None if it is unknown.
-        done: number of bytes that are there already.
+        total: total number of bytes; None if unknown.
+        done: number of bytes that are already present.
 
     Yields:
-        Function that is called with the number of further bytes.
+        Function to call with the number of further bytes.
     """
     with _shown(Meter(title, total, done, number=decimal), title, total, done) as advance:
         yield advance
@@ -68,7 +68,7 @@ def track_bytes(title: str, total: int | None, done: int = 0) -> Iterator[Callab
 
 @contextmanager
 def _shown(meter: Meter, title: str, total: int | None, done: int = 0) -> Iterator[Callable[[int], None]]:
-    """Show a meter within a `with` block, and give the function that counts units."""
+    """Show a meter within a `with` block, and yield the function that counts units."""
     if not console.is_terminal:
         with _lines(meter):
             yield meter.advance
@@ -86,7 +86,7 @@ def _shown(meter: Meter, title: str, total: int | None, done: int = 0) -> Iterat
 
 @contextmanager
 def _lines(meter: Meter) -> Iterator[None]:
-    """Print a meter's line every ten seconds, in a thread: also while one unit takes minutes."""
+    """Print a meter's line every ten seconds, from a thread, since one unit may take minutes."""
     ended = threading.Event()
 
     def print_lines() -> None:

@@ -13,7 +13,7 @@ ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
 @dataclass(frozen=True)
 class Decision:
-    """A record of a setting that was chosen by the data, for the user."""
+    """A record, for the user, of a setting that was chosen from the data."""
 
     option: str
     """Name of the setting in words."""
@@ -38,9 +38,9 @@ class Choice:
     reason: str
     """Reason, as a clause that follows "as"."""
     option: str | None = None
-    """Name of the setting in words; the name of the field with spaces if None."""
+    """Name of the setting in words; None for the field's name with spaces."""
     shown: str | None = None
-    """The value in words; the value's own text if None."""
+    """The value in words; None for the value as text."""
 
     def decision(self) -> Decision:
         """Return the record of this choice."""
@@ -63,7 +63,7 @@ def left_open(config: TrainConfig) -> list[str]:
 
 
 def fill(config: ConfigT, *choices: Choice) -> tuple[ConfigT, list[Decision]]:
-    """Fill in the settings that are still open. The others stay unchanged, and are not reported.
+    """Fill in the settings that are still open. Other settings stay unchanged and are not reported.
 
     Args:
         config: the method's settings.

@@ -1,4 +1,4 @@
-"""The device and the numerical precision of a run, and its random streams."""
+"""The device of a run, its memory and speed, and its random streams."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from nerfloom.base.processes import processes
 GPU_SPEED = 10.0
 """Speed of a GPU in training, relative to two threads of a CPU."""
 BEFORE_STEP, AFTER_STEP = -1, -2
-"""Random streams of a step that several processes share, in place of a process's number."""
+"""Random streams of a step that all processes share; they take the place of a process's number."""
 
 
 def choose_device(machine: MachineConfig) -> torch.device:
     """Return the device of a config, and set its number of CPU threads.
 
-    Several processes on a machine share its cores, and each has a GPU of its own.
+    Processes on the same machine share its cores; each has its own GPU.
 
     Args:
         machine: the device type and the number of threads.
@@ -59,15 +59,15 @@ def device_kind(machine: MachineConfig) -> str:
 
 
 def relative_speed(machine: MachineConfig) -> float:
-    """Return how fast kernels train here, relative to two threads of a CPU: as given, or by device and threads.
+    """Return the speed of training on this machine, relative to two CPU threads.
 
-    One thread was measured to be 0.55 to 0.58 as fast as two, as if a quarter of a step on two threads were not shared
-    out (Amdahl 1967); 4 and 8 were 1.7 and 2.3 times as fast as two. A GPU counts as ten times: one of a data
-    centre took the samples of instant-ngp six times as fast while three other runs shared it. Several processes have 1,
-    since all must decide the same.
+    The speed is `machine.speed` if set. On a CPU it is estimated from torch's number of threads, with a serial part of
+    a quarter of a step on two threads (Amdahl 1967). Measured: one thread is 0.55 to 0.58 times as fast as two; 4 and 8
+    threads are 1.7 and 2.3 times as fast. A GPU counts as ten: a data-centre GPU, shared with three other runs, was six
+    times as fast in samples of instant-ngp. With several processes the result is 1, since all must decide the same.
 
     Args:
-        machine: the device type, and its speed if it is given or was measured; threads are those that torch is set to.
+        machine: the device type, and the speed if it was given or measured.
     """
     if processes().count > 1:
         return 1.0
@@ -92,20 +92,20 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def to_float64(values: Tensor) -> Tensor:
-    """Return `values` in float64: on the CPU if their device is MPS, which lacks float64, else on their own device."""
+    """Return `values` in float64, on the CPU if their device is MPS, which lacks float64."""
     return (values.cpu() if values.device.type == "mps" else values).double()
 
 
 def runs_ahead(device: torch.device) -> bool:
-    """Return whether `device` computes while Python goes on, so that reading a value from it means to wait for it."""
+    """Return whether `device` runs asynchronously, so that reading a value waits for the device."""
     return device.type != "cpu"
 
 
 class StepValue:
-    """A number that changes from step to step, as operations read it: on the CPU a float, else a tensor.
+    """A number that changes from step to step: a float on the CPU, a tensor on other devices.
 
-    The tensor stays the same one, so that a recorded step finds the number of the step in which it is repeated; to set
-    it does not wait for the device.
+    The tensor is always the same one, so that a replayed CUDA graph reads the current number. Setting it does not wait
+    for the device.
 
     Args:
         value: the first number.
@@ -131,27 +131,27 @@ class StepValue:
 
 
 class HostValue:
-    """The value of a scalar tensor in Python, which is read from the device only where it has changed."""
+    """The value of a scalar tensor in Python, read from the device only when it has changed."""
 
     def __init__(self) -> None:
         self._state, self._value = (0, -1), 0.0
 
     def of(self, scalar: Tensor) -> float:
-        """Return the value of a `scalar` (), always the same tensor, that is changed in place."""
+        """Return the value of `scalar` (). Pass the same tensor in each call; it may be changed in place."""
         state = scalar.data_ptr(), scalar._version
         if state != self._state:
             self._state, self._value = state, float(scalar)
         return self._value
 
     def change(self, scalar: Tensor, value: float) -> None:
-        """Set `scalar` to a `value` that float32 holds exactly, without a wait for the device."""
+        """Set `scalar` to a `value` that float32 represents exactly, without waiting for the device."""
         scalar.fill_(value)
         self._state, self._value = (scalar.data_ptr(), scalar._version), value
 
 
 @cache
 def cpu_features() -> frozenset[str]:
-    """Return the CPU's instruction sets by Linux's names; elsewhere, AVX2 and AVX-512 if PyTorch detects them."""
+    """Return the CPU's instruction sets by their Linux names; on other systems, AVX2 and AVX-512 as PyTorch reports."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -169,7 +169,7 @@ def seed_step(seed: int, step: int, stream: int = 0) -> None:
     Args:
         seed: the run's seed.
         step: the step's number.
-        stream: number of the process that draws, or one of the streams that all share.
+        stream: number of the process, or a stream that all processes share.
     """
     number = stream_seed(seed, step, stream)
     torch.default_generator.manual_seed(number)
@@ -181,7 +181,7 @@ def seed_step(seed: int, step: int, stream: int = 0) -> None:
 
 @contextmanager
 def shared_stream(seed: int, step: int, stream: int) -> Iterator[None]:
-    """Draw the same random numbers in all processes within a `with` block; a single process goes on as before.
+    """Draw the same random numbers in all processes within a `with` block. No effect with a single process.
 
     Args:
         seed: the run's seed.
@@ -231,7 +231,7 @@ def peak_memory(device: torch.device) -> int:
 
 
 def free_memory(device: torch.device) -> float:
-    """Return the free memory of a GPU in bytes; infinity for other devices, which share the machine's.
+    """Return the free memory of a GPU in bytes; infinity for other devices, which share the machine's memory.
 
     Args:
         device: the device.
@@ -240,13 +240,13 @@ def free_memory(device: torch.device) -> float:
 
 
 def wait_for(device: torch.device) -> None:
-    """Wait until all pending work on `device` has finished, so that a time can be measured."""
+    """Wait until all pending work on `device` has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def machine_memory() -> float:
-    """Return the memory in bytes of this machine or of the container around this process; infinity if unknown."""
+    """Return the memory in bytes of this machine, or the limit of its container; infinity if unknown."""
     try:
         limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, ValueError, OSError):  # Windows

@@ -15,8 +15,8 @@ class NerfloomError(ValueError):
     """Base class of the errors that the command line prints as one line, without a traceback.
 
     Args:
-        message: the text. Line breaks and control characters, as names read from files may have, are escaped, and text
-            beyond `LONGEST_MESSAGE` characters is cut off.
+        message: the text. Line breaks and control characters are escaped, and text beyond `LONGEST_MESSAGE` characters
+            is cut off.
     """
 
     def __init__(self, message: str) -> None:
@@ -33,7 +33,7 @@ class ConfigError(NerfloomError):
 
 
 class FlagError(ConfigError):
-    """A flag is unknown or missing, or has a value that it cannot have; the exit status of the command is 2."""
+    """A flag is unknown, missing or has an invalid value. The command exits with status 2."""
 
 
 class CheckpointError(NerfloomError):
@@ -45,11 +45,11 @@ class DivergenceError(NerfloomError):
 
 
 class LostProcessError(NerfloomError):
-    """Another process that trains the same run has ended, or no longer has the same model."""
+    """Another process of the same run has ended, or its model differs."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether `error` is an out-of-memory error, Python's own or one of the several that PyTorch raises."""
+    """Return whether `error` is an out-of-memory error of Python or PyTorch."""
     text = str(error)
     return isinstance(error, MemoryError) or (
         isinstance(error, RuntimeError) and ("out of memory" in text or "allocate memory" in text)
@@ -74,7 +74,7 @@ def nearest(name: str, candidates: Iterable[str]) -> str:
 
 
 def printable(text: str) -> str:
-    """Return `text` with unprintable characters, line breaks among them, escaped, so that a terminal shows it as is."""
+    """Return `text` with unprintable characters escaped, including line breaks."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -1,4 +1,4 @@
-"""Some of many, equally far apart."""
+"""Evenly spaced indices."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from torch import Tensor
 
 
 def evenly_spaced(count: int, most: int) -> Tensor:
-    """Return at most `most` indices below `count`, evenly spaced, with the first and the last, (K,) int64.
+    """Return at most `most` indices below `count`, (K,) int64, evenly spaced, including the first and the last.
 
     Args:
-        count: number of what is indexed.
-        most: maximum number of indices; all are returned if there are no more.
+        count: number of items.
+        most: maximum number of indices.
     """
-    # In float32 whole numbers beyond 2^24 are not exact, and pixels are counted through all images.
+    # float32 does not represent integers beyond 2^24 exactly, and indices of pixels run over all images.
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).long()

@@ -1,4 +1,4 @@
-"""Commands that install optional packages, by the packages' own names, so that they work in a clone too."""
+"""Commands that install optional packages. They name the packages themselves, so that they also work in a clone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXTRAS: dict[str, dict[str, str]] = {
     "export": {"skimage": "scikit-image", "trimesh": "trimesh", "fast_simplification": "fast-simplification"},
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
 }
-"""Extra of pyproject.toml -> {module that is imported: name of its package for pip}."""
+"""Extra in pyproject.toml -> {imported module: name of its package for pip}."""
 
 
 def install_command(extra: str) -> str | None:

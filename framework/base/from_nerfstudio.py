@@ -1,4 +1,4 @@
-"""Flags, subcommands and configs of nerfstudio, and the answers that tell its users what to use here."""
+"""Answers to nerfstudio's flags, subcommands and configs: what to use here."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ TAKEN = (
     "predict-normals", "sh-degree", "ssim-lambda", "train-num-rays-per-batch", "train-split-fraction",
     "use-gradient-scaling",
 )  # fmt: skip
-"""Last parts of the nerfstudio flags that mean the same here and have the same values, so that they are taken."""
+"""Last parts of the nerfstudio flags that are accepted: they have the same meaning and the same values here."""
 SPELLINGS = {
     "iterations": "--max-num-iterations",
     "iters": "--max-num-iterations",
@@ -64,11 +64,11 @@ SPELLINGS = {
     "sh-degree": "--degree",
     "source-path": "--data",
 }
-"""Flag without prefix, as it is spelt in other programs -> the flag here that means the same, and is taken."""
+"""Flag of another program, without prefix -> the flag here with the same meaning. These are accepted."""
 CAMERA_SETTINGS = {"lr": "--camera-learning-rate"}
-"""As `SETTINGS`, for flags of the camera optimiser."""
+"""Like `SETTINGS`, for flags of the camera optimiser."""
 SECTIONS = {
-    "viewer": "of the viewer there are --viewer.websocket-host, --viewer.websocket-port and --viewer-share",
+    "viewer": "the viewer's flags here are --viewer.websocket-host, --viewer.websocket-port and --viewer-share",
     "logging": "leave it out; the choice here is --vis viewer, tensorboard, viewer+tensorboard or none",
     "optimizers": "Adam is the only optimiser, with --learning-rate, --lr-schedule and --lr-final",
     "pipeline": "there is no equivalent flag; ns-train {method} --help-all lists all flags",
@@ -84,7 +84,7 @@ SECTIONS = {
     "prompt": "no method here uses text prompts",
     "start-paused": "leave it out; the viewer has a button that pauses training",
 }
-"""First part of a nerfstudio flag -> the answer if there is no equivalent flag here."""
+"""First part of a nerfstudio flag -> the answer if no flag here is equivalent."""
 VIEWERS = ("viewer_legacy", "viewer_beta", "wandb", "comet")
 """Values of nerfstudio's --vis, alone or joined by +, that are not available here."""
 FORMATS = {
@@ -101,7 +101,7 @@ NO_FORMATS = (
     "scannet-data", "scannetpp-data", "sdfstudio-data", "sitcoms3d-data",
 )  # fmt: skip
 """Data subcommands of nerfstudio without a data format here."""
-_MESH = "meshes are made by 'marching-cubes' (of methods with density) and 'tsdf' (of all)"
+_MESH = "use 'marching-cubes' (methods with density) or 'tsdf' (all methods) for meshes"
 _OTHER_POSES = "export its cameras in COLMAP's format, and pass that folder to ns-train --data; no processing is needed"
 KINDS = {
     "poisson": _MESH,
@@ -110,29 +110,28 @@ KINDS = {
     "odm": _OTHER_POSES,
     "aria": "it is not supported here",
 }
-"""Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent here -> what to use
-instead."""
+"""Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent -> what to use instead."""
 
 
 RENDERING = {
-    "output-format": "the extension of --output-path says it; without one, images are written to a folder",
-    "jpeg-quality": "leave it out; JPEG images are of quality 95",
+    "output-format": "the extension of --output-path sets the format; without one, images are written to a folder",
+    "jpeg-quality": "leave it out; JPEG images have quality 95",
     "seconds": "here they are --num-frames and --fps",
     "frame-rate": "here it is --fps",
-    "interpolation-steps": "here it is --num-frames, of the whole path",
-    "pose-source": "leave it out; the path leads past the training cameras",
-    "order-poses": "leave it out; cameras are passed in the order of their images' names",
+    "interpolation-steps": "here it is --num-frames, for the whole path",
+    "pose-source": "leave it out; the path follows the training cameras",
+    "order-poses": "leave it out; the path passes cameras in the order of their images' names",
     "camera-idx": "leave it out; the mean appearance of all images is shown",
     "render-nearest-camera": "there is no equivalent; 'ns-render dataset' shows views beside their true images",
     "check-occlusions": "there is no equivalent; 'ns-render dataset' shows views beside their true images",
-    "colormap-options": "leave it out; depth is in viridis, within --depth-near-plane and --depth-far-plane",
+    "colormap-options": "leave it out; depth is in viridis, between --depth-near-plane and --depth-far-plane",
     "eval-num-rays-per-chunk": "leave it out; it is a setting of the run",
 }
 """First part of a flag of nerfstudio's ns-render without an equivalent of the same name -> the answer."""
 
 
 def render_answer(flag: str) -> str | None:
-    """Return the answer to a flag of nerfstudio's ns-render that does not exist here; None for any other word.
+    """Return the answer to a flag of nerfstudio's ns-render that does not exist here; None for other words.
 
     Args:
         flag: the word as typed, possibly with =VALUE.
@@ -143,22 +142,22 @@ def render_answer(flag: str) -> str | None:
 
 
 def vis_answer(value: str) -> str | None:
-    """Return the answer to `value`, a value of nerfstudio's --vis that is not available here; None for any other."""
+    """Return the answer to a `value` of nerfstudio's --vis that is not available here; None for other values."""
     foreign = set(value.split("+")) & set(VIEWERS)
     return f"--vis {value} is nerfstudio's; {SECTIONS['logging']}" if foreign else None
 
 
 def taken(words: list[str], known: Collection[str]) -> tuple[list[str], list[str]]:
-    """Return the words of a command line with flags and formats of nerfstudio as they are called here, and what to say.
+    """Replace nerfstudio's flags and formats in a command line by those with the same meaning here.
 
-    Only what means the same is taken. All other words are returned as they are.
+    All other words stay as they are.
 
     Args:
         words: flags and their values.
         known: flags of the method, with their dashes.
 
     Returns:
-        The words, and a line for each that was replaced.
+        The words, and a line to print for each replaced word.
     """
     ours, notes = [], []
     for index, word in enumerate(words):
@@ -173,7 +172,7 @@ def taken(words: list[str], known: Collection[str]) -> tuple[list[str], list[str
 
 
 def _ours(flag: str, known: Collection[str]) -> str | None:
-    """Return the flag that means the same as a flag of nerfstudio or of other programs; None for any other word."""
+    """Return the flag with the same meaning as a flag of nerfstudio or another program; None for other words."""
     name = flag.removeprefix("--").replace("_", "-")
     if not flag.startswith("--") or f"--{name}" in known:
         return None
@@ -186,11 +185,11 @@ def _ours(flag: str, known: Collection[str]) -> str | None:
 
 
 def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:
-    """Return the answer to a flag of nerfstudio that does not exist here; None for any other flag.
+    """Return the answer to a flag of nerfstudio that does not exist here; None for other flags.
 
     Args:
         flag: the flag as typed, possibly with =VALUE.
-        method: name of the method to be trained.
+        method: name of the method.
         known: flags of this method, with their dashes.
     """
     name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
@@ -213,7 +212,7 @@ def _equivalent(name: str) -> str:
 
 
 def format_answer(name: str) -> str | None:
-    """Return the answer to a data subcommand of nerfstudio; None for any other word.
+    """Return the answer to a data subcommand of nerfstudio; None for other words.
 
     Args:
         name: the word that a user typed as data format.
@@ -228,9 +227,9 @@ def format_answer(name: str) -> str | None:
 
 
 def config_answer(text: str) -> str | None:
-    """Return the answer to a config.yml of nerfstudio; None for any other file.
+    """Return the answer to a config.yml of nerfstudio; None for other files.
 
-    The text is searched for the method and the data. It is never loaded, which would construct its Python objects.
+    The function searches the text for the method and the data. Loading the YAML would construct its Python objects.
 
     Args:
         text: content of a YAML file.
@@ -241,4 +240,4 @@ def config_answer(text: str) -> str | None:
     data = re.search(r"^data: (?:&\w+ )?!!python/object/apply:pathlib\.\w+\n((?:- .+\n)+)", text, re.MULTILINE)
     parts = re.findall(r"^- ['\"]?(.+?)['\"]?$", data[1], re.MULTILINE) if data else ["DIR"]
     train = f"ns-train {method[1] if method else 'METHOD'} --data {shlex.quote('/'.join(parts).replace('//', '/'))}"
-    return f"is nerfstudio's; it cannot be loaded, and its checkpoints are of other networks; train anew: {train}"
+    return f"is nerfstudio's; its networks differ, so that its checkpoints cannot be loaded; train again: {train}"

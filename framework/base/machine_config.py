@@ -1,4 +1,4 @@
-"""Settings of the machine that a run is on, and of the viewer that it opens there."""
+"""Settings of a run's machine and viewer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 from nerfloom.base.errors import ConfigError, shown
 
 MOST_THREADS = 1024
-"""Maximum number of CPU threads that a run may ask for."""
+"""Maximum number of CPU threads."""
 
 
 @dataclass(frozen=True)
@@ -17,17 +17,17 @@ class MachineConfig:
     """The device of a run, its threads and its seed."""
 
     seed: int = 42
-    """Random seed. The same seed, CPU and thread count give the same bits; on a GPU, sums differ in rounding."""
+    """Random seed. The same seed, CPU and thread count give the same bits; on a GPU, rounding differs between runs."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on; auto: CUDA if available, else the CPU."""
     num_threads: int | None = None
-    """CPU threads; all cores if not given."""
+    """CPU threads. Default: all cores."""
     speed: float | None = None
-    """How fast this machine trains, relative to two quiet cores of the server that settings were tuned on. If not
-    given: measured on a CPU if --max-seconds is at least 10, else by the number of threads."""
+    """Training speed relative to two idle cores of the server that settings were tuned on. Default: measured on a CPU
+    if --max-seconds is at least 10, else estimated from the number of threads."""
     cuda_graphs: Literal["auto", "on", "off"] = "auto"
-    """Record training steps on a GPU as CUDA graphs and repeat them, which saves the time to start each operation.
-    auto: where steps are alike, if a repeated step has the loss and the effect of one without; a line says why not."""
+    """Capture training steps on a GPU as CUDA graphs, which saves the time to launch each operation. auto: if steps
+    repeat and a replayed step gives the same loss and update as an ordinary one; a message says why not."""
 
     def __post_init__(self) -> None:
         if not -(2**63) <= self.seed < 2**63:
@@ -44,9 +44,9 @@ class ViewerConfig:
     """The address of the viewer."""
 
     websocket_host: str = "127.0.0.1"
-    """Interface to listen on; 0.0.0.0 for all, from which other machines can connect. There is no password."""
+    """Interface to listen on; 0.0.0.0: all, so that other machines can connect. There is no password."""
     websocket_port: int = 7007
-    """Port to listen on; the next free one if it is taken."""
+    """Port to listen on, or the next free one."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.websocket_port <= 65535:

@@ -1,4 +1,4 @@
-"""A meter of operations: units that are done, and the time that the others will take."""
+"""Progress of an operation: finished units and the time left."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 UNKNOWN = "–"
-"""Text that stands for an unknown value."""
+"""Text for an unknown value."""
 
 
 def time_text(seconds: float) -> str:
@@ -18,27 +18,27 @@ def time_text(seconds: float) -> str:
 
 
 def left_text(seconds: float | None) -> str:
-    """Return how long something will take, such as ``3 min left``.
+    """Return the time left as text, such as ``3 min left``.
 
     Args:
-        seconds: the duration; None, which is written as a dash, if it is unknown.
+        seconds: the duration; None if unknown, which is written as a dash.
     """
     return f"{UNKNOWN if seconds is None else time_text(seconds)} left"
 
 
 class Meter:
-    """Units of an operation that are done, and the time that the others will take.
+    """Progress of an operation: finished units and the time left.
 
-    All units are taken to last as long as those that are done did on average. This holds for units of minutes too, for
-    which a speed over the last seconds would be unknown.
+    The time left assumes that each remaining unit takes the mean time of the finished ones. Speed over the last seconds
+    would be unknown for units that take minutes.
 
     Args:
-        title: what is done, for people.
-        total: number of units; None if it is unknown.
-        done: number of units that are done already.
-        spent: seconds that those took; if None, they tell nothing of the time that the others take.
+        title: text that names the operation.
+        total: number of units; None if unknown.
+        done: number of units that are already finished.
+        spent: seconds that these units took; None to leave them out of the estimate.
         clock: function that returns seconds.
-        number: function that writes a number of units.
+        number: function that formats a number of units.
     """
 
     def __init__(
@@ -56,13 +56,13 @@ class Meter:
         self._start = self._last - (spent or 0.0)
 
     def advance(self, count: int = 1) -> None:
-        """Count further units, `count` of them, as done."""
+        """Count `count` more units as finished."""
         self._done += count
         self._last = self._clock()
 
     @property
     def seconds_left(self) -> float | None:
-        """Seconds that the other units will take; None before the first is done, or if their number is unknown."""
+        """Estimated seconds for the remaining units; None if their number is unknown or none has finished yet."""
         counted = self._done - self._first
         if not counted or self._total is None:
             return None
@@ -71,12 +71,12 @@ class Meter:
 
     @property
     def left(self) -> str:
-        """The time that the other units will take, as text."""
+        """The time left, as text."""
         return left_text(self.seconds_left)
 
     @property
     def state(self) -> str:
-        """The units that are done, their share and the time left, as text."""
+        """The finished units, their percentage and the time left, as text."""
         if self._total is None:
             return self._number(self._done)
         share = 100 * self._done / max(self._total, 1)

@@ -16,14 +16,14 @@ Schedule = Literal["constant", "exponential", "cosine", "hold-exponential"]
 
 @dataclass(frozen=True)
 class Optimised:
-    """Optimiser settings of a module's parameters. A value of None is that of the containing module, or of the run.
+    """Optimiser settings of a module's parameters. None takes the value of the containing module, or of the run.
 
-    A module declares them in its attribute `optimised`. They apply to the parameters of the module and of all modules
-    in it that declare none.
+    A module declares them in its attribute `optimised`. They apply to the module's parameters and to submodules without
+    settings of their own.
     """
 
     name: str | None = None
-    """Name of the group, under which its learning rate is logged."""
+    """Name of the group in logs of the learning rate."""
     learning_rate: float | None = None
     """Initial learning rate of Adam."""
     betas: tuple[float, float] | None = None
@@ -33,9 +33,9 @@ class Optimised:
     schedule: Schedule | None = None
     """Schedule of the learning rate over the training budget."""
     warmup_steps: int | None = None
-    """Number of steps in which the learning rate rises linearly from 0."""
+    """Number of steps over which the learning rate rises linearly from 0."""
     sparse: bool | None = None
-    """True if the parameters are tables (E, F), of which a step updates only the entries that it has used."""
+    """True if the parameters are tables (E, F) and a step updates only the entries that it used."""
 
     def within(self, outer: Optimised) -> Optimised:
         """Return these settings, with values of None replaced by those of `outer`."""
@@ -55,15 +55,15 @@ class ParameterGroup:
 
 @dataclass(frozen=True)
 class RowChange:
-    """A change of a parameter's rows: some are kept, in any order, and new ones are appended.
+    """A change of a parameter's rows: keeps some, in any order, and appends new ones.
 
-    A row that is kept keeps its optimiser state; that of a new row is reset.
+    Kept rows keep their optimiser state; new rows start with a fresh one.
     """
 
     parameter: nn.Parameter
     """(E, ...) a parameter of the model."""
     kept: Tensor
-    """(K,) int64 indices of the rows that are kept, in their new order."""
+    """(K,) int64 indices of the kept rows, in their new order."""
     fresh: Tensor | None = None
     """(A, ...) values of the new rows; None if there are none."""
 
@@ -75,7 +75,7 @@ class DefersGradient(Protocol, metaclass=SeesRegistered):
     table: nn.Parameter
     """(E, F) the table."""
     deferred: Any
-    """The deferred gradient (`TableGradient` or `PlanesGradient`); None if autograd accumulates it after all."""
+    """The deferred gradient (`TableGradient` or `PlanesGradient`); None if autograd accumulates it."""
 
 
 def parameter_groups(model: nn.Module) -> list[ParameterGroup]:

@@ -1,4 +1,4 @@
-"""Methods that users ask for by name and that other projects provide: where to get them, and the closest one here."""
+"""Methods of other projects: where to get them, and the closest method here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LARGER = "here it is 'nerfacto' with larger settings:"
 
 ELSEWHERE: dict[str, str] = {
     "splatfacto": _GAUSSIANS,
-    "splatfacto-big": f"{_GAUSSIANS}; --num-gaussians says how many it may have",
+    "splatfacto-big": f"{_GAUSSIANS}; --num-gaussians sets the maximum number of Gaussians",
     "3dgs": _GAUSSIANS,
     "gsplat": _GAUSSIANS,
     "neus": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus')}",
@@ -29,7 +29,7 @@ ELSEWHERE: dict[str, str] = {
     "nerf++": "here it is called 'nerf-plus-plus'",
     "nerfplusplus": "here it is called 'nerf-plus-plus'",
     "pixelnerf": "here it is called 'pixel-nerf'",
-    "instant-ngp-bounded": "here it is called 'instant-ngp', and the scene's profile says whether it is bounded",
+    "instant-ngp-bounded": "here it is called 'instant-ngp'; it detects whether a scene is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",
     "nerfacto-huge": f"{_LARGER} --max-resolution 8192 --log2-table-size 21 --hidden-width 256",
     "phototourism": "here it is 'nerfacto'; data of the format phototourism is recognised",
@@ -40,4 +40,4 @@ ELSEWHERE: dict[str, str] = {
     "k-planes": "here it is called 'kplanes'",
     "d-nerf": "here it is called 'dnerf'",
 }
-"""Name -> how to get the method. A registered method of the same name takes precedence."""
+"""Name -> how to get the method. Registered methods take precedence."""

@@ -1,37 +1,37 @@
-"""The pace of a run with a budget in seconds, and the times of its steps."""
+"""The pace of a run with a time budget, and the durations of its steps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 SHARE_OF_LAST = 0.1
-"""Share that the last measurement has in the running mean."""
+"""Weight of the last measurement in the running mean."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """Steps and seconds of a run so far, and the seconds that it has."""
+    """Steps and seconds of a run so far, and its time budget."""
 
     step: int
     """Number of training steps done."""
     seconds: float
     """Seconds of training so far."""
     budget: float
-    """Seconds of training in all."""
+    """Total seconds of training."""
     steps_per_read: int = 1
     """Steps between two waits for the device. Seconds are exact only over a multiple of this number."""
 
     @property
     def progress(self) -> float:
-        """Share of the budget that is spent."""
+        """Spent fraction of the budget."""
         return min(self.seconds / self.budget, 1.0)
 
 
 class StepTimes:
-    """Seconds that steps of different sizes take, measured while they are taken.
+    """Measured durations of steps of different sizes.
 
-    The first measurement of a run is left out, as the first step allocates and compiles. When a size is measured again,
-    all sizes are taken to have changed by its ratio: more primitives and other programs slow down all of them.
+    The first measurement of a run is dropped, since the first step allocates and compiles. When a size is measured
+    again, the durations of all sizes are scaled by its ratio: more primitives and other programs slow down all sizes.
     """
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class StepTimes:
         self._warm = False
 
     def of(self, size: int) -> float | None:
-        """Return the seconds of a step of `size`; None if none was measured."""
+        """Return the seconds of a step of `size`; None if not measured."""
         return self._seconds.get(size)
 
     def learn(self, pace: Pace, size: int) -> None:

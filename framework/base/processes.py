@@ -1,7 +1,7 @@
 """Several processes that train one run: `torchrun --nproc-per-node N $(which ns-train) METHOD ...`.
 
-Each runs the same program on pixels or images of its own. The first alone prints and writes. They exchange tensors
-only by the functions here, in the same order in each process. With a single process these do nothing.
+Each process runs the same program on its own pixels or images. Only the first prints and writes. Processes exchange
+tensors only through the functions here, called in the same order in each process. With one process they do nothing.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from nerfloom.base.console import console
 from nerfloom.base.errors import ConfigError, LostProcessError
 
 PATIENCE = timedelta(days=1)
-"""Maximum time to wait for another process, which may be evaluating. One that has ended is noticed at once."""
+"""Maximum time to wait for another process, which may be evaluating. An ended process is noticed at once."""
 NAMES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-"""Environment variables by which torchrun numbers its processes."""
+"""Environment variables in which torchrun numbers its processes."""
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Number and count of the processes of a run."""
+    """The rank of this process and the number of processes of a run."""
 
     rank: int = 0
-    """Number of this process, from 0."""
+    """Rank of this process, from 0."""
     count: int = 1
     """Number of processes."""
     local_rank: int = 0
-    """Number of this process among those on this machine."""
+    """Rank of this process on this machine."""
     local_count: int = 1
     """Number of processes on this machine."""
 
@@ -50,16 +50,16 @@ _joined = Processes()
 
 
 def processes() -> Processes:
-    """Return the processes of this run; a single one outside `joined_processes`."""
+    """Return the processes of this run; one process outside `joined_processes`."""
     return _joined
 
 
 @contextmanager
 def joined_processes() -> Iterator[Processes]:
-    """Join the processes that torchrun has started, within a `with` block; all but the first print no messages there.
+    """Connect the processes that torchrun has started, within a `with` block. Only the first prints messages there.
 
     Raises:
-        ConfigError: if they do not find each other.
+        ConfigError: if they cannot connect.
     """
     global _joined
     started = _started()
@@ -73,18 +73,18 @@ def joined_processes() -> Iterator[Processes]:
     try:
         dist.init_process_group(backend, timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:
-        raise ConfigError(f"{several}, but they do not find each other; start them by torchrun: {error}") from error
+        raise ConfigError(f"{several}, but they cannot connect; start them with torchrun: {error}") from error
     _joined, console.quiet = started, not started.first
     try:
         yield started
     finally:
         _joined = Processes()
-    dist.destroy_process_group()  # not after an error, when it could wait for processes that have ended
+    dist.destroy_process_group()  # not after an error: it could wait for processes that have ended
 
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Take this process for a single one within a `with` block, for work whose result the others are given."""
+    """Treat this process as the only one within a `with` block, for work whose result is sent to the others."""
     global _joined
     before, _joined = _joined, Processes()
     try:
@@ -94,7 +94,7 @@ def alone() -> Iterator[None]:
 
 
 def _started() -> Processes:
-    """Return the processes that torchrun has started, by its environment variables."""
+    """Return the processes that torchrun has started, from its environment variables."""
     if not {"RANK", "WORLD_SIZE", "MASTER_ADDR"} <= os.environ.keys():
         return Processes()
     try:
@@ -104,10 +104,10 @@ def _started() -> Processes:
 
 
 def gathered(values: Sequence[float]) -> list[list[float]]:
-    """Return the numbers of all processes, a row for each.
+    """Return the numbers of all processes, one row per process.
 
     Args:
-        values: numbers of this process, as many as in the others.
+        values: numbers of this process; all processes pass the same number of them.
 
     Raises:
         LostProcessError: if another process has ended.
@@ -121,10 +121,10 @@ def gathered(values: Sequence[float]) -> list[list[float]]:
 
 
 def add_up(values: Tensor) -> Tensor:
-    """Sum a tensor over all processes, in place. Each gets the same bits.
+    """Sum a tensor over all processes, in place. All processes get the same bits.
 
     Args:
-        values: a contiguous tensor, of the same shape in each process.
+        values: a contiguous tensor with the same shape in each process.
 
     Returns:
         The same tensor.
@@ -141,7 +141,7 @@ def from_first(content: Any, device: torch.device | str = "cpu") -> Any:
     """Return the first process's `content`.
 
     Args:
-        content: tensors and plain data, as in checkpoints; only that of the first process matters.
+        content: tensors and plain data, as in checkpoints; ignored in all but the first process.
         device: device of the tensors in the other processes.
 
     Raises:
@@ -161,7 +161,7 @@ def from_first(content: Any, device: torch.device | str = "cpu") -> Any:
 
 
 def _together(collective: Callable[..., Any], *arguments: Any) -> None:
-    """Call a function of torch.distributed; raise LostProcessError if it fails, as all do when a process has ended."""
+    """Call a function of torch.distributed; raise LostProcessError if it fails because a process has ended."""
     try:
         collective(*arguments)
     except RuntimeError as error:

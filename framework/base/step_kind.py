@@ -1,4 +1,4 @@
-"""The kind of a training step: whether steps repeat each other."""
+"""The kind of a training step, which decides whether steps can be captured and replayed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StepKind:
-    """All that a training step depends on besides the values of tensors that stay where they are.
+    """Everything that a training step depends on, except the values of tensors at fixed addresses.
 
-    Steps of equal kinds run the same operations on tensors of the same sizes, so that one of them can be recorded and
-    repeated (`nerfloom.training.graphs`).
+    Steps of equal kinds run the same operations on tensors of the same sizes, so that one of them can be captured and
+    replayed (`nerfloom.training.graphs`).
     """
 
     of: tuple[Hashable, ...] = ()
-    """Everything else that decides which operations run."""
+    """Values that decide which operations run."""
     varies: str | None = None
-    """Why steps do not repeat each other, in words that follow "because"; None if they do."""
+    """Why steps cannot be replayed, as a clause that follows "because"; None if they can."""

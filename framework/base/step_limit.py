@@ -1,4 +1,4 @@
-"""Settings that follow from the names of those that a user gives."""
+"""The limit of steps of a run with a limit of seconds."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
 
 def limited_as_given(config: ConfigT, given: Collection[str]) -> ConfigT:
-    """Return settings without a limit of steps if a user gives seconds alone: a method's number of steps is a default.
+    """Remove the default limit of steps if the user sets only a limit of seconds.
 
     Args:
         config: the settings.
-        given: names of the settings that the user gives.
+        given: names of the settings that the user has set.
 
     Raises:
-        FlagError: if neither steps nor seconds have a limit, which schedules need.
+        FlagError: if neither steps nor seconds are limited; schedules need a limit.
     """
     if config.max_seconds is not None and "max_seconds" in given and "max_num_iterations" not in given:
         config = dataclasses.replace(config, max_num_iterations=None)
     if config.max_seconds is None and config.max_num_iterations is None:
-        raise FlagError("--max-num-iterations None needs --max-seconds: learning rates follow the share that is spent")
+        raise FlagError("--max-num-iterations None needs --max-seconds: learning rates follow the spent budget")
     return config

@@ -1,4 +1,4 @@
-"""The folder of files that can be created again."""
+"""The user's cache folder."""
 
 from __future__ import annotations
 

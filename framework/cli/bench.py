@@ -1,4 +1,4 @@
-"""The command `ns-bench`: what this machine can do, in kernels, training steps, pictures and methods."""
+"""The command `ns-bench`: benchmarks of kernels, training steps, pictures and methods on this machine."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ usage: ns-bench WHAT [flags]
   kernels          time and error of every compiled kernel against torch, and the machine's measured limits
   gpu              the same on a GPU, steps as CUDA graphs, and PSNR after 2 to 60 seconds, in less than eight minutes
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
-  profile-step     time of a training step: of each compiled kernel, and of Python and torch
-  frames           pictures a second of trained runs, at several sizes and numbers of threads
+  profile-step     time of each compiled kernel in a training step, and of Python and torch
+  frames           pictures per second of trained runs, at several sizes and numbers of threads
 
 ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
 --output-dir or --output.

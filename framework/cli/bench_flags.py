@@ -15,18 +15,18 @@ class KernelFlags:
     samples: int = 2**15
     """Number of samples in a batch."""
     repeats: int = 9
-    """Number of runs, of which medians are reported."""
+    """Number of runs; the report gives medians."""
     variants: tuple[str, ...] = ()
-    """Instruction sets, each measured in its own process, such as avx2 avx512; the fastest if not given."""
+    """Instruction sets, such as avx2 avx512, each measured in its own process. Default: the fastest."""
     output_dir: Path = RESULTS
     """Folder of kernels-VARIANT.json."""
     plot_dir: Path | None = None
-    """Folder of a plot of the times; no plot if not given."""
+    """Folder for a plot of the times. Default: no plot."""
 
 
 @dataclass(frozen=True)
 class FramesFlags:
-    """Measure pictures a second of trained runs on the CPU, in colour, along the cameras of held-out images."""
+    """Measure colour pictures per second of trained runs on the CPU, along the cameras of held-out images."""
 
     runs: tuple[Path, ...] = ()
     """Folders of trained runs."""
@@ -45,17 +45,17 @@ class MethodFlags:
     """Train every built-in method on one data set for the same time and compare them, as ns-compare does."""
 
     data: Path | None = None
-    """Folder of the data set; the embedded scene if not given."""
+    """Folder of the data set. Default: the embedded scene."""
     max_seconds: float = 120.0
     """Seconds of training of each method."""
     repeats: int = 1
     """Number of runs of each method, with different seeds."""
     run_dir: Path | None = None
-    """Folder of runs and report; outputs/bench-DATA if not given."""
+    """Folder of runs and report. Default: outputs/bench-DATA."""
     output_dir: Path = RESULTS
     """Folder of methods-DATA.json."""
     plot_dir: Path | None = None
-    """Folder of a plot of PSNR over time; no plot if not given."""
+    """Folder for a plot of PSNR over time. Default: no plot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +65,10 @@ class ProfileFlags:
     data: Path
     """Folder of the data set."""
     method: str = "instant-ngp"
-    """A method, with its flags if it has some: 'vanilla-nerf --sampler occupancy'."""
+    """A method, optionally with flags: 'vanilla-nerf --sampler occupancy'."""
     steps: int = 900
     """Training steps before the measurement."""
     max_seconds: float = 45.0
-    """Time budget, seconds, for which the method chooses its settings; training does not stop after it."""
+    """Time budget from which the method chooses its settings, seconds; training does not stop after it."""
     output_dir: Path = RESULTS
-    """Folder of profile-step.json, which gets a row for the method."""
+    """Folder of profile-step.json; a row for the method is added."""

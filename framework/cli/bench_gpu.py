@@ -12,9 +12,9 @@ from nerfloom.cli.bench_results import RESULTS, write_results
 from nerfloom.cli.common import make_room
 
 AROUND, STEPS_SECONDS = 30.0, 60.0
-"""Seconds that a method's start and evaluation are expected to take, and the timed steps."""
+"""Expected seconds of a method's start and evaluation, and of the timed steps."""
 BEFORE = 300
-"""Training steps before those that are timed: steps of both kinds are recorded in them."""
+"""Training steps before the timed ones; CUDA graphs are captured during these steps."""
 
 
 @dataclass(frozen=True)
@@ -25,24 +25,24 @@ class GpuFlags:
     """
 
     interpreter: bool = False
-    """Compute the largest errors of Triton's kernels in Triton's interpreter, on the CPU, and nothing else."""
+    """Only compute the largest errors of the Triton kernels, in Triton's interpreter on the CPU."""
 
     data: Path | None = None
-    """Folder of the data set; the embedded scene if not given."""
+    """Folder of the data set. Default: the embedded scene."""
     seconds: float = 60.0
     """Seconds of training of each method."""
     samples: int = 2**18
     """Number of samples in a batch of the kernels."""
     repeats: int = 9
-    """Number of runs of each kernel, of which medians are reported."""
+    """Number of runs of each kernel; the report gives medians."""
     steps: int = 200
-    """Number of training steps of nerfacto and of instant-ngp that are timed, as they are and as CUDA graphs."""
+    """Number of timed training steps of nerfacto and instant-ngp, with and without CUDA graphs."""
     limit: float = 480.0
-    """Seconds after which nothing new begins: kernels are left out first, then whole parts, which the report names."""
+    """Seconds after which nothing new starts. Kernels are skipped first, then whole parts; the report names them."""
     run_dir: Path | None = None
-    """Folder of runs and report; outputs/bench-gpu-DATA if not given."""
+    """Folder of runs and report. Default: outputs/bench-gpu-DATA."""
     output_dir: Path = RESULTS
-    """Folder of gpu-DATA.json; of gpu-interpreter.json with --interpreter."""
+    """Folder of gpu-DATA.json, or of gpu-interpreter.json with --interpreter."""
 
 
 def measure_gpu(flags: GpuFlags) -> None:

@@ -1,4 +1,4 @@
-"""Files of results, as `ns-bench` writes them."""
+"""Result files of `ns-bench`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PICTURES = Path("docs/pictures")
 
 
 def write_results(path: Path, content: dict[str, Any]) -> None:
-    """Write plain data as JSON, and say where.
+    """Write plain data as JSON, and print the path.
 
     Args:
         path: the file; its folder is created if missing.

@@ -27,13 +27,13 @@ K = TypeVar("K")
 def chosen_kind(
     arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str
 ) -> tuple[str, K, list[str]] | None:
-    """Return what the first argument names, or print the help if it asks for it.
+    """Look up the first argument, or print the help if it asks for help.
 
     Args:
         arguments: arguments of the command.
-        kinds: what may be named, by name.
+        kinds: entries by name.
         usage: text of the help.
-        unknown: start of the message for another name, such as "unknown path".
+        unknown: start of the message for an unknown name, such as "unknown path".
 
     Returns:
         The name, its entry of `kinds` and the remaining arguments; None if the help was printed.
@@ -53,9 +53,7 @@ def chosen_kind(
 
 
 def with_run(arguments: list[str], several: Collection[str] = ()) -> list[str]:
-    """Return the arguments of a command that takes a run, with --load-config before a run without it.
-
-    So `ns-eval RUN_FOLDER` is `ns-eval --load-config RUN_FOLDER`.
+    """Insert --load-config before a run's path that lacks it: `ns-eval RUN` becomes `ns-eval --load-config RUN`.
 
     Args:
         arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
@@ -80,9 +78,9 @@ def _is_word(argument: str) -> bool:
 
 
 def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[str, DataParser] | None]:
-    """Return the arguments of a command without the data format that is named after them, and the format.
+    """Split the arguments of a command from the data format named after them.
 
-    Flags after the format's name are the format's, if it has them, else the command's.
+    Flags after the format's name belong to the format if it has them, else to the command.
 
     Args:
         command: name of the command, for the format's help.
@@ -108,7 +106,7 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
 
 
 def make_room(path: Path) -> None:
-    """Create the folder of the file `path`, and check that the file can be written, before any work is done for it.
+    """Create the folder of the file `path`, and check that the file can be written, before any work.
 
     Raises:
         ConfigError: if it cannot be written.
@@ -120,13 +118,13 @@ def make_room(path: Path) -> None:
         if not existed:
             path.unlink()
     except OSError as error:
-        # If the folder is a file, the error of `mkdir` only says that it exists.
+        # If the folder is a file, `mkdir` only reports that it exists.
         reason = os.strerror(errno.ENOTDIR) if isinstance(error, FileExistsError) else error.strerror
         raise ConfigError(f"cannot write {path}: {reason}; name another place") from error
 
 
 def check_weights(path: Path | None) -> None:
-    """Check a file of LPIPS's weights, before any work is done whose result is evaluated with it.
+    """Check a file of LPIPS weights, before any work.
 
     Args:
         path: the file; None for none.
@@ -143,9 +141,9 @@ def check_weights(path: Path | None) -> None:
 def run_command(command: Callable[[list[str]], None]) -> None:
     """Run a command on the arguments of the process, and exit with its status.
 
-    Errors that a user can act on are printed on one line, and the exit status is 1, or 2 for an error in the flags;
-    with `--debug` among the arguments, the traceback is shown. After a signal the status is 128 plus the signal's
-    number. `--version` prints the version and, with `--environment`, all that a report of an error needs.
+    Errors that a user can act on are printed on one line; the exit status is 1, or 2 for an error in the flags. The
+    argument `--debug` shows the traceback. After a signal the status is 128 plus the signal's number. `--version`
+    prints the version, and with `--environment` also the details for error reports.
 
     Args:
         command: function of the list of arguments, without `--debug`.
@@ -163,9 +161,9 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     except (NerfloomError, OSError) as error:
         if debug:
             raise
-        console.quiet = False  # of several processes, each says why it ends
+        console.quiet = False  # every process says why it ends
         say(f"error: {in_our_words(error)}")
-        if isinstance(error, LostProcessError):  # what waits for the lost process can abort Python's own end
+        if isinstance(error, LostProcessError):  # threads that wait for the lost process can abort Python's shutdown
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(1)
@@ -174,7 +172,7 @@ def run_command(command: Callable[[list[str]], None]) -> None:
         if debug or not is_out_of_memory(error):
             raise
         console.quiet = False
-        say("error: there is not enough memory; smaller settings, such as --num-rays-per-batch, take less")
+        say("error: out of memory; reduce settings such as --num-rays-per-batch")
         sys.exit(1)
     except KeyboardInterrupt as stop:
         say(str(stop) or "interrupted")
@@ -188,13 +186,13 @@ def version() -> str:
 
 
 def _environment() -> str:
-    from nerfloom.cli.environment import environment  # it loads torch, for which --version alone need not wait
+    from nerfloom.cli.environment import environment  # loads torch, which --version alone does not need
 
     return environment()
 
 
 def in_our_words(error: Exception) -> str:
-    """Return the line of text for an `error`; an OSError becomes its file and its reason, without its number."""
+    """Return the message of an `error` on one line; for an OSError its file and reason, without the number."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     return str(error)

@@ -24,30 +24,30 @@ class CompareFlags:
     Writes report.html, report.md, results.json and results.csv. If run again, it continues where it was stopped."""
 
     methods: tuple[str, ...] = ()
-    """Methods, in quotes if with flags of their own: instant-ngp "vanilla-nerf --sampler occupancy"."""
+    """Methods; quote a method with flags: instant-ngp "vanilla-nerf --sampler occupancy"."""
     data: Path | None = None
-    """Folder of the data set; the embedded scene if not given."""
+    """Folder of the data set. Default: the embedded scene."""
     data_flags: str = ""
-    """Flags of the data format, for all methods, in quotes after an "=": --data-flags="--downscale-factor 2"."""
+    """Flags of the data format, for all methods, quoted after an "=": --data-flags="--downscale-factor 2"."""
     max_seconds: float | None = None
     """Seconds of training of each method, without evaluation and saving."""
     max_num_iterations: int | None = None
     """Training steps of each method."""
     target_psnr: float | None = None
-    """PSNR of the validation views, dB, at which training of a method stops."""
+    """Stop training a method when its validation views reach this PSNR, dB."""
     repeats: int = 1
     """Number of runs of each method, with different seeds."""
     output_dir: Path | None = None
-    """Folder of runs and report; outputs/compare-DATA if not given."""
+    """Folder of runs and report. Default: outputs/compare-DATA."""
     max_eval_images: int | None = None
-    """Maximum number of held-out views of the final evaluation, evenly spaced. If not given: one for each second of
-    training, at least 25; all without --max-seconds. The report says how many they are."""
+    """Maximum number of held-out views in the final evaluation, evenly spaced. Default: one per second of training, at
+    least 25; all without --max-seconds. The report states the number."""
     lpips_weights: Path | None = None
-    """File of weights of LPIPS with AlexNet (.npz); without it, the lpips package is looked for."""
+    """File of LPIPS weights with AlexNet (.npz). Default: those of the lpips package, if installed."""
     curve_images: int = 4
-    """Number of views of the evaluations during training; 0 for none."""
+    """Number of views in evaluations during training; 0: none."""
     num_threads: int | None = None
-    """CPU threads of each run; all cores if not given."""
+    """CPU threads of each run. Default: all cores."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on."""
     jobs: int = 1

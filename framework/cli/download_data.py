@@ -18,8 +18,8 @@ usage: ns-download-data NAME [--scenes SCENE ...] [--save-dir DIR] [flags]
 data sets:
 {table}
 
-Scenes are put into DIR/NAME/SCENE, data/blender/lego for example. Those that are there are not downloaded again, and a
-download that was interrupted goes on where it stopped. ns-download-data NAME --help shows the flags and the scenes.
+Scenes are put into DIR/NAME/SCENE, for example data/blender/lego. Existing scenes are not downloaded again, and an
+interrupted download continues. ns-download-data NAME --help shows the flags and the scenes.
 """
 
 
@@ -28,13 +28,13 @@ class DownloadFlags:
     """Download a public data set."""
 
     scenes: tuple[str, ...] = ()
-    """Scenes to put in place; all if not given. An archive that holds several is downloaded as a whole."""
+    """Scenes to install. Default: all. An archive of several scenes is downloaded as a whole."""
     save_dir: Path = Path("data")
     """Folder of the data sets."""
     archive: Path | None = None
-    """Zip file that was downloaded by hand, instead of downloading it."""
+    """Zip file to use instead of downloading it."""
     keep_archives: bool = False
-    """Keep the archives, in the folder .downloads of the save-dir, after they are unpacked."""
+    """Keep the archives after unpacking, in the folder .downloads of the save-dir."""
 
 
 def main() -> None:
@@ -56,7 +56,7 @@ def _command(arguments: list[str]) -> None:
     try:
         folders = install(name, dataset, flags.save_dir, flags.scenes, flags.archive, flags.keep_archives)
     except KeyboardInterrupt as stop:
-        note = "interrupted; the same command goes on where it stopped"
+        note = "interrupted; run the same command again to continue"
         raise Stopped(signal_of(stop), note) from None
     for folder in folders:
         print(folder)

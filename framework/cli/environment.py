@@ -19,7 +19,7 @@ VARIABLES = ("NERFLOOM_", "OMP_", "KMP_", "GOMP_", "MKL_", "CUDA_VISIBLE_DEVICES
 
 
 def environment() -> str:
-    """Return a table of the environment, one line per item; an item that cannot be determined says so."""
+    """Return a table of the environment, one line per item; unknown items give the reason."""
     rows: dict[str, Callable[[], str]] = {
         "nerfloom": _nerfloom,
         "Python": lambda: f"{platform.python_version()} ({platform.python_implementation()}), {sys.executable}",
@@ -37,7 +37,7 @@ def environment() -> str:
 
 
 def _said(value: Callable[[], str]) -> str:
-    """Return an item's text, or the reason why there is none: error reports often come from broken installations."""
+    """Return an item's text, or the error: reports often come from broken installations."""
     try:
         return value()
     except Exception as error:

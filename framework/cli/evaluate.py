@@ -19,26 +19,26 @@ class EvalFlags(RunFlags):
     """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views."""
 
     output_path: Path | None = None
-    """JSON file to write. If not given: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
+    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
-    """Maximum number of views with pictures in that folder, evenly spaced, besides worst.png; all if not given."""
+    """Maximum number of views with pictures in that folder, evenly spaced, besides worst.png. Default: all."""
     split: Literal["test", "val", "train"] = "test"
     """Split to evaluate."""
     max_images: int | None = None
-    """Maximum number of evaluated images, evenly spaced; all if not given."""
+    """Maximum number of evaluated images, evenly spaced. Default: all."""
     rays_per_pixel: RaysPerPixel | None = None
-    """Rays per pixel, of which its colour is the mean; the run's setting if not given."""
+    """Rays averaged per pixel. Default: the run's setting."""
     eval_appearance: Literal["mean", "half"] | None = None
-    """Appearance of held-out images. mean: the mean of the training images'. half: fitted to the left half of each,
-    with metrics of the right half (NeRF-W's protocol). The run's setting if not given."""
+    """Appearance of held-out images. mean: the mean of the training images'; half: fitted to the left half of each
+    image, with metrics of the right half (NeRF-W's protocol). Default: the run's setting."""
     lpips_weights: Path | None = None
-    """File of weights of LPIPS with AlexNet (.npz); the run's setting if not given."""
+    """File of LPIPS weights with AlexNet (.npz). Default: the run's setting."""
     max_error: str | None = None
-    """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
+    """End rays where the rest cannot change a colour by more than this, such as 1/255. Default: 1e-4."""
     round_to_uint8: bool = False
-    """Round colours to 8 bits before they are measured."""
+    """Round colours to 8 bits before computing metrics."""
 
 
 def main() -> None:
@@ -98,7 +98,7 @@ def _command(arguments: list[str]) -> None:
 
 
 def _beside(run: Path) -> Path:
-    """Return the file of the results of a run, by its settings, or of a file of Gaussians."""
+    """Return the default results file for a run's config.yml or a file of Gaussians."""
     return run.parent / "eval.json" if run.suffix == ".yml" else run.with_suffix(".eval.json")
 
 

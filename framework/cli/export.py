@@ -27,16 +27,16 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   gaussian-splat  splat.ply or splat.spz: the Gaussians of gaussian-splatting, for other programs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
-                  has refined them; transforms_train.json: those of training, as nerfstudio writes it
+                  refined them; transforms_train.json: the training cameras, in nerfstudio's format
   occupancy       occupancy.npz and occupancy.ply: the cells that the method samples, if it has a grid
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-A file of Gaussians (.ply, .spz, .splat) stands for a run: gaussian-splat and web need no data, the others --data DIR.
+Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): gaussian-splat and web need no data, others --data DIR.
 
   ns-export web splat.ply --output-dir exports
 
-ns-export WHAT --help shows its flags. Everything is written in the frame and units of the input.
+ns-export WHAT --help shows its flags. All files use the frame and units of the input.
 """
 
 
@@ -45,13 +45,13 @@ class PointFlags(ExportFlags):
     """Write point_cloud.ply: points at the median depth of random training rays."""
 
     num_points: int = 1_000_000
-    """Number of rays; rays that end on no surface, or too far away, give no point."""
+    """Number of rays; rays without a surface, or with one beyond --reach, give no point."""
     reach: float = 2.0
-    """Maximum distance of a point from the box's centre along each axis, in half edges of the box; 0 keeps all."""
+    """Maximum distance of a point from the box's centre along each axis, in half edges of the box; 0: no limit."""
     remove_outliers: bool = True
-    """Leave out points that are farther from their 20 nearest neighbours than --std-ratio allows."""
+    """Remove points that are farther from their 20 nearest neighbours than --std-ratio allows."""
     std_ratio: float = 2.0
-    """Standard deviations above the mean over all points beyond which a point is an outlier."""
+    """Distance of an outlier from its neighbours, in standard deviations above the mean over all points."""
     estimate_normals: bool = True
     """Estimate normals from each point's neighbours if the method has none."""
 
@@ -61,7 +61,7 @@ class CameraFlags(ExportFlags):
     """Write cameras as nerfstudio/transforms.json, colmap/sparse/0/*.txt, and transforms_train.json."""
 
     relative_paths: bool = False
-    """Name images relative to transforms.json instead of by absolute paths."""
+    """Write image paths relative to transforms.json instead of absolute paths."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,31 +69,31 @@ class OccupancyFlags(ExportFlags):
     """Write occupancy.npz, the occupancy grid, and occupancy.ply, its occupied cells."""
 
     cells: Literal["centers", "boxes"] = "centers"
-    """What occupancy.ply holds: the cells' centres, or the surface of their boxes."""
+    """Content of occupancy.ply: the cells' centres, or the surface of their boxes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFlags(ExportFlags):
-    """Write splat.ply or splat.spz: Gaussians, as the code of 3D Gaussian Splatting and viewers read them."""
+    """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
     format: Literal["ply", "spz"] = "ply"
-    """ply: 32 bits a number, read by every program. spz: 8 to 24 bits, compressed; about a tenth of the size."""
+    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth."""
     max_megabytes: float | None = None
-    """Make the file at most this large, in millions of bytes: fewer harmonics first, fewer Gaussians last."""
+    """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None
-    """Moment that is written of a scene that moves, 0 to 1; 0 if not given."""
+    """Time of a moving scene, 0 to 1. Default: 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WebFlags(ExportFlags):
-    """Write scene.html: a page that shows the scene's Gaussians, or such as are fitted to the pictures of a field."""
+    """Write scene.html: a page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field."""
 
     max_megabytes: float = 30.0
-    """Maximum size of the page in millions of bytes, up to 32: fewer harmonics first, fewer Gaussians last."""
+    """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians last."""
     fit_seconds: float = 60.0
-    """Seconds for fitting Gaussians to a field: rendering pictures of it, and training on them."""
+    """Seconds for fitting Gaussians to a field: rendering pictures of it and training on them."""
     time: float | None = None
-    """Moment that is shown of a scene that moves, 0 to 1; 0 if not given."""
+    """Time of a moving scene, 0 to 1. Default: 0."""
 
 
 def main() -> None:

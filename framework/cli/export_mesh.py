@@ -25,24 +25,23 @@ class MeshFlags(ExportFlags):
     """Flags of every mesh."""
 
     format: Literal["ply", "obj", "glb"] = "ply"
-    """Format of the file; ply is the smallest and fastest."""
+    """File format; ply is the smallest and fastest."""
     resolution: int = 256
     """Number of cells along the longest edge of the box, up to 1024."""
     bounding_box_min: tuple[float, float, float] | None = None
-    """Least corner x y z of the box that is searched, in the frame and units of the input; the scene's box if not
-    given."""
+    """Minimum corner x y z of the searched box, in the frame and units of the input. Default: the scene's box."""
     bounding_box_max: tuple[float, float, float] | None = None
-    """Greatest corner x y z of that box."""
+    """Maximum corner x y z of that box."""
     num_components: int = 0
-    """Keep at most this many separate pieces, the largest; 0 keeps all."""
+    """Maximum number of separate pieces to keep, largest first; 0: all."""
     min_component_share: float = 0.001
-    """Leave out pieces that have fewer faces than this fraction of those of the largest one."""
+    """Remove pieces with fewer faces than this fraction of the largest piece's."""
     target_num_faces: int | None = None
-    """Number of faces that the mesh is simplified to; it is not simplified if not given."""
+    """Simplify the mesh to this number of faces. Default: no simplification."""
     texture_size: int | None = None
-    """Edge of a texture in texels, such as 4096, for obj and glb; without it the vertices have the colours."""
+    """Edge length of a texture for obj and glb, texels, such as 4096. Default: no texture, colours at vertices."""
     texture_seconds: float = 300.0
-    """Time after which what is left of the texture gets the colours of the vertices."""
+    """Maximum seconds for the texture; the rest of it gets the vertices' colours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,19 +49,20 @@ class MarchingCubesFlags(MeshFlags):
     """Write a mesh of the surface where the density of a field passes a level, with colours and normals."""
 
     isosurface_threshold: float | None = None
-    """Density of the surface, per scene unit. If not given, that at which 1/32 of the scene's box is half opaque."""
+    """Density of the surface, per scene unit. Default: the density at which 1/32 of the scene's box is half opaque."""
     time: float = 0.0
-    """Time of a scene that moves, 0 to 1."""
+    """Time of a moving scene, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TsdfFlags(MeshFlags):
-    """Write a mesh of what the training cameras see: the surface that their depth images agree on; for every method."""
+    """Write a mesh of what the training cameras see, from their fused depth images; works with every method."""
 
     truncation: float = 4.0
-    """Distance from the surface up to which depth images count, in cells: more is smoother, less keeps thin parts."""
+    """Maximum distance from the surface at which depth images count, cells; larger is smoother, smaller keeps thin
+    parts."""
     max_num_views: int = 200
-    """Maximum number of training views that are rendered, evenly spaced."""
+    """Maximum number of rendered training views, evenly spaced."""
 
 
 def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> None:
@@ -121,7 +121,7 @@ def tsdf(flags: TsdfFlags, loaded: Loaded, path: Path) -> None:
 
 
 def _prepared(flags: MeshFlags, loaded: Loaded) -> tuple[Lattice, Cleaning, Texturing | None]:
-    """Return the lattice, what is kept and the texture, checked, and check that a mesh's packages are installed."""
+    """Return the lattice and the settings of cleaning and texture, after checks of flags and installed packages."""
     if (advice := install_command("export")) is not None:
         raise ConfigError(f"a mesh needs packages that are not installed: {advice}")
     from nerfloom.export.lattice import lattice_of

@@ -1,7 +1,7 @@
-"""Groups of flags in the help of `ns-train METHOD`: the everyday ones first, then by the class that declares them.
+"""Groups of flags in the help of `ns-train METHOD`: everyday flags first, then by declaring class.
 
-A flag's name does not depend on its group. Settings that a plugin declares are in the method's own group; settings that
-it inherits are in the same group as for every method.
+A flag's name does not depend on its group. Settings that a plugin declares are in the method's own group; inherited
+settings are in the same group as for every method.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from nerfloom.samplers.choice import HierarchicalConfig, SamplingConfig
 from nerfloom.scene.motion import MotionConfig
 
 EVERYDAY = "everyday"
-"""Title of the flags that `--help` shows; `--help-all` shows those of all groups."""
+"""Title of the group that `--help` shows; `--help-all` shows all groups."""
 OWN = "METHOD"
-"""Placeholder of the method's name, whose group has all settings that no other group has."""
+"""Placeholder of the method's name. Its group has all settings that are in no other group."""
 GROUPS: dict[str, tuple[str | type, ...]] = {
     EVERYDAY: (
         "data", "max_seconds", "max_num_iterations", "output_dir", "experiment_name", "rays_per_pixel", "background",
@@ -50,21 +50,21 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     "evaluation and saving": (TrainConfig,),
     "machine": ("cache_limit", "cache_dir", "mixed_precision", "machine", "viewer"),
 }  # fmt: skip
-"""Titles in their order, and what each group holds: settings by name, or all others of a class. The data format's
+"""Titles in order, and the content of each group: settings by name, or all other settings of a class. The data format's
 settings come last."""
 
 
 def grouped_flags(
     method: str, config: TrainConfig, data_format: str, parser: DataParser, everyday: bool = False
 ) -> ConstructorRegistry:
-    """Return rules with which tyro shows the flags of a method and of a data format in groups.
+    """Return tyro's rules that show the flags of a method and a data format in groups.
 
     Args:
         method: the method's name.
         config: the method's settings.
         data_format: the data format's name.
         parser: the data format with its settings.
-        everyday: whether the help shows the everyday flags alone.
+        everyday: whether the help shows only the everyday flags.
     """
     registry = plain_flags()
     groups = [(method if title == OWN else title, names) for title, names in groups_of(type(config))]
@@ -97,7 +97,7 @@ def groups_of(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
 def _divided(
     registry: ConstructorRegistry, settings: Any, groups: list[tuple[str, list[str]]], everyday: bool
 ) -> dict[type, StructConstructorSpec]:
-    """Return rules with which tyro treats a dataclass as a struct of groups, each a struct of some of its fields."""
+    """Return rules that make tyro treat a dataclass as a struct of groups, each a struct of some fields."""
     with registry:
         whole: Any = ConstructorRegistry.get_struct_spec(StructTypeInfo.make(type(settings), settings, False))
     unprefixed = tyro.conf.arg(prefix_name=False)

@@ -1,4 +1,4 @@
-"""Flags as tyro shows and reads them: without a None that says nothing, and with our errors instead of tyro's."""
+"""Rules for tyro's flags: no uninformative None in the help, and our errors instead of tyro's."""
 
 from __future__ import annotations
 
@@ -17,17 +17,11 @@ DECIDED = "(default: decided by the data)"
 
 
 class RefusedSettings(Exception):
-    """Settings whose values cannot be.
-
-    It is no ValueError, which tyro would put into a box.
-    """
+    """Invalid values of settings. Not a ValueError, which tyro would print in a box."""
 
 
 def plain_flags() -> ConstructorRegistry:
-    """Return rules with which tyro shows the flags of every dataclass plainly.
-
-    With these rules `tyro.cli` raises RefusedSettings where settings raise ConfigError.
-    """
+    """Return rules for plain help. With them `tyro.cli` raises RefusedSettings where settings raise ConfigError."""
     registry = ConstructorRegistry()
     registry.struct_rule(_amended(ConstructorRegistry.get_struct_spec, _plain))
     registry.primitive_rule(_amended(ConstructorRegistry.get_primitive_spec, _without_none))
@@ -51,7 +45,7 @@ def _amended(answer: Callable[[Any], Any], amend: Callable[[Any, Any], Any]) -> 
 
 
 def _plain(info: Any, spec: StructConstructorSpec | None) -> StructConstructorSpec | None:
-    """Return the flags of a dataclass, with what is shown of their defaults."""
+    """Return the flags of a dataclass with their help text."""
     if not dataclasses.is_dataclass(info.type) or not isinstance(spec, StructConstructorSpec):
         return spec
 
@@ -66,7 +60,7 @@ def _plain(info: Any, spec: StructConstructorSpec | None) -> StructConstructorSp
 
 
 def _plain_field(field: StructFieldSpec) -> StructFieldSpec:
-    """Return a field whose text has no line breaks of the source, and whose default is shown if it says something."""
+    """Return a field with its help text on one line, and its default if informative."""
     is_open = field.default == AUTO and LEFT_TO_DATA in getattr(field.type, "__metadata__", ())
     shown: Any = Annotated[field.type, tyro.conf.arg(help_behavior_hint=DECIDED if is_open else _default)]
     return dataclasses.replace(field, type=shown, helptext=lambda: _on_one_line(field.helptext))
@@ -78,12 +72,12 @@ def _on_one_line(text: str | Callable[[], str | None] | None) -> str | None:
 
 
 def _default(label: str) -> str:
-    """Return what is shown of a default. Of None and of nothing, the text says what happens."""
+    """Return the text for a default; empty for None and empty values, which the help text explains."""
     return "" if label in ("None", "") else f"(default: {label})"
 
 
 def _without_none(info: Any, spec: Any) -> Any:
-    """Return how a value is read, whose kind is shown without the None that the flag also takes."""
+    """Return a specification whose help omits the None that the flag also takes."""
     if not isinstance(spec, PrimitiveConstructorSpec) or type(None) not in get_args(info.type):
         return spec
     return dataclasses.replace(spec, metavar=spec.metavar.removeprefix("{None}|").replace("{None,", "{"))

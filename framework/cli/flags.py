@@ -1,4 +1,4 @@
-"""The flags of all commands: tyro reads them, and what is wrong with them is said in one line."""
+"""The flags of all commands: read by tyro, with one-line errors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any
 from nerfloom.base.errors import FlagError
 
 HELP = ("-h", "--help", "--help-all")
-"""Flags that ask for the help of any command. `ns-train METHOD` has so many flags that --help leaves some out."""
+"""Flags that ask for help. --help of `ns-train METHOD` shows only the everyday flags, --help-all shows all."""
 FRAME = "╭╮╰╯│─"
-"""What tyro draws boxes and rules with, unless the terminal has only ASCII."""
+"""Characters of tyro's boxes and rules, unless the terminal has only ASCII."""
 EDGE = re.compile("^[╭│ ][─ ]")
 STYLE = re.compile(r"\033\[[\d;]*m")
 NAME = re.compile(r" {4}(--[\w.-]+)")
-"""A flag in tyro's list of those that are missing, or that may have been meant."""
+"""A flag in tyro's list of missing or suggested flags."""
 PHRASES = (
     (
         r"(--\S+): no type matching (?:\{None\}\|)?(\S+) could be instantiated from \['(.*)'\]",
@@ -31,21 +31,21 @@ PHRASES = (
     (r"invalid choice ('.*') for argument '(--\S+)'\. Expected one of \((.*)\)", r"\2 is \1; it must be one of \3"),
     (r"Missing value for argument '(?:\(')?(--[\w.-]+).*", r"\1 needs a value"),  # tyro 1.0 writes ('--flag',)
 )
-"""What tyro says of a value, and how it is said here."""
+"""Pattern of tyro's message about a value -> our message."""
 
 
 def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **options: Any) -> Any:
-    """Return settings that are read from the arguments of a command.
+    """Read settings from the arguments of a command.
 
     Args:
         kind: the class of the settings, or several joined by `|`.
-        prog: the command with what it does, for its help: "ns-render orbit".
-        arguments: the arguments, without what `prog` names.
-        takes: what stands before the flags, for the help: "RUN_FOLDER".
-        options: further arguments of `tyro.cli`. Flags of booleans have a value if `config` is not among them.
+        prog: the command for its help, such as "ns-render orbit".
+        arguments: the arguments after `prog`.
+        takes: positional arguments for the help, such as "RUN_FOLDER".
+        options: further arguments of `tyro.cli`. Without `config`, boolean flags take a value.
 
     Raises:
-        FlagError: if a flag is unknown, missing, or has a value that it cannot have.
+        FlagError: if a flag is unknown, missing, or has an invalid value.
         SystemExit: with status 0 after the help.
     """
     import tyro
@@ -69,7 +69,7 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
 
 
 def in_one_line(box: str, prog: str) -> str:
-    """Return what tyro says in a framed box, as one line: what is wrong, and where to look.
+    """Return tyro's error box as one line: what is wrong, and where to look.
 
     Args:
         box: the text of the box: a title, and sections between rules.
@@ -93,7 +93,7 @@ def in_one_line(box: str, prog: str) -> str:
 
 
 def _unknown(words: list[str]) -> str:
-    """Return the words that nothing knows, of which some may be values of an unknown flag."""
+    """Return a message about unknown words; some may be values of an unknown flag."""
     flags = [word for word in words if word.startswith("-")]
     return f"unknown flag {', '.join(flags)}" if flags else f"unexpected argument {', '.join(map(repr, words))}"
 

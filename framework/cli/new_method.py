@@ -1,4 +1,4 @@
-"""The command `ns-new-method`: a new package with a small, working method, to be changed."""
+"""The command `ns-new-method`: a new package with a small, working method as a starting point."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ SUFFIX = ".template"
 USAGE = """\
 usage: ns-new-method NAME [--dir DIR]
 
-Writes a package with a small, working method into the folder NAME, or DIR: one file with the method, which you change,
-its tests, and the package's description for pip. NAME, such as my-method, is the method's name for ns-train.
+Writes a package with a small, working method into the folder NAME, or DIR: one file with the method, for you to change,
+its tests, and a pyproject.toml for pip. NAME, such as my-method, is the method's name for ns-train.
 """
 
 
 @dataclass(frozen=True)
 class NewMethodFlags:
-    """Write a package with a small, working method, to be changed."""
+    """Write a package with a small, working method as a starting point."""
 
     dir: Path | None = None
-    """Folder to write, new or empty; the method's name if not given."""
+    """Folder to write, new or empty. Default: the method's name."""
 
 
 def main() -> None:
@@ -64,16 +64,16 @@ def check_name(name: str) -> None:
         ConfigError: if it is invalid or taken.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
-        raise ConfigError(f"'{name}' is no method's name: lowercase letters, digits and single dashes, as my-method")
+        raise ConfigError(f"'{name}' is invalid: use lowercase letters, digits and single dashes, as in my-method")
     if name in registered("methods"):
-        raise ConfigError(f"there is a method '{name}' already; choose another name")
+        raise ConfigError(f"the method '{name}' already exists; choose another name")
     module = module_of(name)
     if keyword.iskeyword(module) or importlib.util.find_spec(module) is not None:
         raise ConfigError(f"the method's module would be '{module}', which is taken already; choose another name")
 
 
 def module_of(name: str) -> str:
-    """Return the name of a method's Python module; of `name` my-method, my_method."""
+    """Return the name of a method's Python module: my_method for the `name` my-method."""
     return name.replace("-", "_")
 
 
@@ -103,7 +103,7 @@ def write_package(name: str, folder: Path) -> None:
         ConfigError: if the folder is not empty or cannot be written.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{folder} is there already, and nothing is overwritten; choose another --dir")
+        raise ConfigError(f"{folder} already exists and is not overwritten; choose another --dir")
     try:
         for relative, content in package_of(name).items():
             path = folder / relative

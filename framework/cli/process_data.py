@@ -21,7 +21,7 @@ usage: ns-process-data KIND --data IN --output-dir OUT [flags]
 kinds:
   images          a folder of images; COLMAP estimates their poses
   video           a video; COLMAP estimates the poses of its sharpest frames
-                  (each of the two takes what the other does, and says so)
+                  (either kind accepts the other's input, and says so)
   polycam         Polycam's raw export, with the phone's poses
   record3d        Record3D's export with EXR and RGBD, with the phone's poses
 
@@ -34,7 +34,7 @@ class ImagesFlags(ColmapFlags):
     """Estimate the poses of the images in a folder and its subfolders."""
 
     masks_dir: Path | None = None
-    """Folder of masks with the images' names; black pixels are used neither for poses nor for training."""
+    """Folder of masks with the images' names; black pixels are ignored for poses and training."""
 
     def check(self) -> None:
         super().check()
@@ -49,7 +49,7 @@ class VideoFlags(ColmapFlags):
     """Estimate the poses of the sharpest frames of a video."""
 
     num_frames_target: int = 300
-    """Number of frames to take, the sharpest of each of as many intervals of equal duration."""
+    """Number of frames to take. The video is split into this many equal intervals; each gives its sharpest frame."""
 
     def check(self) -> None:
         super().check()
@@ -82,7 +82,7 @@ class PolycamFlags(PhoneFlags):
     min_blur_score: float = 25.0
     """Minimum score of sharpness, from Polycam; images with a lower score are omitted."""
     crop_border_pixels: int = 15
-    """Pixels to cut off at each side, as Polycam's images may have a black border."""
+    """Pixels to crop at each side, since Polycam's images may have a black border."""
 
     def check(self) -> None:
         super().check()
@@ -121,15 +121,15 @@ def _command(arguments: list[str]) -> None:
     try:
         _process(flags)
     except KeyboardInterrupt as stop:
-        kept = "features and matches are kept: --resume goes on, " if isinstance(flags, ColmapFlags) else ""
-        note = f"interrupted; {flags.output_dir} is unfinished, {kept}--overwrite begins again"
+        kept = "--resume continues with the features and matches so far, " if isinstance(flags, ColmapFlags) else ""
+        note = f"interrupted; {flags.output_dir} is unfinished; {kept}--overwrite starts again"
         raise Stopped(signal_of(stop), note) from None
 
 
 def _what_it_is(name: str, words: list[str]) -> tuple[str, list[str]] | None:
-    """Return the other kind and its arguments if --data is a video where images are named, or the other way round.
+    """Return the other kind and its arguments if the kind is images and --data a video, or the reverse.
 
-    A folder without images but with one video stands for the video.
+    A folder with one video and no images counts as the video.
     """
     words = [part for word in words for part in (word.split("=", 1) if word.startswith("--data=") else [word])]
     given = [index for index, word in enumerate(words[:-1]) if word == "--data"]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from nerfloom.training.splat_files import DataFormat
 
 NUMBERS = ("distance", "scalar")
-"""Kinds of outputs that are shown in the colours of a range."""
+"""Kinds of outputs shown with a colour map."""
 
 
 def main() -> None:
@@ -118,7 +118,7 @@ def _views(flags: Flags, loaded: Loaded) -> Views:
 
 
 def _facts(name: str, flags: Flags, loaded: Loaded, views: Views) -> dict[str, Any]:
-    """Return everything that the pictures depend on, as plain data."""
+    """Return everything that determines the pictures, as plain data."""
     from nerfloom.base.config import to_plain
     from nerfloom.evaluation.frames import hash_of_file, hash_of_tensors
 
@@ -163,7 +163,7 @@ def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
 def _write(
     flags: Flags, frames: Frames, output: Path, views: Views, facts: dict[str, Any], outputs: Sequence[Output]
 ) -> None:
-    """Write the files that were asked for, and say where they are."""
+    """Write the requested files, and print their paths."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.frames import FACTS, write_file
     from nerfloom.evaluation.outputs import shown_output, side_by_side
@@ -201,7 +201,7 @@ def _write(
 
 
 def _colored_range(flags: Flags, frames: Frames, name: str, kind: str) -> tuple[float, float]:
-    """Return the numbers at the ends of the colours of an output, and say them; flags set those of distances."""
+    """Return and print the values at the ends of an output's colour map; flags set the range of distances."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.outputs import distance_range
 
@@ -215,7 +215,7 @@ def _colored_range(flags: Flags, frames: Frames, name: str, kind: str) -> tuple[
 
 
 def _write_depths(flags: Flags, frames: Frames, folder: Path, stems: Sequence[str], name: str) -> None:
-    """Write distances as numbers, and beside them what they mean."""
+    """Write distances as numbers, with depth.json, which gives their unit."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.frames import write_file
     from nerfloom.evaluation.outputs import largest_distance, opaque_distance

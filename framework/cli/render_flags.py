@@ -1,4 +1,4 @@
-"""Flags of `ns-render`, in groups; without torch, so that the help comes at once."""
+"""Flags of `ns-render`, in groups. This module does not import torch, so that the help is fast."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
 
 paths:
   interpolate     for captures: a smooth walk past the photographs' cameras, in the order of their names
-  orbit           around what the photographs look at: a circle as high and as far as the cameras on average
+  orbit           around what the photographs look at: a circle with the cameras' mean height and distance
   spiral          for cameras that all look the same way: a spiral in front of what they see
   time            for scenes that move: one camera, while time runs from 0 to 1
   camera-path     the cameras of a file: camera_path.json, as ns-viewer and nerfstudio's viewer write it
-  dataset         the held-out photographs and their renders, one image each; --split train: those of training
+  dataset         the held-out photographs and their renders, one image each; or another split, --split train
 
   ns-render interpolate RUN_FOLDER --output-path walk.mp4
 
-A file of Gaussians (.ply, .spz, .splat) stands for a run: orbit and camera-path need no data, the others
+Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): orbit and camera-path need no data, others
 --data DIR [FORMAT [format flags]], as in
 
   ns-render orbit splat.ply --output-path orbit.mp4
@@ -38,32 +38,32 @@ class ViewFlags:
     """Outputs of a view, and their colours."""
 
     rendered_output_names: tuple[str, ...] = ("rgb",)
-    """What is shown, from left to right. rgb: colours; depth: mean distance; median_depth: distance at which half of
-    the light is stopped; accumulation: opacity; what the method has besides, such as normals: directions of surfaces;
-    with 'dataset' also gt-rgb, the photograph, and error, the difference from it."""
+    """Outputs, from left to right. rgb: colour; depth: mean distance; median_depth: distance at which half of the light
+    is absorbed; accumulation: opacity; outputs of the method, such as normals; with 'dataset' also gt-rgb: the
+    photograph, and error: the difference from it."""
     depth_near_plane: float | None = None
-    """Distance at the dark end of the colours of depth, units of the input; found in all frames if not given."""
+    """Distance at the dark end of the depth colours, units of the input. Default: from all frames."""
     depth_far_plane: float | None = None
-    """Distance at the light end, and the largest in 16-bit files; found in all frames if not given."""
+    """Distance at the light end, and the largest in 16-bit files. Default: from all frames."""
     downscale_factor: int = 1
-    """Integer factor by which width and height are reduced."""
+    """Divide width and height by this integer."""
     rays_per_pixel: RaysPerPixel | None = None
-    """Rays per pixel, of which its colour is the mean; the run's setting if not given."""
+    """Rays averaged per pixel. Default: the run's setting."""
     max_error: str | None = None
-    """Maximum error of a colour, such as 1/255: rays end where the rest cannot change it by more; 1e-4 if not given."""
+    """End rays where the rest cannot change a colour by more than this, such as 1/255. Default: 1e-4."""
 
 
 @dataclass(frozen=True)
 class FileFlags:
-    """Files that are written."""
+    """Output files."""
 
     apart: bool | None = None
-    """Write each output to a file or folder of its own, not side by side; only 'dataset' does so if not given."""
+    """Write each output to its own file or folder instead of side by side. Default: only for images of 'dataset'."""
     image_format: Literal["png", "jpeg"] = "png"
-    """Format of the images of a folder."""
+    """Image format in a folder."""
     depth_format: Literal["color", "png16", "npy"] = "color"
-    """Depth in a folder: colours, 16-bit PNG (with the unit in a depth.json) or float32 .npy; distances along the ray
-    in units of the input, 0 where nothing is seen."""
+    """Depth in a folder: colours, 16-bit PNG (depth.json gives the unit) or float32 .npy; distances along the ray in
+    units of the input, 0 where nothing is seen."""
 
 
 @dataclass(frozen=True)
@@ -75,21 +75,21 @@ class PathFlags:
     outputs: ViewFlags = field(default_factory=ViewFlags)
     """Outputs of a view, and their colours."""
     files: FileFlags = field(default_factory=FileFlags)
-    """Files that are written."""
+    """Output files."""
 
 
 @dataclass(frozen=True)
 class CameraPathFlags(PathFlags):
-    """Render the cameras of a file, camera_path.json, as nerfstudio's viewer writes it."""
+    """Render the cameras of a file, camera_path.json, in the format of nerfstudio's viewer."""
 
     camera_path_filename: Path = Path("camera_path.json")
-    """File of the cameras, in the frame of the scene, as the data format has placed it."""
+    """File of the cameras, in the scene's frame as the data format places it."""
     dataparser_transforms: Path | None = None
-    """dataparser_transforms.json of the run that the path was made with, if it placed the same input in another way."""
+    """dataparser_transforms.json of the path's run, if that run placed the same input differently."""
     output_path: Path = Path("camera_path.gif")
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
     fps: float | None = None
-    """Frames per second; the file's if not given."""
+    """Frames per second. Default: the file's."""
 
 
 @dataclass(frozen=True)
@@ -115,14 +115,14 @@ class SpiralFlags(PathFlags):
     fps: float = 24.0
     """Frames per second."""
     radius: float | None = None
-    """Radius along each axis of the camera, scene units; from the spread of the cameras if not given."""
+    """Radius along each axis of the camera, scene units. Default: from the spread of the cameras."""
 
 
 @dataclass(frozen=True)
 class OrbitFlags(PathFlags):
     """Render a horizontal circle around the scene, with the mean height and distance of the training cameras.
 
-    Around a capture it goes as far as the photographs do, there and back if they leave out a sixth or more.
+    If the photographs of a capture leave out a sixth of the circle or more, the path swings over their part and back.
     """
 
     output_path: Path = Path("orbit.gif")
@@ -132,9 +132,9 @@ class OrbitFlags(PathFlags):
     fps: float = 16.0
     """Frames per second."""
     full_circle: bool = False
-    """Whether to go all around a capture also where its photographs do not. If not: a swing there and back."""
+    """Render the full circle around a capture even where photographs are missing, instead of a swing and back."""
     time: float | None = None
-    """Time of all frames of a scene that moves, 0 to 1. If not given, it runs from 0 to 1."""
+    """Time of all frames of a moving scene, 0 to 1. Default: runs from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -142,16 +142,16 @@ class TimeFlags(PathFlags):
     """Render the view of one camera while time runs from 0 to 1."""
 
     output_path: Path = Path("time.gif")
-    """File to write: a video or an animation (.mp4, .gif, .webp), or the frames side by side (.png). Without extension:
-    a folder of images."""
+    """File to write: a video or animation (.mp4, .gif, .webp), or the frames side by side (.png). Without extension: a
+    folder of images."""
     num_frames: int = 32
     """Number of frames."""
     fps: float = 16.0
     """Frames per second."""
     split: Literal["train", "val", "test"] = "test"
-    """Split of which --camera-index counts the cameras."""
+    """Split of the camera."""
     camera_index: int = 0
-    """Index of the camera, from 0."""
+    """Index of the camera in the split, from 0."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class DatasetFlags(PathFlags):
     outputs: ViewFlags = field(default_factory=lambda: ViewFlags(rendered_output_names=("rgb", "gt-rgb")))
     """Outputs of a view, and their colours."""
     output_path: Path = Path("renders")
-    """Folder to write to; or a video (.mp4, .gif, .webp, .png), if all images are of one size."""
+    """Folder to write to, or a video (.mp4, .gif, .webp, .png) if all images have the same size."""
     fps: float = 4.0
     """Frames per second of a video."""
     split: Literal["train", "val", "test"] = "test"
@@ -196,7 +196,7 @@ def check_flags(flags: Flags) -> None:
     if not outputs or len(set(outputs)) < len(outputs):
         raise FlagError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
     if not isinstance(flags, DatasetFlags) and (unknown := {"error", "gt-rgb"} & set(outputs)):
-        raise FlagError(f"--rendered-output-names {min(unknown)}: the true image is known to 'ns-render dataset' alone")
+        raise FlagError(f"--rendered-output-names {min(unknown)}: only 'ns-render dataset' has true images")
     if isinstance(flags, SpiralFlags) and flags.radius is not None and not 0 < flags.radius < 1e9:
         raise FlagError(f"--radius is {flags.radius:g}; it must be above zero")
     near, far = shown.depth_near_plane, shown.depth_far_plane

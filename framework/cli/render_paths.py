@@ -46,7 +46,7 @@ from nerfloom.training.loaded import Loaded
 
 @dataclass(frozen=True)
 class Views:
-    """F views to render, and what is known of them."""
+    """F views to render."""
 
     cameras: Cameras
     """F cameras at their final size, on the model's device."""
@@ -61,7 +61,7 @@ class Views:
 
 
 def camera_path_views(flags: CameraPathFlags, loaded: Loaded) -> Views:
-    """Return the views of a camera path's file, which needs no data.
+    """Return the views of a camera path file; this needs no data.
 
     Args:
         flags: flags of the path.
@@ -87,7 +87,7 @@ def camera_path_views(flags: CameraPathFlags, loaded: Loaded) -> Views:
 
 
 def path_views(flags: InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags, loaded: Loaded) -> Views:
-    """Return the views of a path that is made of the cameras of the data.
+    """Return the views of a path that follows from the data's cameras.
 
     Args:
         flags: flags of the path.
@@ -129,10 +129,10 @@ def _circle(flags: OrbitFlags, loaded: Loaded, parsed: ParsedScene) -> tuple[Cam
     scene = loaded.model.scene
     if scene.warped:
         raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
-    # The middle of the box is an object's; a capture's is what it looks at.
+    # An object's centre is the box's; a capture's is the point that its cameras look at.
     middle = looked_at(parsed.cameras.camera_to_worlds) if scene.unbounded else None
     middle = scene.box.mean(0).cpu() if middle is None else middle.float()
-    # An object hides nothing of its surroundings; of a capture's, only what photographs look past is known.
+    # Around an object all directions are rendered; a capture is known only in the directions of its photographs.
     arc = arc_of(parsed.cameras, middle) if scene.unbounded and not flags.full_circle else None
     if arc is not None:
         around = f"the photographs go around {math.degrees(arc.width):.0f} of 360 degrees"
@@ -148,7 +148,7 @@ def _circle(flags: OrbitFlags, loaded: Loaded, parsed: ParsedScene) -> tuple[Cam
 
 
 def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
-    """Return a smooth path past the cameras in the order of their images' names, and say where it jumps.
+    """Return a smooth path past the cameras in the order of their images' names, and report jumps.
 
     Args:
         parsed: the photographs.
@@ -158,10 +158,10 @@ def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
     cameras = parsed.cameras[torch.tensor(order)]
     parts = stretches(cameras)
     if left := len(cameras) - sum(map(len, parts)):
-        say(f"{left} of {len(cameras)} photographs stand apart from those before and after them, and are not passed")
+        say(f"the path leaves out {left} of {len(cameras)} photographs, which are far from those before and after them")
     if jumps := len(parts) - 1:
         times = "once" if jumps == 1 else f"{jumps} times"
-        say(f"the photographs' walk jumps {times}; there the path jumps too, like a cut in a film")
+        say(f"the photographs' walk jumps {times}, and so does the path, like a cut in a film")
     return interpolate(cameras, num_frames)
 
 

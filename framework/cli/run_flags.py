@@ -1,4 +1,4 @@
-"""Flags of every command that opens something to look at: a trained run or a file of Gaussians."""
+"""Flags of every command that opens a trained run or a file of Gaussians."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from nerfloom.training.loaded import Loaded
 
 OPENS = "RUN_FOLDER or FILE"
-"""What such a command takes before its flags, for its help."""
+"""Positional argument of such a command, for its help."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,19 +20,19 @@ class RunFlags:
     """The trained run, or the file of Gaussians."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat); the
-    flag's name may be left out."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat). The
+    flag's name may be omitted."""
     load_checkpoint: Path | None = None
-    """Checkpoint to load; the newest if not given."""
+    """Checkpoint to load. Default: the newest."""
     data: Path | None = None
-    """Folder of the data, if it has moved since training; that of a file of Gaussians, which may have none."""
+    """Folder of the data, if it has moved since training; optional data for a file of Gaussians."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Axis of a file of Gaussians without data that points up, as in --up=-y; z if not given."""
+    """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
 
     def check(self) -> Path:
-        """Return the config.yml of the run, or the file of Gaussians, after a look at what is there, without torch.
+        """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
 
         Raises:
             ConfigError, CheckpointError, DataError: if something is missing.
@@ -40,7 +40,7 @@ class RunFlags:
         return trained_run(self.load_config, self.load_checkpoint, self.data)
 
     def load(self, found: Path, **others: Any) -> Loaded:
-        """Load what `check` has found.
+        """Load the run or the file that `check` has found.
 
         Args:
             found: the result of `check`.

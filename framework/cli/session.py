@@ -36,9 +36,9 @@ from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 
 PICTURES = 4
-"""Maximum number of held-out views of which images are written at the end."""
+"""Maximum number of held-out views whose pictures are written at the end."""
 FEW_PIXELS = 16
-"""Longer side of the images, pixels, below which a warning is printed."""
+"""Warn if the images' longer side is shorter than this, pixels."""
 
 
 def start(run: Run) -> None:
@@ -48,7 +48,7 @@ def start(run: Run) -> None:
         Stopped: if a signal ends it; the message says what was saved.
     """
     with joined_processes() as several:
-        run = replace(run, folder=Path(from_first(str(run.folder))))  # it is named by the time
+        run = replace(run, folder=Path(from_first(str(run.folder))))  # its name contains the time
         trainer = _prepare(run)
         run = replace(run, config=trainer.config)  # with open settings filled in
         if not several.first:
@@ -94,7 +94,7 @@ def _prepare(run: Run) -> Trainer:
         threads = torch.get_num_threads()
         say(f"{processes().count} processes with batches of their own; CPU threads of each: {threads}")
         if device.type == "cpu" and processes().local_count > 1:
-            say("note: on the cores of one CPU, several processes learn more slowly than one (docs/benchmarks.md)")
+            say("note: on one CPU, several processes learn more slowly than one (docs/benchmarks.md)")
     if images is not None:
         say(images)
     trainer = Trainer.of(run, train_set, eval_set)
@@ -102,44 +102,44 @@ def _prepare(run: Run) -> Trainer:
     for line in trainer.profile.lines():
         say(line)
     if train_set.scene.image_size < FEW_PIXELS:
-        say(f"warning: images of {train_set.scene.image_size} pixels show next to nothing; are they thumbnails?")
+        say(f"warning: images of {train_set.scene.image_size} pixels are too small to learn from; are they thumbnails?")
     by_images = isinstance(trainer.model, StartsFromImages)
     say(f"{'' if by_images else f'{trainer.model.size():,} parameters; '}writing to {run.folder}")
     return trainer
 
 
 def _held_out(run: Run, device: torch.device, most: int | None = None) -> Dataset | None:
-    """Return the held-out images that are looked at during training, or at `most` so many of them; None without any."""
+    """Return the held-out images for evaluations during training, at most `most`; None if there are none."""
     found = first_split(run, ("val", "test"), most)
     return None if found is None else found.to(device, with_pixels=False)
 
 
 def _follow(trainer: Trainer) -> None:
-    """Train along with the first process, which alone writes and evaluates."""
+    """Train together with the first process. Only the first process writes and evaluates."""
     stopped_by = _train(trainer).stopped_by
     if stopped_by is not None:
         raise Stopped(stopped_by)
 
 
 def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outcome:
-    """Train. If another process ends after the first step, save what there is, and say how to continue."""
+    """Train. If another process ends after the first step, save, and say how to continue."""
     try:
         return trainer.train(between_steps)
     except LostProcessError as error:
         if trainer.state.step == 0:
             raise
         if processes().first:
-            with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it when a process has ended
+            with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it after a process has ended
                 trainer.save()
         where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.folder}"
         raise LostProcessError(f"{where}: {error}; continue with: {command}") from error
 
 
 def _finish(run: Run, trainer: Trainer) -> None:
-    # Also when a run is resumed, as it may have been killed before.
+    # Also for a resumed run, which may have been killed before writing it.
     write_transforms(run, trainer.train_set)
     profile = run.folder / "scene_profile.json"
-    if trainer.first_step == 0 or not profile.exists():  # a resumed run has no open settings left, and keeps its own
+    if trainer.first_step == 0 or not profile.exists():  # a resumed run has no open settings, and keeps its profile
         write_report(profile, trainer.profile.as_plain())
     with _noted_stop(lambda: _saved_note(run)), _viewer(run, trainer) as between_steps:
         outcome = _train(trainer, between_steps)
@@ -167,7 +167,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
 
 
 def _count(model: HasGaussians) -> str:
-    """Return how many Gaussians a model has, and how many of them are not finite and never drawn."""
+    """Return a line with the number of Gaussians, and of those that are not finite and never drawn."""
     gaussians = model.gaussians()
     bad = len(gaussians) - int(gaussians.finite().sum())
     return f"{len(gaussians):,} Gaussians" + (f", {bad:,} of them not finite and never drawn" if bad else "")
@@ -177,7 +177,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     test_set = first_split(run, ("test", "val"))
     if test_set is None or run.config.max_eval_images == 0:
         return
-    say(f"evaluating held-out images, first those with pictures, which are in {run.folder / 'pictures'}")
+    say(f"evaluating held-out images; the first ones are written to {run.folder / 'pictures'}")
     evaluation = evaluate(
         trainer.model,
         test_set.to(trainer.device, with_pixels=False),
@@ -200,7 +200,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
 
 
 def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:
-    """Open the viewer of a run in training, if it is asked for."""
+    """Open the viewer of a run in training, if configured."""
     if "viewer" not in trainer.config.vis:
         return nullcontext()
     from nerfloom.viewer.training_viewer import training_viewer
@@ -218,8 +218,8 @@ def _noted_stop(note: Callable[[], str]) -> Iterator[None]:
 
 
 def _saved_note(run: Run) -> str:
-    """Return a line that says which checkpoint an interrupted run has saved."""
+    """Return a line that names the checkpoint of an interrupted run."""
     saved = list_checkpoints(run.folder / FOLDER)
     if not saved:
         return "stopped at once: nothing was saved"
-    return f"stopped at once: {saved[-1].name} is what was saved; continue with: ns-train --resume {run.folder}"
+    return f"stopped at once: the last checkpoint is {saved[-1].name}; continue with: ns-train --resume {run.folder}"

@@ -24,7 +24,7 @@ USAGE = """\
 usage: ns-stress METHOD [METHOD ...] [--data DIR] [flags]
        ns-stress all [--data DIR] [flags]
 
-METHOD is a registered method, in quotes if with flags of its own: "vanilla-nerf --sampler occupancy"; all is every
+METHOD is a registered method; quote a method with flags: "vanilla-nerf --sampler occupancy". all stands for every
 registered method. Each is trained for a short time, on a ball rendered in memory or on a few images of --data DIR,
 first without a condition (plain) and then under each of
 
@@ -35,8 +35,8 @@ first without a condition (plain) and then under each of
   training                    another-seed learning-rate-x10 float32 bfloat16 float16 1-ray 8192-rays
   invalid data                nan-pixels inf-pixels nan-pose
 
-The outcome of each is pass, degraded (the PSNR is lower than that without a condition by more than is allowed), refused
-(with a clear error, as it should) or fail. The exit status is 1 if one fails. ns-stress METHOD --help shows the flags.
+The outcome of each is pass, degraded (the PSNR drops by more than allowed, compared with plain), refused (with a clear
+error, as it should) or fail. The exit status is 1 if one fails. ns-stress METHOD --help shows the flags.
 """
 
 
@@ -45,17 +45,17 @@ class StressFlags:
     """Train methods on hard scenes and under hard conditions; report where they pass, degrade or fail."""
 
     data: Path | None = None
-    """Folder of a data set, of which a few images are used, reduced; a ball rendered in memory if not given."""
+    """Folder of a data set; a few downscaled images are used. Default: a ball rendered in memory."""
     data_flags: str = ""
-    """Flags of the data format, in quotes after an "=": --data-flags="--downscale-factor 2"."""
+    """Flags of the data format, quoted after an "=": --data-flags="--downscale-factor 2"."""
     only: tuple[str, ...] = ()
-    """Conditions, as listed by ns-stress --help; all if not given. The plain run is always made."""
+    """Conditions, as listed by ns-stress --help. Default: all. The plain run always takes place."""
     max_num_iterations: int = 300
     """Training steps under each condition."""
     max_seconds: float | None = 30.0
-    """Maximum seconds of training under each condition; None for no limit."""
+    """Maximum seconds of training under each condition; None: no limit."""
     output_path: Path | None = None
-    """JSON file to write, with a .md beside it; if not given, outputs/stress-DATA/METHOD.json, or methods.json."""
+    """JSON file to write, with a .md beside it. Default: outputs/stress-DATA/METHOD.json, or methods.json."""
 
 
 def main() -> None:
@@ -84,7 +84,7 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
     The JSON file is written after each condition, so that earlier outcomes survive the end of the process.
 
     Args:
-        methods: names of the methods, each followed by flags of its own, if any.
+        methods: names of the methods, each optionally followed by its flags.
         flags: the flags of the command.
 
     Returns:
@@ -135,7 +135,7 @@ def _run(method: str, flags: StressFlags) -> Run:
     data = [] if flags.data is None else ["--data", str(flags.data)]
     run = run_of(words[0], [*words[1:], *data, *data_flags])
     if run.config.data != flags.data:
-        raise ConfigError(f"{method}: --data stands behind the methods, for all of them get the same photographs")
+        raise ConfigError(f"{method}: put --data after the methods; all methods use the same photographs")
     return run
 
 
@@ -149,7 +149,7 @@ def _conditions(flags: StressFlags) -> list[Condition]:
         return selected
     left_out = [condition.name for condition in selected if condition.ball_only]
     if left_out:
-        say(f"left out, for they need pictures that only the ball has: {', '.join(left_out)}")
+        say(f"left out, since they need pictures of the ball: {', '.join(left_out)}")
     return [condition for condition in selected if not condition.ball_only]
 
 
@@ -201,7 +201,7 @@ def _print(results: Sequence[Result]) -> None:
     head, *rows = table(results)
     grid = Table()
     for name in head:
-        grid.add_column(Text(name))  # as text, as brackets in a string would be taken for markup
+        grid.add_column(Text(name))  # rich would parse brackets in a string as markup
     for row in rows:
         grid.add_row(*map(Text, row))
     console.print(grid)

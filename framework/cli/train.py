@@ -23,7 +23,7 @@ USAGE = """\
 usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
        ns-train --load-config FILE [flags]     train with the settings of a recipe or an earlier run
        ns-train --resume RUN_FOLDER [flags]    continue a run that was stopped
-       ns-train --version --environment        print what a report of an error needs
+       ns-train --version --environment        print the details for an error report
 
   ns-train instant-ngp --max-seconds 60                               the scene that comes with Nerfloom
   ns-train gaussian-splatting --data data/mine --max-seconds 300      a phone capture, after ns-process-data
@@ -39,7 +39,7 @@ def _command(arguments: list[str]) -> None:
     if not arguments or arguments[0] in HELP:
         print(_overview())
         return
-    from nerfloom.cli.train_paths import check_paths  # here, so that the help above comes at once
+    from nerfloom.cli.train_paths import check_paths  # here, so that the help above is fast
     from nerfloom.training.run_path import config_file
 
     resumed, flags = _take(arguments, "--resume")
@@ -92,13 +92,13 @@ def _overview() -> str:
     lines += ["", "data formats (recognised automatically, or named after the flags):", *listed["dataparsers"]]
     lines += [
         "",
-        "ns-train METHOD --help shows the everyday flags, --help-all those of the method and the data format too.",
+        "ns-train METHOD --help shows the everyday flags, --help-all all flags of the method and the data format.",
     ]
     return "\n".join(lines)
 
 
 def _check_method(method: str) -> None:
-    """Raise ConfigError if `method` is no method: before slow imports."""
+    """Raise ConfigError if `method` is not a method, before slow imports."""
     if os.path.exists(method) and method not in registered("methods"):
         raise ConfigError(f"the method comes first, as in: ns-train nerfacto --data {shlex.quote(method)}")
     if method.startswith("-"):
@@ -133,7 +133,7 @@ def _read_run(path: Path) -> Run:
 def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     """Return `run` with the settings of the method and the data format changed by flags, in any order.
 
-    Flags are parsed with those of the data format, so that --data and the format's name must be found before.
+    The flags include the data format's, so that --data and the format's name must be found first.
     """
     from nerfloom.base.step_limit import limited_as_given
     from nerfloom.registry import load_dataparser
@@ -148,7 +148,7 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     if _are_pairs(flags):
         given, word = _take(flags, "--data")[0], None
         asked = run.config.data if given is None else None if given == "None" else Path(given)
-    else:  # a word may belong to the flag before it or be a format's name: only the flags' types tell
+    else:  # a word may be a flag's value or a format's name, depending on the flags' types
         asking_nothing = [flag for flag in flags if flag not in HELP]
         initial, unknown = _parsed(run, asking_nothing, {"method": run.config}, return_unknown_args=True)
         asked, word = initial.method.data, _stray_word(unknown)
@@ -173,16 +173,16 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
 
 def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any) -> Any:
-    """Return `settings` changed by `flags`: one flat set of the flags of all, so that their order does not matter.
+    """Return `settings` changed by `flags`. All flags form one flat set, so that their order does not matter.
 
     Args:
         run: the run, for names and titles.
         flags: the flags.
-        settings: settings of the method, and of the data format, each by a name for it.
+        settings: settings of the method and of the data format, by name.
         options: further arguments of `tyro.cli`.
 
     Raises:
-        FlagError: if a flag is unknown, or has a value that it cannot have.
+        FlagError: if a flag is unknown or has an invalid value.
     """
     import tyro
 
@@ -202,12 +202,12 @@ def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any
 
 
 def _asks_for_help(flags: list[str]) -> bool:
-    """Return whether the flags ask for the help with the everyday flags alone."""
+    """Return whether the flags ask for the short help."""
     return bool({"-h", "--help"} & set(flags)) and "--help-all" not in flags
 
 
 def _are_pairs(flags: list[str]) -> bool:
-    """Return whether the flags are `--name value` or `--name=value` and nothing else, and name --data at most once."""
+    """Return whether all flags are `--name value` or `--name=value`, with at most one --data."""
     index = 0
     while index < len(flags):
         has_value = "=" in flags[index]
@@ -221,9 +221,9 @@ def _are_pairs(flags: list[str]) -> bool:
 
 
 def _check_format(word: str, method: str) -> None:
-    """Raise ConfigError if `word` is no data format."""
+    """Raise ConfigError if `word` is not a data format."""
     if word not in registered("dataparsers") and os.path.exists(word):
-        raise ConfigError(f"'{word}' is no data format; the data is named by a flag: ns-train {method} --data {word}")
+        raise ConfigError(f"'{word}' is not a data format; pass data with a flag: ns-train {method} --data {word}")
     entry_of("dataparsers", word)
 
 
@@ -236,7 +236,7 @@ def _check_for_nerfstudio(flags: list[str], method: str, settings: list[Any]) ->
 
 
 def _names(flags: list[str]) -> set[str]:
-    """Return the names of the settings that flags give."""
+    """Return the names of the settings that flags set."""
     return {flag[2:].partition("=")[0].replace("-", "_") for flag in flags if flag.startswith("--")}
 
 
@@ -251,7 +251,7 @@ def _flag_names(settings: Any, prefix: str = "--") -> Iterator[str]:
 
 
 def _stray_word(unknown: list[str]) -> str | None:
-    """Return the first word that is neither a flag nor a flag's value, which names a data format."""
+    """Return the first word that is neither a flag nor a flag's value: the name of a data format."""
     for index, word in enumerate(unknown):
         if word.startswith("-"):
             continue

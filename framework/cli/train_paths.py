@@ -1,4 +1,4 @@
-"""The paths that `ns-train` is given, looked at before torch is imported, which takes seconds."""
+"""Checks of the paths in `ns-train`'s flags, before the import of torch, which takes seconds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | Non
 
     Args:
         flags: flags of the command.
-        recipe: file of the settings that the flags change; None for a method's defaults.
+        recipe: file of settings; None for a method's defaults.
         folder: folder of the run; None for a new one.
 
     Raises:
@@ -32,11 +32,11 @@ def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | Non
     if data is not None and data != "None":
         check_data(Path(data))
     elif data is None and isinstance(recorded, str) and not os.path.exists(recorded):
-        raise DataError(f"{recorded}, the run's data, is not there; say where it is now: --data DIR")
+        raise DataError(f"the run's data {recorded} does not exist; give its new location: --data DIR")
     for name in ("--load-checkpoint", "--load-dir"):
         start = _value(flags, name)
         if start is not None and start != "None" and not os.path.exists(start):
-            raise CheckpointError(f"{name} {start} is not there")
+            raise CheckpointError(f"{name} {start}: there is no such file or folder")
     output = _value(flags, "--output-dir") or settings.get("output_dir") or TrainConfig.output_dir
     check_writable(folder or Path(str(output)), "the run's folder")
 

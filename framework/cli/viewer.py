@@ -1,4 +1,4 @@
-"""The command `ns-viewer`: a trained run, one in training, or a file of Gaussians, in a browser."""
+"""The command `ns-viewer`: a trained run, or a file of Gaussians, in a browser."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from nerfloom.cli.run_flags import OPENS, RunFlags
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerFlags(RunFlags):
-    """Look at a trained run or a file of Gaussians in a browser. It shows newer checkpoints at once; Ctrl-C ends it."""
+    """View a trained run or a file of Gaussians in a browser. New checkpoints are shown at once; Ctrl-C ends it."""
 
     websocket_host: str = ViewerConfig.websocket_host
-    """Interface to listen on; 0.0.0.0 for all, from which other machines can connect. There is no password."""
+    """Interface to listen on; 0.0.0.0: all, so that other machines can connect. There is no password."""
     websocket_port: int = ViewerConfig.websocket_port
-    """Port to listen on; the next free one if it is taken."""
+    """Port to listen on, or the next free one."""
 
 
 def main() -> None:

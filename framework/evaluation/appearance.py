@@ -74,7 +74,7 @@ def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]
 def fit_appearance(
     model: Renderable, dataset: Dataset, pixels: Tensor, background: Tensor, start: Tensor | None = None
 ) -> Tensor | None:
-    """Fit the appearance vector for which the model's colours are closest to given pixels.
+    """Fit the appearance vector that brings the model's colours closest to given pixels.
 
     Args:
         model: the model; its parameters are not changed.
@@ -104,7 +104,7 @@ def fit_appearance(
 
 @torch.no_grad()
 def _closest(model: Renderable, appearance: Appearance, dataset: Dataset, pixels: Tensor, background: Tensor) -> Tensor:
-    """Return the vector (D,) with which some of the pixels are shown best: the mean, or one of the training images'.
+    """Return the vector (D,) that reproduces some of the pixels best: the mean, or a training image's.
 
     The network learns the mean vector separately (`Appearance`), so vectors near the mean say little about the light of
     others, and a descent from there may end at a poor minimum.

@@ -62,7 +62,7 @@ def measured_error(model: Renderable, dataset: Dataset, bound: float) -> tuple[f
     Args:
         model: the model.
         dataset: views, on the model's device.
-        bound: transmittance at which rays end.
+        bound: transmittance where rays end.
 
     Returns:
         The maximum difference of a colour channel from rendering without early stop, and the ratio of the two times.

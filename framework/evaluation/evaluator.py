@@ -233,11 +233,11 @@ def evaluate(
         max_images: maximum number of views, evenly spaced; all if None.
         seconds: time that the views may take by the time of the first, which is always evaluated; no limit if None.
         pictures: folder for renders, true images, `view_panels` and further outputs; no files if None.
-        max_pictures: maximum number of views of which files are written, evenly spaced; all if None. If that is some of
-            them, files of the view with the lowest PSNR are written besides, as worst.png and so on. Views with files
-            are evaluated before the others.
+        max_pictures: maximum number of views with files, evenly spaced; all if None. If not all views have files, the
+            view with the lowest PSNR is also written, as worst.png and so on. Views with files are evaluated before the
+            others.
         round_to_uint8: whether colours are rounded to 8 bits before they are measured.
-        lpips_weights: file of LPIPS's weights; those of the package lpips if None.
+        lpips_weights: file of LPIPS's weights; the weights of the package lpips if None.
         title: text of the progress bar.
 
     Raises:

@@ -96,7 +96,7 @@ class Frames:
 
 
 def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
-    """Return the frames for a file or folder, including those of an earlier, stopped run of the same command.
+    """Return the frames for a file or folder, including frames of an earlier, stopped run of the same command.
 
     Args:
         output: rendered file or folder.

@@ -17,7 +17,7 @@ from nerfloom.kernels.math import safe_normalize
 from nerfloom.renderable import Renderable
 
 JUMP = 5.0
-"""Ratio of the step between two neighbours to the median step from which a walk is said to jump."""
+"""A walk counts as jumping if a step reaches this multiple of the median step."""
 AROUND, ABOVE, OPENING = 1.0, math.radians(20), math.radians(50)
 """Of cameras around a scene: distance from its middle in edges of its box, elevation and field of view, radians."""
 FEWEST = 3
@@ -209,7 +209,7 @@ def look_same_way(cameras: Cameras) -> bool:
 
 
 def focus_distance(model: Renderable, camera: Cameras, background: Tensor) -> float:
-    """Return the median distance of what one camera shows, scene units, as the model renders it.
+    """Return the median rendered distance of one camera's picture, scene units.
 
     Args:
         model: the trained model.

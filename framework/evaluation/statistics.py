@@ -12,7 +12,7 @@ Rows = Sequence[dict[str, Any]]
 
 
 def statistics(rows: Rows) -> dict[str, Any]:
-    """Return the statistics of all images and, as `by_size`, those of each image size if there are several.
+    """Return the statistics of all images and, as `by_size`, of each image size if there are several.
 
     Args:
         rows: report on each image.
@@ -46,7 +46,7 @@ def _of_metrics(rows: Rows) -> dict[str, float | None]:
 
 
 def _deviation(values: list[float]) -> float:
-    """Return the standard deviation; NaN if a value is not finite, for which `stdev` would raise an error."""
+    """Return the standard deviation; NaN if a value is not finite (`stdev` would raise an error)."""
     if not all(map(math.isfinite, values)):
         return math.nan
     return stdev(values) if len(values) > 1 else 0.0

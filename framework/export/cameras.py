@@ -20,7 +20,7 @@ from nerfloom.geometry.lenses import LENSES
 from nerfloom.renderable import RefinesPoses, Renderable
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-"""Splits in the order in which their images are listed."""
+"""Splits, in the order of their images in the file."""
 ORTHONORMAL_STEPS = 2
 """Newton steps that make a rotation orthonormal in float64; from float32, one is enough."""
 
@@ -165,7 +165,7 @@ def rational(lenses: Sequence[Mapping[str, float]]) -> bool:
     """Return whether any of `lenses` has coefficients of the denominator, k4 to k6.
 
     Raises:
-        ConfigError: if a lens has k7 too, for which no format has a place.
+        ConfigError: if a lens also has k7, which no format can store.
     """
     found = any(lens.get(name) for lens in lenses for name in ("k4", "k5", "k6"))
     if found and any(lens.get("k7") for lens in lenses):

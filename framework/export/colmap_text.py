@@ -22,14 +22,14 @@ ORDERS = {
 
 
 def images_folder(posed: PosedFiles) -> Path:
-    """Return the folder of all image files of `posed`, to which their names in the model are relative."""
+    """Return the common folder of the image files of `posed`; names in the model are relative to it."""
     return Path(os.path.commonpath([file.resolve().parent for file in posed.files]))
 
 
 def write_model(folder: Path, posed: PosedFiles) -> None:
     """Write the three files of a model.
 
-    Images have no keypoints, and points no observations: what there is of a data set is where its points are.
+    Images have no keypoints and points have no observations, since only the positions of points are known.
 
     Args:
         folder: folder to write to, which is created.

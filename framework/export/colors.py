@@ -1,4 +1,4 @@
-"""Colours of vertices: what is seen of each from right before the surface."""
+"""Colours of vertices, rendered from just in front of the surface."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from nerfloom.renderable import RendersRays
 REACH = 3.0
 """Length of a ray before the surface and behind it, in cells."""
 OPAQUE = 0.1
-"""Minimum opacity of a ray of which the colour is known."""
+"""Minimum opacity of a ray with a known colour."""
 GREY = 0.5
-"""Colour of a mesh of which no vertex has one."""
+"""Colour of a mesh if no vertex has a colour."""
 CHUNK = 2**15
 """Number of rays that are rendered at once."""
 
@@ -22,8 +22,8 @@ CHUNK = 2**15
 def seen_colors(model: RendersRays, vertices: Tensor, normals: Tensor, spacing: float, time: float) -> Tensor:
     """Return the colours (V, 3) of vertices, each by a short ray against its normal; NaN where it meets nothing.
 
-    A ray crosses as much of the surface as rays from cameras do, so that its colour is a mean of the field's colours
-    by their weights; the colour at the vertex itself, which is at the rim of the matter, is not what images show.
+    Like a camera's ray, each ray crosses the surface, and its colour is the weighted mean of the field's colours. The
+    field's colour at the vertex itself, at the edge of the matter, differs from the images.
 
     Args:
         model: the model in evaluation mode.
@@ -55,7 +55,7 @@ def seen_colors(model: RendersRays, vertices: Tensor, normals: Tensor, spacing: 
 
 
 def spread_colors(colors: Tensor, faces: Tensor) -> Tensor:
-    """Return colours (V, 3) in which vertices without colour have the mean colour of their neighbours.
+    """Return colours (V, 3); vertices without colour get the mean colour of their neighbours.
 
     Colours spread along edges until no vertex can be reached. Those that none reaches have the mean of all.
 

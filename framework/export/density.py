@@ -1,4 +1,4 @@
-"""The density of a trained model on a lattice, as its renderer sees it, and the level at which its surface lies."""
+"""The density of a trained model on a lattice, as its renderer uses it, and the level of its surface."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nerfloom.samplers.base import SkipsCells
 BLOCK = 32
 """Cells along an edge of a block."""
 ROUNDING = 1e-3
-"""Distance in cells of the occupancy grid by which a point may be off by rounding."""
+"""Maximum rounding error of a point, in cells of the occupancy grid."""
 CHUNK = 2**16
 """Number of positions that are evaluated at once."""
 COARSE = 4
@@ -28,9 +28,9 @@ COARSE = 4
 COARSE_SHARE = 0.01
 """A block is searched if the coarse pass finds this fraction of the level in it."""
 LEVEL_SHARE = 1 / 32
-"""Length, as a fraction of the longest edge of the scene's box, of which matter at the default level is half opaque. On
-the embedded scene (benchmarks/meshes.py) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses what is
-translucent."""
+"""At the default level, matter of this length is half opaque; a fraction of the longest edge of the scene's box. On
+the embedded scene (benchmarks/meshes.py) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses
+translucent parts."""
 
 
 @dataclass
@@ -40,7 +40,7 @@ class DensityRange:
     evaluated: int = 0
     """Number of positions that were evaluated."""
     nan: int = 0
-    """Number of those at which the density is NaN."""
+    """Number of positions with a density of NaN."""
     low: float = field(default=math.inf)
     """Minimum of the others."""
     high: float = field(default=-math.inf)
@@ -135,7 +135,7 @@ class LatticeDensity:
     def _occupied_blocks(self) -> Iterator[Tensor]:
         """Yield the blocks that overlap an occupied cell of the grid, by sums over the cells of boxes.
 
-        Of nested boxes, the cells are those of the smallest that the whole lattice lies in.
+        With nested boxes, uses the cells of the smallest box that contains the whole lattice.
         """
         cells = self._occupancy()
         n, boxes = cells.resolution, nested_boxes(cells.box.double(), cells.levels)
@@ -148,7 +148,7 @@ class LatticeDensity:
         offsets = torch.cartesian_prod(*[torch.tensor([0, BLOCK])] * 3)
         for block in self.lattice.all_blocks(BLOCK):
             corners = (self.lattice.positions(block * BLOCK + offsets) - box[0]) / (box[1] - box[0]) * n
-            # A point on the face of a block may be in a cell of the next, to which rounding may count it.
+            # A point on the face of a block may be rounded into a cell of the next.
             low = (corners.amin(0) - ROUNDING).floor().clamp(0, n).long().tolist()
             high = ((corners.amax(0) + ROUNDING).floor() + 1).clamp(0, n).long().tolist()
             total = 0
@@ -160,7 +160,7 @@ class LatticeDensity:
                 yield block
 
     def _coarse_blocks(self) -> Iterator[Tensor]:
-        """Yield the blocks in which the density on a coarser lattice is NaN or comes near the level."""
+        """Yield the blocks where the density on a coarser lattice is NaN or near the level."""
         for block in self.lattice.all_blocks(BLOCK):
             points, _ = self.lattice.block_points(block, BLOCK)
             last = torch.tensor(self.lattice.cells)
@@ -171,7 +171,7 @@ class LatticeDensity:
 
 
 def default_level(box: Tensor) -> float:
-    """Return the density, 1/scene unit, at which a surface is taken to lie: a fraction of the box is half opaque.
+    """Return the density of the surface, 1/scene unit: matter as long as `LEVEL_SHARE` of the box is half opaque.
 
     It does not depend on the lattice, so that a finer one shows the same surface in more detail.
 

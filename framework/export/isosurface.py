@@ -103,7 +103,7 @@ def _identified(vertices: np.ndarray, start: np.ndarray, cells: tuple[int, int, 
     nearest = np.round(vertices)
     on_point = np.abs(vertices - nearest) < SMALLEST / 4
     corner = np.where(on_point, nearest, np.floor(vertices)).astype(np.int64) + start
-    # A vertex on an edge has one fractional coordinate; one within a cell, of which there is one at most, has three.
+    # A vertex on an edge has one fractional coordinate; the one inside a cell, if any, has three.
     within = (~on_point).sum(1) != 1
     kind = np.where(within, 3, np.argmin(on_point, axis=1))
     key = ((corner[:, 0] * (cells[1] + 1) + corner[:, 1]) * (cells[2] + 1) + corner[:, 2]) * 4 + kind

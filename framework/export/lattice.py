@@ -28,7 +28,7 @@ class Lattice:
     """(3, 3) float64, row a is the step from a point to the next along axis a, scene coordinates. Rows are orthogonal
     and of the same length."""
     cells: tuple[int, int, int]
-    """Number of cells along each axis, one less than that of points."""
+    """Number of cells along each axis, one less than the number of points."""
 
     @property
     def spacing(self) -> float:
@@ -44,7 +44,7 @@ class Lattice:
         return (positions.double() - self.corner) @ self.axes.T / self.spacing**2
 
     def block_counts(self, edge: int) -> tuple[int, int, int]:
-        """Return the number of blocks of `edge` cells along each axis, of which the last may be smaller."""
+        """Return the number of blocks of `edge` cells along each axis; the last may be smaller."""
         return tuple(-(-count // edge) for count in self.cells)  # type: ignore[return-value]
 
     def all_blocks(self, edge: int) -> Tensor:

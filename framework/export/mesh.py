@@ -43,7 +43,7 @@ class Mesh:
 
 
 def without_degenerate(mesh: Mesh) -> Mesh:
-    """Return `mesh` without faces of which two corners are the same vertex, and without unused vertices."""
+    """Return `mesh` without degenerate faces (two equal corners) and without unused vertices."""
     a, b, c = mesh.faces.unbind(-1)
     return mesh.with_faces((a != b) & (b != c) & (c != a))
 
@@ -74,7 +74,7 @@ class Closedness:
         return not self.open_edges and not self.crowded_edges
 
     def sentence(self) -> str:
-        """Return what to tell people."""
+        """Return a description for people."""
         if self.watertight:
             return "watertight"
         crowded = f", {self.crowded_edges:,} edges of more than two faces" if self.crowded_edges else ""
@@ -97,7 +97,7 @@ def closedness(mesh: Mesh) -> Closedness:
 
 
 def components(mesh: Mesh) -> Tensor:
-    """Return the index (F,) of the connected component of each face of `mesh`, that of most faces first."""
+    """Return the index (F,) of each face's connected component; the component with most faces is 0."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -148,7 +148,7 @@ def largest_components(mesh: Mesh, most: int, least_share: float, cameras: Tenso
     Args:
         mesh: a mesh of at least one face.
         most: maximum number of components; 0 for any.
-        least_share: minimum number of faces of a component, as a fraction of those of the largest.
+        least_share: minimum number of faces of a component, relative to the largest component.
         cameras: (M, 3) positions of cameras, in the frame of the mesh.
     """
     owners = components(mesh)

@@ -34,7 +34,7 @@ class Cleaning:
     num_components: int = 0
     """Maximum number of connected components; 0 for any."""
     min_component_share: float = 0.001
-    """Minimum number of faces of a component, as a fraction of those of the largest."""
+    """Minimum number of faces of a component, relative to the largest component."""
     target_num_faces: int | None = None
     """Number of faces that the mesh is simplified to; None for no simplification."""
 
@@ -55,7 +55,7 @@ def density_mesh(
     cleaning: Cleaning,
     texturing: Texturing | None = None,
 ) -> Mesh:
-    """Return the surface at which the density of a model passes a level, in scene coordinates.
+    """Return the isosurface of a model's density, in scene coordinates.
 
     Args:
         model: the model in evaluation mode.
@@ -63,8 +63,8 @@ def density_mesh(
         level: the density, 1/scene unit.
         time: time in [0, 1] of a scene that moves.
         cameras: the training cameras.
-        cleaning: what is kept.
-        texturing: what its texture should be; None for none.
+        cleaning: which parts are kept.
+        texturing: settings of the texture; None for none.
 
     Raises:
         ConfigError: if the model has no density, or there is no surface; the message says why.
@@ -101,10 +101,10 @@ def fused_mesh(
         model: the model in evaluation mode.
         dataset: the training split, on the model's device.
         lattice: where distances are fused.
-        truncation: distance at which they are cut off, in cells.
+        truncation: truncation distance, in cells.
         views: maximum number of views, evenly spaced in the data set.
-        cleaning: what is kept.
-        texturing: what its texture should be; None for none.
+        cleaning: which parts are kept.
+        texturing: settings of the texture; None for none.
 
     Raises:
         ConfigError: if no view sees a surface in the box.

@@ -24,8 +24,8 @@ def box_frame(grid: SkipsCells, placement: Placement) -> Tensor:
     """Return the matrix (4, 4) float64 from a grid's unit cube to the input's frame.
 
     Args:
-        grid: the grid; its edges are parallel to the axes of the scene, and may not be to those of the input.
-        placement: the input's in the scene.
+        grid: the grid, aligned with the axes of the scene, but not always with the axes of the input.
+        placement: placement of the input in the scene.
     """
     low, high = grid.box.double().cpu()
     corners = torch.stack([low, *(low + torch.diag(high - low))])
@@ -39,15 +39,15 @@ def box_frame(grid: SkipsCells, placement: Placement) -> Tensor:
 def write_grid(file: Path, grid: SkipsCells, placement: Placement) -> None:
     """Write a grid as a compressed .npz of numpy.
 
-    It holds `occupied` (n, n, n) bool, whose index is that of the cell along x, y and z of the scene; `cube_to_input`
+    It holds `occupied` (n, n, n) bool, indexed along x, y and z of the scene; `cube_to_input`
     (4, 4), from the unit cube of the grid to the frame of the input; and `box` (2, 3), the corners of the grid in the
-    scene's frame. Of nested boxes, these are of the smallest; `larger` (L - 1, n, n, n) has the cells of the others,
-    each of twice the size, and is empty where a smaller box says what is there.
+    scene's frame. With nested boxes, these describe the smallest; `larger` (L - 1, n, n, n) has the cells of the
+    others, each of twice the size, without the part inside a smaller box.
 
     Args:
         file: path of the file.
         grid: the grid.
-        placement: the input's in the scene.
+        placement: placement of the input in the scene.
 
     Raises:
         OSError: if the file cannot be written.
@@ -79,12 +79,12 @@ def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
 
 
 def write_cells(file: Path, grid: SkipsCells, placement: Placement, boxes: bool) -> None:
-    """Write the occupied cells, of nested boxes those of the smallest, to a PLY file.
+    """Write the occupied cells, with nested boxes of the smallest box only, to a PLY file.
 
     Args:
         file: path of the file.
-        grid: the grid, of which at least one cell is occupied.
-        placement: the input's in the scene.
+        grid: the grid, with at least one occupied cell.
+        placement: placement of the input in the scene.
         boxes: True for the surface of their boxes, without faces between occupied cells; False for their centres.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Export of a point cloud of what the training cameras see, at the median depth of each ray."""
+"""Export of a point cloud: the points at the median depth of the training cameras' rays."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _within(model: Renderable, positions: Tensor, reach: float | None) -> Tensor
 
 
 def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
-    """Concatenate `parts`, of which there must be at least one; without normals if any part has none."""
+    """Concatenate one or more `parts`; without normals if any part has none."""
     chunks = list(parts)
     normals = [chunk.normals for chunk in chunks if chunk.normals is not None]
     return SurfacePoints(

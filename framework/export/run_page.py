@@ -41,12 +41,12 @@ from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
 
 VIEWS = 5
-"""Maximum number of views by which a page is compared with what it shows."""
+"""Maximum number of views for comparing a page with the model."""
 
 
 @dataclass(frozen=True)
 class Closeness:
-    """Metrics of a page's Gaussians against what they show, drawn by our own renderer."""
+    """Metrics of a page's Gaussians compared with the model, drawn by Nerfloom."""
 
     views: str
     """What was compared, for people."""
@@ -72,10 +72,10 @@ def export_page(
     """Write the web page of a run or a file of Gaussians, and say its size and how close it comes.
 
     Args:
-        loaded: what is shown.
+        loaded: the run or file.
         path: file to write.
         max_megabytes: maximum size of the page, in millions of bytes.
-        fit_seconds: seconds in which Gaussians are fitted to a field.
+        fit_seconds: time for fitting Gaussians to a field, seconds.
         moment: time that the page shows of a scene that moves, 0 to 1; 0 if None.
         splatting: the method that fits them.
 
@@ -131,11 +131,11 @@ def export_page(
 
 
 def _finite(found: Gaussians) -> Gaussians:
-    """Return those of some Gaussians that are finite, on the CPU, and say how many are not."""
+    """Return the finite Gaussians, on the CPU, and report the number of others."""
     found = found.map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
-        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
+        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are dropped")
     if not len(good):
         raise ConfigError("there are no Gaussians to show; train the run again")
     return good
@@ -150,14 +150,14 @@ def closeness(
     look: Look,
     moment: float | None,
 ) -> Closeness:
-    """Compare Gaussians with what they are to show.
+    """Compare Gaussians with the model that they represent.
 
     Args:
-        model: what they are to show.
+        model: the model.
         gaussians: N Gaussians in the scene's frame, on the model's device.
         cameras: M cameras to compare from.
         dataset: their images, on the model's device; None without any.
-        near: smallest depth at which a centre is drawn, scene units.
+        near: Gaussians whose centre has a smaller depth are not drawn, scene units.
         look: how the Gaussians are drawn.
         moment: time of the views; None for a static scene.
     """

@@ -1,10 +1,10 @@
 """Gaussians fitted to the pictures of a field, so that a method without Gaussians can be shown where only they can.
 
 They start on the surfaces that the field's rays end on (`framework/export/points.py`), and gaussian-splatting trains
-them with moves as in 3DGS-MCMC (Kheradmand et al. 2024). They are to show what the field has learnt, so they learn from
-pictures that it renders, at the training cameras and between them. A field on a CPU renders few in a minute; so every
-other step learns from a photograph, where the field was to show just that: where nothing moves, light does not vary,
-and the lens can be drawn.
+them with moves as in 3DGS-MCMC (Kheradmand et al. 2024). The Gaussians learn from pictures that the field renders, at
+the training cameras and between them. A field on a CPU renders few pictures per minute, so every other step uses a
+photograph, if the field aims to reproduce photographs exactly: nothing moves, light does not vary, and Gaussians can be
+drawn with the lens.
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from nerfloom.splats.start import from_points
 from nerfloom.training.trainer import Trainer
 
 PICTURES_SHARE = 0.45
-"""Share of the budget in which pictures are rendered; the others are steps."""
+"""Share of the budget for rendering pictures; the rest is for training steps."""
 PICTURES = 48
-"""Number of pictures for which the part of an image that each shows is chosen."""
+"""Number of pictures that should fit into their share; determines the part of an image that each shows."""
 FEWEST_PICTURES = 6
-"""Minimum number of pictures, whatever they take."""
+"""Minimum number of pictures, even if they exceed their share."""
 LONGEST_SIDE = 800
 """Maximum longer side of an image in pixels; larger ones are reduced."""
 SMALLEST_PART = 0.5
 """Minimum share of an image's width and height that a picture shows."""
 TIMED_RAYS = 8192
-"""Number of rays by which speed is measured."""
+"""Number of rays for measuring speed."""
 BETWEEN = 4
-"""One of so many pictures is from between two cameras."""
+"""Every Nth picture is from between two cameras."""
 PASSES = 4
-"""Maximum number of times that rays are drawn, of which some end on no surface."""
+"""Maximum number of rounds of drawing rays, since some rays hit no surface."""
 OPACITY, SIZE = 0.5, 0.7
-"""Of Gaussians at the start: opacity, and standard deviation in distances to neighbours."""
+"""Initial opacity of Gaussians, and their standard deviation in mean distances to neighbours."""
 MOST_GAUSSIANS, MOST_RATE = 300_000, 5.0
 """Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
-"""Steps a second by which that factor is chosen."""
+"""Assumed steps per second when the factor of learning rates is chosen."""
 SETTINGS: dict[str, Any] = {
     "max_num_iterations": None,
     "degree": MAX_DEGREE,
@@ -79,7 +79,7 @@ SETTINGS: dict[str, Any] = {
     "field_depth_mult": 0.0,
     "background": "black",  # `FieldPictures` chooses it
 }
-"""Settings of gaussian-splatting by which it learns a field's pictures, beside those that the budget decides."""
+"""Settings of gaussian-splatting for learning a field's pictures; the budget sets the others."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def fit_gaussians(
     Args:
         model: the model in evaluation mode.
         splatting: the method gaussian-splatting.
-        dataset: the training split, on the model's device; its times are those of the pictures.
+        dataset: the training split, on the model's device; the pictures have its times.
         cameras: M pinhole cameras of that split.
         seconds: time for pictures and steps together; more is taken where the fewest pictures take longer than theirs.
         machine: seed and device.
@@ -155,7 +155,7 @@ def fit_gaussians(
     config = replace(
         settings,
         **SETTINGS,
-        # On a slow machine even the fewest pictures take longer than their share; a page of no steps is of no use.
+        # On a slow machine even the fewest pictures exceed their share; training still needs time.
         max_seconds=max(seconds - (time.perf_counter() - begun), own_share),
         num_gaussians=most,
         rate_factor=rate_factor(STEPS_PER_SECOND * own_share, MOST_RATE),
@@ -172,7 +172,7 @@ def fit_gaussians(
             if report.progress >= (percent + 1) / 100:
                 break
     found, dropped = fitted.gaussians(), trainer.state.skipped
-    without = f", of which {dropped:,} were dropped, since their gradients were not finite" if dropped else ""
+    without = f" ({dropped:,} dropped: gradients not finite)" if dropped else ""
     say(f"{len(found):,} Gaussians after {trainer.state.step:,} steps{without}")
     return found
 
@@ -194,9 +194,9 @@ def _surfaces(model: RendersRays, dataset: Dataset, count: int) -> tuple[Tensor,
 
 
 def _shots(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: float) -> list[Shot]:
-    """Return pictures that the model renders in about so many seconds.
+    """Return pictures that the model renders in about `seconds`.
 
-    They are parts of images rather than small images, in which there is too little to learn from.
+    They are crops of images, since small images have too little detail.
     """
     end = time.perf_counter() + seconds
     cameras = cameras.scaled(min(1.0, LONGEST_SIDE / float(torch.maximum(cameras.widths, cameras.heights).max())))
@@ -211,12 +211,12 @@ def _shots(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: floa
 
 
 def _part(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: float) -> float:
-    """Return the share of images' sides that pictures show so that PICTURES, or two a camera, take so many seconds."""
+    """Return the side of pictures relative to images, such that PICTURES, or two per camera, take `seconds`."""
     pixels = float((cameras.widths * cameras.heights).double().mean())
     moment = None if dataset.times is None else float(dataset.times[0])
     background = model.background
     stride = max(int(math.sqrt(pixels / TIMED_RAYS)), 1)
-    model.render_view(View(cameras[:1], moment, stride=8 * stride), background)  # allocates what the first use does
+    model.render_view(View(cameras[:1], moment, stride=8 * stride), background)  # warms up
     start, view = time.perf_counter(), View(cameras[:1], moment, stride=stride)
     model.render_view(view, background)
     wait_for(model.device)
@@ -286,7 +286,7 @@ def _shot(model: RendersRays, camera: Cameras, moment: float | None) -> Shot:
 
 
 def _photographs(model: RendersRays, dataset: Dataset) -> list[Callable[[], Shot]]:
-    """Return functions that load photographs; none where the field is not to show just what they show."""
+    """Return functions that load photographs; none if the field does not aim to reproduce them exactly."""
     if dataset.times is not None or dataset.cameras.model not in DRAWN or dataset.scene.appearance_varies:
         return []
     cameras = refined_cameras(model, dataset.cameras)

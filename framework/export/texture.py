@@ -1,8 +1,8 @@
 """Textures of meshes: an image, and the place on it of each triangle.
 
-The image is divided into squares, each of which holds two triangles of equal size. That wastes more of it than charts
-of neighbouring triangles would, but it works for every mesh, in no time, and needs no package. Each triangle owns all
-texels that interpolation within it reads, so that the colours of others do not bleed into it.
+The image is divided into squares, each of which holds two triangles of equal size. This wastes more space than charts
+of neighbouring triangles, but it works for every mesh, takes no time and needs no package. Each triangle owns all
+texels that its interpolation reads, so that other colours do not bleed into it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Texturing:
     size: int
     """Edge of the image, texels."""
     max_seconds: float
-    """Time after which texels that have no colour yet get those of the vertices."""
+    """Time limit, seconds. Remaining texels then get the colours of the vertices."""
 
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
@@ -139,7 +139,7 @@ def painted(
         vertex_colors: (V, 3) in [0, 1], for texels without a colour of their own.
         faces: (F, 3) int64 indices of vertices.
         colors: function from positions and normals (T, 3) to colours (T, 3), NaN where there is none.
-        texturing: what the texture should be.
+        texturing: settings of the texture.
 
     Raises:
         ConfigError: if the image is too small for that many faces.

@@ -1,9 +1,9 @@
 """A truncated signed distance (TSDF), fused from the depth images that a model renders: Curless and Levoy 1996.
 
-It asks nothing of a method but pictures with depth. Each lattice point near a surface has the mean, over all views in
-which it is not hidden, of the distance from the point to what is seen in its pixel, cut off at some cells. Views count
-by the angle at which they see the surface. Distances are taken block by block, so that memory holds the views and one
-batch of blocks.
+It works with every method that renders depth. Each lattice point near a surface gets the mean distance from the point
+to the surface seen in its pixel, over all views where the point is not hidden, truncated at a few cells. Views are
+weighted by the angle between ray and surface. The lattice is processed in blocks, so that memory holds the views and
+one batch of blocks.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class DepthView:
     camera: Cameras
     """One camera, for the full image."""
     stride: int
-    """Distance between the rendered rows and columns, of which the first is `stride // 2`."""
+    """Distance between rendered rows and columns; the first is `stride // 2`."""
     depth: Tensor
     """(H, W) distance along the ray to the median surface, scene units; inf where the ray meets nothing, and NaN where
     that is unknown."""
@@ -69,7 +69,7 @@ class DepthView:
 
 
 def stride_for(cameras: Cameras, lattice: Lattice, most_pixels: int = MAX_PIXELS) -> int:
-    """Return the distance between rendered pixels at which neighbours are about a cell apart in the lattice's middle.
+    """Return the stride that puts neighbouring pixels about a cell apart at the centre of the lattice.
 
     Args:
         cameras: the cameras to be rendered.
@@ -117,7 +117,7 @@ def rendered_views(
 
 
 def _facing(points: Tensor, directions: Tensor) -> Tensor:
-    """Return the weight (H, W) of each pixel of a depth image: the cosine at which its ray meets the surface.
+    """Return the weight (H, W) of each pixel of a depth image: the cosine of its ray's angle to the surface normal.
 
     Args:
         points: (H, W, 3) points on the surface, not finite where there is none.
@@ -131,7 +131,7 @@ def _facing(points: Tensor, directions: Tensor) -> Tensor:
 
 
 def surface_points(view: DepthView) -> Tensor:
-    """Return the points (K, 3) in scene coordinates at which the rays of `view` meet a surface."""
+    """Return the points (K, 3) where the rays of `view` meet a surface, scene coordinates."""
     height, width = int(view.camera.heights[0]), int(view.camera.widths[0])
     grid = torch.arange(height * width).view(height, width)[
         view.stride // 2 :: view.stride, view.stride // 2 :: view.stride
@@ -147,7 +147,7 @@ class FusedDistance:
     Args:
         lattice: the points.
         views: the rendered views.
-        truncation: distance at which distances are cut off, in cells.
+        truncation: truncation distance, in cells.
 
     Raises:
         ConfigError: if the truncation is less than one cell.

@@ -39,7 +39,7 @@ MOST_CAMERAS = 300
 SCRIPTS = ("spz.js", "splats.js", "viewer.js")
 """Files of the page's program, in their order."""
 LEVEL = 0.5
-"""Cosine between z and the cameras' mean up direction below which the scene is turned."""
+"""The scene is turned if the cosine between z and the cameras' mean up direction is below this."""
 DATA = re.compile(r'<script id="data" type="text/plain">([^<]*)</script>')
 """The Gaussians in a page."""
 
@@ -55,7 +55,7 @@ class PageFacts:
     background: tuple[float, float, float]
     """Colour behind everything, 0 to 1."""
     near: float
-    """Smallest depth at which a centre is drawn, scene units."""
+    """Gaussians whose centre has a smaller depth are not drawn, scene units."""
     look: Look
     """How Gaussians are drawn."""
     focus: list[float]
@@ -136,11 +136,11 @@ def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
 
 
 def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> tuple[str, list[str]]:
-    """Return a web page that is not larger than a limit, and sentences on what that cost.
+    """Return a web page of limited size, and sentences about what was removed to fit it.
 
     Args:
         gaussians: N Gaussians on the CPU, in a frame whose z is up.
-        facts: what the page knows besides.
+        facts: further data of the page.
         max_megabytes: maximum size of the page, in millions of bytes.
 
     Raises:
@@ -177,7 +177,7 @@ def page(payload: bytes, facts: PageFacts) -> str:
 
     Args:
         payload: content of the file.
-        facts: what the page knows besides.
+        facts: further data of the page.
     """
     folder = files("nerfloom.export") / "page"
     plain = json.dumps(asdict(facts), separators=(",", ":"), allow_nan=False)

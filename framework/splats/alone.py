@@ -1,4 +1,4 @@
-"""The frame of Gaussians that come without images: where they are, how large, and which way is up."""
+"""The frame of Gaussians without images: their place, size and up direction."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from nerfloom.splats.gaussians import Gaussians
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """An axis of a file's frame, and its direction."""
 FAINT = 0.1
-"""Opacity below which Gaussians say nothing about where the scene is."""
+"""Gaussians below this opacity are ignored when the scene is placed."""
 HALF_WITHIN = 0.5
-"""Distance from the middle, scene units, within which half of the Gaussians are placed."""
+"""Median distance of placed Gaussians from the origin, scene units."""
 OUTSIDE = 0.01
-"""Share of the Gaussians outside the box above which the scene has surroundings."""
+"""A scene counts as unbounded if more than this share of the Gaussians is farther than 1 from the origin."""
 IMAGE_SIZE = 800
-"""Longer side of pictures, pixels, where no image says it."""
+"""Longer side of rendered pictures, pixels."""
 
 
 def placed_alone(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, Scene]:
-    """Return the placement of Gaussians of which no images are known, and the scene that they make.
+    """Return the placement of Gaussians without images, and their scene.
 
-    The median of their centres becomes the origin, and half of them are then within `HALF_WITHIN` of it: the few that
-    are far away do not count. What is not faint decides.
+    The median of the centres becomes the origin, and half of the Gaussians are then within `HALF_WITHIN` of it. Medians
+    ignore the few that are far away; faint Gaussians do not count.
 
     Args:
         gaussians: N Gaussians in the frame of their file.
@@ -35,7 +35,7 @@ def placed_alone(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, Scene
 
     Returns:
         The placement of the file's frame in the scene's, and a scene without cameras, whose box is from -1 to 1. It is
-        unbounded, and its background black, if more than `OUTSIDE` of the Gaussians are outside the box.
+        unbounded, with a black background, if more than `OUTSIDE` of the Gaussians are farther than 1 from the origin.
 
     Raises:
         DataError: if no Gaussian is finite.

@@ -1,8 +1,8 @@
-"""Capacity of the lists of Gaussians on an image's tiles, from what earlier images needed.
+"""Capacity of the lists of Gaussians per tile, estimated from earlier images.
 
-Only a device that runs ahead of Python knows how many entries the lists have. It notes what each image needs. When it
-is waited for anyway, the notes are read, and decide on the capacity for the images that follow. Until something is
-known of images of their size, each image waits. Gaussians beyond the capacity are left out, and counted.
+The number of entries is known on the device only. A device that runs ahead of Python records it for each image. At the
+next synchronisation these records set the capacity for later images. Each image synchronises until the capacity for its
+size is known. Entries beyond the capacity are dropped and counted.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from nerfloom.base import device as devices
 from nerfloom.kernels.splats.tiles import TileLists
 
 HEADROOM = 1.3
-"""Capacity, in units of the most that an image has needed."""
+"""Ratio of the capacity to the maximum number of entries that an image needed."""
 FADED = 0.95
-"""What is left of the most that images have needed, at each reading, unless one needs more."""
+"""Factor of the known maximum at each reading, unless a newer image needs more."""
 PIECE = 4096
-"""Numbers of entries are multiples of it."""
+"""Capacities are multiples of this number of entries."""
 
 
 class Capacity:
@@ -28,29 +28,29 @@ class Capacity:
 
     def __init__(self) -> None:
         self.entries = self.left_out = 0
-        """Number of entries that images have needed so far, and of those that were left out, as last read."""
+        """Numbers of entries needed and dropped so far, at the last reading."""
         self._per_gaussian = 0.0
         self._pixels = 0
         self._largest = 0
         self._noted: Tensor | None = None
 
     def of(self, records: Tensor, pixels: int) -> int | None:
-        """Return the number of entries for an image; None if the device is to be asked.
+        """Return the number of entries for an image; None if it must be read from the device.
 
         Args:
             records: (N, RECORD) Gaussians on the image.
-            pixels: size of the image.
+            pixels: number of pixels of the image.
         """
         if not devices.runs_ahead(records.device) or not len(records) or pixels > self._pixels:
             return None
         return PIECE * math.ceil(HEADROOM * self._per_gaussian * len(records) / PIECE)
 
     def note(self, records: Tensor, pixels: int, lists: TileLists) -> None:
-        """Note on the device what an image has needed, without a wait.
+        """Record on the device the number of entries that an image needed, without synchronising.
 
         Args:
             records: (N, RECORD) Gaussians on the image.
-            pixels: size of the image.
+            pixels: number of pixels of the image.
             lists: its lists.
         """
         if not devices.runs_ahead(records.device) or not len(records):
@@ -66,7 +66,7 @@ class Capacity:
         left_out.add_((needed - given).clamp(min=0))
 
     def read(self) -> None:
-        """Read what images have needed since the last time, and decide on the capacity for those that follow."""
+        """Read the records since the last reading, and set the capacity for later images. Synchronises."""
         if self._noted is None:
             return
         most, entries, left_out = self._noted.tolist()

@@ -1,8 +1,8 @@
 """Gaussians in compressed PLY files, as SuperSplat and PlayCanvas's splat-transform write them.
 
-The format is that of https://github.com/playcanvas/splat-transform (src/lib/readers/decompress-ply.ts). A binary PLY
-file has an element `chunk` with a row for each 256 Gaussians, the least and the most of each number in them; an element
-`vertex` with four 32-bit words a Gaussian; and, for harmonics of degree 1 and higher, an element `sh` of bytes:
+The format is specified by https://github.com/playcanvas/splat-transform (src/lib/readers/decompress-ply.ts). A binary
+PLY file has an element `chunk` with a row for each 256 Gaussians, the least and the most of each number in them; an
+element `vertex` with four 32-bit words a Gaussian; and, for harmonics of degree 1 and higher, an element `sh` of bytes:
 
     packed_position   11, 10 and 11 bits of x, y and z, from the highest, between min_x ... and max_x ...
     packed_scale      likewise of the logarithms of the scales, between min_scale_x ... and max_scale_x ...
@@ -45,7 +45,7 @@ def is_compressed(header: PlyHeader) -> bool:
 
 
 def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
-    """Read Gaussians from a compressed PLY file. Those that are not finite are left to the caller.
+    """Read Gaussians from a compressed PLY file. Values may be infinite or NaN.
 
     Args:
         file: path of the file.
@@ -67,7 +67,7 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
     if set(_COLORS[0]) <= set(chunk.names):
         darkest, brightest = (np.stack(_columns(file, chunk, names), -1)[rows] for names in _COLORS)
         shade = _between(darkest, brightest, shade)
-    opacity = (color & 255).astype(np.float64).clip(0.25, 254.75) / 255  # the middle of what is rounded to 0 and 1
+    opacity = (color & 255).astype(np.float64).clip(0.25, 254.75) / 255  # 0 and 1 have no logit
     return Gaussians(
         means=_float(_between(low, high, _three(position))),
         log_scales=_float(_between(low_scale, high_scale, _three(scale))),
@@ -90,12 +90,12 @@ def _three(words: np.ndarray) -> np.ndarray:
 
 
 def _between(low: np.ndarray, high: np.ndarray, share: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left out later
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are removed later
         return low.astype(np.float64) * (1 - share) + high.astype(np.float64) * share
 
 
 def _quaternions(words: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (N, 4) w, x, y, z: the largest component makes up the length that the others leave."""
+    """Return unit quaternions (N, 4) w, x, y, z: the largest component follows from unit length."""
     others = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], -1) / 1023 - 0.5
     others *= math.sqrt(2)
     largest = np.sqrt((1 - (others**2).sum(-1)).clip(0))

@@ -1,7 +1,7 @@
-"""Growth by gradients: Gaussians are cloned and split where images ask most for it, and transparent ones are dropped.
+"""Adaptive density control: Gaussians with large gradients are cloned or split, and transparent ones are dropped.
 
-Kerbl et al. 2023, section 5.2, by the absolute gradients of image positions (AbsGS, Ye et al. 2024), which do not
-cancel where the pixels of one Gaussian pull in different directions.
+Source: Kerbl et al. 2023, section 5.2, with the absolute gradients of image positions (AbsGS, Ye et al. 2024). These do
+not cancel where the pixels of a Gaussian have opposite gradients.
 """
 
 from __future__ import annotations
@@ -19,21 +19,22 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.strategy import Change, Strategy
 
 GRADIENT = 8e-4
-"""Mean gradient of the image position, of images whose longer side is 2 units, from which a Gaussian is not enough."""
+"""Gaussians with a larger mean gradient of the image position are cloned or split; images have a longer side of 2
+units."""
 LARGE = 0.01
 """Largest standard deviation, in scene extents, of a Gaussian that is cloned; a larger one is split."""
 TRANSPARENT = 0.005
-"""Opacity below which a Gaussian is dropped."""
+"""Gaussians at or below this opacity are dropped."""
 CHILDREN, SHRUNK = 2, 1.6
-"""Gaussians that one is split into, and the ratio of its standard deviations to theirs."""
+"""Number of Gaussians that replace a split one, and the divisor of its standard deviations."""
 RESET = 0.01
-"""Opacity to which all are lowered now and then, so that those which nothing needs stay transparent."""
+"""Maximum opacity after a reset. Gaussians that no image needs stay transparent and are dropped."""
 
 
 class GradientMean(nn.Module):
     """The mean size of the gradients of image positions, over the images that show a Gaussian.
 
-    An image is watched before its backward pass, and added after it.
+    Call `watch` before the backward pass of an image, and `add` after it.
     """
 
     sums: Tensor
@@ -46,7 +47,7 @@ class GradientMean(nn.Module):
         self._longer_side = 1
 
     def watch(self, records: Tensor, camera: SplatCamera) -> None:
-        """Keep the gradient of an image; without effect if there will be none.
+        """Retain the gradient of an image's records; does nothing if they require none.
 
         Args:
             records: (N, RECORD) Gaussians on the image.
@@ -58,10 +59,10 @@ class GradientMean(nn.Module):
 
     @torch.no_grad()
     def add(self, finite: bool | Tensor = True) -> None:
-        """Add the image that was watched last; without effect if there is none, or it has no gradient.
+        """Add the gradient of the image watched last; does nothing if there is none.
 
         Args:
-            finite: whether the step counts, possibly () bool on the device, where nothing is added if it does not.
+            finite: whether the step counts, possibly () bool on the device; nothing is added if it does not.
         """
         records, self._watched = self._watched, None
         if records is None or records.grad is None:
@@ -75,7 +76,7 @@ class GradientMean(nn.Module):
         self.sums[:, 1] += shown
 
     def take(self, count: int) -> Tensor:
-        """Return the means (count,) over the images of all processes, 0 of what none has shown, and begin anew.
+        """Return the means (count,) over the images of all processes, and reset them. Gaussians in no image have 0.
 
         Args:
             count: number of Gaussians.
@@ -95,7 +96,7 @@ class DensityControl(Strategy):
     """Adaptive density control of 3D Gaussian Splatting.
 
     Args:
-        steps_per_reset: steps after which all Gaussians become nearly transparent.
+        steps_per_reset: steps between resets that make all Gaussians nearly transparent.
     """
 
     def __init__(self, steps_per_reset: int) -> None:
@@ -119,26 +120,27 @@ class DensityControl(Strategy):
 
 
 def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
-    """Return how much the pixels pull at each Gaussian's position, (N,), on an image whose longer side is 2 units.
+    """Return the absolute gradient (N,) of each Gaussian's image position, for an image whose longer side is 2 units.
 
     Args:
-        gradient: (N, RECORD) their gradient; two columns hold `blend`'s sums of absolute gradients over pixels.
-        longer_side: of the image, pixels.
+        gradient: (N, RECORD) gradient of the records; two columns hold `blend`'s sums of absolute gradients over
+            pixels.
+        longer_side: longer side of the image, pixels.
     """
     return torch.hypot(gradient[:, ABSOLUTE_X], gradient[:, ABSOLUTE_Y]) * (longer_side / 2)
 
 
 def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Change | None:
-    """Clone or split the Gaussians with the largest gradients, and drop transparent ones and those that are not finite.
+    """Clone or split Gaussians with large gradients; drop transparent ones and those that are not finite.
 
     Args:
         gaussians: N Gaussians.
         gradients: (N,) mean gradient of their image positions, as `image_gradients` returns them.
         most: maximum number of Gaussians afterwards.
-        extent: the scene's, scene units.
+        extent: size of the scene, scene units.
 
     Returns:
-        What becomes of them; None if all stay as they are.
+        The change; None if nothing changes.
     """
     alive = (torch.sigmoid(gaussians.logits) > TRANSPARENT) & gaussians.finite()
     wanting = alive & (gradients > GRADIENT)
@@ -156,7 +158,7 @@ def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> 
 
 
 def _child(gaussians: Gaussians) -> Gaussians:
-    """Return a smaller Gaussian at a random place of each."""
+    """Return a smaller Gaussian at a random position inside each Gaussian."""
     g = gaussians
     offset = torch.randn_like(g.means) * g.log_scales.exp()
     means = g.means + (rotation_matrices(g.rotations) @ offset[:, :, None])[:, :, 0]

@@ -1,4 +1,4 @@
-"""Pictures of Gaussians: from a camera of the framework to an image and what is seen in it."""
+"""Pictures of Gaussians from the framework's cameras."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
 
 DRAWN = ("pinhole", "opencv", "fisheye")
-"""Camera models that Gaussians can be drawn for."""
+"""Camera models that Gaussians can be drawn with."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
 
@@ -38,12 +38,12 @@ def smallest_depth(scene: Scene) -> float:
 def splat_camera(
     camera: Cameras, near: float, look: Look = OURS, pose: Tensor | None = None, reduced: int = 1
 ) -> SplatCamera:
-    """Return a camera as splatting sees it.
+    """Return a camera in the form that the rasteriser takes.
 
     Args:
         camera: one camera.
-        near: what is nearer to it along its axis is not drawn, scene units.
-        look: how Gaussians are drawn.
+        near: Gaussians at a smaller depth are not drawn, scene units.
+        look: the settings of drawing.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
         reduced: factor by which the image is smaller than the camera's.
 
@@ -72,14 +72,13 @@ def splat_camera(
 
 @lru_cache(maxsize=16)
 def _flipped(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return FLIPPED (3, 3), which is kept: bringing it to a device means to wait for it."""
+    """Return FLIPPED (3, 3), cached for each device: a copy to a device synchronises."""
     return torch.tensor(FLIPPED, dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=1024)
 def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
-    """Return the distortion of one lens. How far it reaches is found by iteration, which a training step has no time
-    for."""
+    """Return the distortion of a lens, cached: its range of validity is found by a slow iteration."""
     return Distortion.of(model, torch.tensor([coefficients], dtype=torch.float64))
 
 
@@ -90,11 +89,11 @@ def draw_colors(
     """Draw the colours (H, W, 3) of a picture alone, which takes less time than `draw_view`.
 
     Args:
-        gaussians: what is drawn.
+        gaussians: the Gaussians.
         camera: the whole image.
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
-        rasteriser: how it is drawn.
+        rasteriser: the rasteriser.
     """
     return every(rasteriser.draw(rasteriser.project(gaussians, camera), camera, background).image, stride)
 
@@ -107,12 +106,12 @@ def draw_view(
     """Draw a picture with depth, opacity and normals.
 
     Args:
-        gaussians: what is drawn.
+        gaussians: the Gaussians.
         camera: the whole image.
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
-        far: depth where nothing is seen, scene units.
-        rasteriser: how it is drawn.
+        far: depth of empty pixels, scene units.
+        rasteriser: the rasteriser.
     """
     shown = rasteriser.project(gaussians, camera)
     image, through, median = rasteriser.draw(shown, camera, background, CHANNELS["normals"], median=True)

@@ -1,4 +1,4 @@
-"""Gaussians to look at that learn nothing, such as those of a file."""
+"""Gaussians that can be rendered but not trained, such as those of a file."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from nerfloom.splats.redrawn import Redrawn
 
 
 class DrawnGaussians(Renderable):
-    """Gaussians that are drawn onto images.
+    """A renderable of fixed Gaussians.
 
     Args:
         gaussians: N Gaussians in the frame of the scene.
-        look: how they are drawn.
-        scene: their frame.
+        look: the settings of drawing.
+        scene: the scene that defines their frame.
     """
 
     cameras: ClassVar[tuple[str, ...] | None] = DRAWN
@@ -47,17 +47,17 @@ class DrawnGaussians(Renderable):
         return self._redrawn.gaussians
 
     def look(self) -> Look:
-        """Return how they are drawn."""
+        """Return the settings of drawing."""
         return self._look
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         return self.render_gaussians(self.gaussians(), view, background)
 
     def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
-        """Render given Gaussians, such as some of its own, as `render_view` does all of them.
+        """Render the given Gaussians, such as a part of its own.
 
         Args:
-            gaussians: what is drawn, in the frame of the scene.
+            gaussians: Gaussians in the frame of the scene.
             view, background: as in `render_view`.
         """
         camera = splat_camera(view.camera, smallest_depth(self.scene), self._look)

@@ -16,11 +16,11 @@ from nerfloom.splats.spz import MAGIC, encoded, out_of_range, read_spz
 SUFFIXES = (".ply", ".spz")
 """Suffixes of files that can be written."""
 SPLAT = ".splat"
-"""Suffix of files that can be read besides; nothing in them tells what they are."""
+"""Suffix of a further format that can be read; its files have no header."""
 OTHERS = {
     ".ksplat": "GaussianSplats3D", ".sog": "PlayCanvas", ".splatv": "antimatter15/splaTV", ".rad": "Spark",
 }  # fmt: skip
-"""Suffixes of formats that cannot be read, and where they come from."""
+"""Suffixes of formats that cannot be read, and their programs."""
 
 
 def is_splat_file(path: Path) -> bool:
@@ -29,7 +29,7 @@ def is_splat_file(path: Path) -> bool:
 
 
 def read_gaussians(file: Path) -> Splats:
-    """Read Gaussians from a PLY file, compressed or not, an SPZ file or a .splat file, and how they are drawn.
+    """Read Gaussians and their settings of drawing from a PLY (compressed or not), SPZ or .splat file.
 
     Args:
         file: path of the file, with any suffix if it is PLY or SPZ.
@@ -56,19 +56,19 @@ def read_gaussians(file: Path) -> Splats:
 def write_gaussians(
     file: Path, gaussians: Gaussians, max_megabytes: float | None = None, look: Look = OURS
 ) -> list[str]:
-    """Write Gaussians to a file of the format that its suffix names, and return what that cost.
+    """Write Gaussians to a file in the format of its suffix, and return what was lost.
 
     Args:
         file: path of the file, with a suffix of `SUFFIXES`.
         gaussians: N Gaussians on the CPU.
         max_megabytes: maximum size of the file in millions of bytes; None for any.
-        look: how they are drawn.
+        look: the settings of drawing.
 
     Returns:
-        Sentences on what was left out to make the file small enough, or is beyond the format's range.
+        Sentences about what was removed to fit the size, and about values outside the format's range.
 
     Raises:
-        ConfigError: if the format cannot hold the Gaussians, or no file is that small.
+        ConfigError: if the format cannot hold the Gaussians, or no file fits the size.
         OSError: if the file cannot be written.
     """
     most = None if max_megabytes is None else 1e6 * max_megabytes

@@ -1,7 +1,7 @@
-"""Gaussians in a file of limited size: what is given up, in an order that costs least.
+"""Gaussians in files of limited size.
 
-Harmonics go first: their degree and, in SPZ files, the bits to which they are rounded. Of the choices that fit, that
-with the least error is taken. Gaussians are dropped only where degree 0 is too much, the least visible first.
+Harmonics are reduced first: their degree and, in SPZ files, their number of bits. Among the choices that fit, the one
+with the least error is used. Gaussians are dropped, the least visible first, only if degree 0 is too large.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from nerfloom.splats.ply import ply_size
 from nerfloom.splats.spz import BITS, encoded, rounded_harmonics
 
 COARSER_BITS = (4, 3)
-"""Bits of harmonics in SPZ files where `BITS` are too many."""
+"""Bits of harmonics in SPZ files if `BITS` are too many."""
 SAMPLE = 1 << 16
-"""Maximum number of Gaussians by which sizes and errors are estimated."""
+"""Maximum number of Gaussians used to estimate sizes and errors."""
 DOUBT = 1.05
-"""Ratio of an estimated size to the limit beyond which a choice is not tried."""
+"""A choice is not tried if its estimated size exceeds the limit by more than this ratio."""
 
 
 def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[Gaussians, str]:
-    """Return Gaussians whose PLY file is not larger than a limit, and what was left out, in words.
+    """Return Gaussians that fit into a PLY file of limited size, and a description of what was removed.
 
     Args:
         gaussians: N Gaussians.
         most_bytes: maximum size of the file.
-        look: how they are drawn.
+        look: the settings of drawing.
 
     Raises:
         ConfigError: if not even one Gaussian fits.
@@ -49,12 +49,12 @@ def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
 
 
 def fitted_spz(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[bytes, str]:
-    """Return the content of an SPZ file that is not larger than a limit, and what was left out, in words.
+    """Return an SPZ file of limited size, and a description of what was removed.
 
     Args:
         gaussians: N Gaussians on the CPU.
         most_bytes: maximum size of the file.
-        look: how they are drawn.
+        look: the settings of drawing.
 
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.
@@ -81,7 +81,7 @@ def fitted_spz(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
 def colour_error(gaussians: Gaussians, degree: int, bits: tuple[int, int]) -> float:
     """Return the mean squared error of colours over all directions, weighted by visibility, in an SPZ file.
 
-    Harmonics are orthonormal, so that it is the sum of squared errors of their coefficients, but for a factor.
+    Harmonics are orthonormal, so the error is proportional to the sum of squared errors of their coefficients.
 
     Args:
         gaussians: N Gaussians.
@@ -114,7 +114,7 @@ def most_visible(gaussians: Gaussians, count: int) -> Gaussians:
 
     Args:
         gaussians: N Gaussians.
-        count: how many are kept, at most N.
+        count: number of Gaussians kept, at most N.
     """
     if count >= len(gaussians):
         return gaussians

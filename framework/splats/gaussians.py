@@ -1,4 +1,4 @@
-"""Gaussians in space: the parameters of a splatted scene, as they are optimised and as files hold them."""
+"""Gaussians in space: the parameters of a splatted scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.look import Look
 
 MAX_DEGREE = max(DEGREES)
-"""Highest degree of the spherical harmonics that colours are made of."""
+"""Highest degree of the spherical harmonics of colours."""
 COLUMNS = ("means", "log_scales", "rotations", "logits", "colors", "harmonics")
 """Names of the columns that all Gaussians have."""
 
@@ -24,25 +24,25 @@ COLUMNS = ("means", "log_scales", "rotations", "logits", "colors", "harmonics")
 class Gaussians:
     """N Gaussians of 3D Gaussian Splatting (Kerbl et al. 2023), before their activations.
 
-    Their parameters are columns with names: six that drawing needs, and those that a method adds.
+    The parameters are named columns: six for drawing, and those that a method adds.
     """
 
     means: Tensor
-    """(N, 3) centres, scene coordinates; float64 if a file holds them so."""
+    """(N, 3) centres, scene coordinates; float64 if the file stores doubles."""
     log_scales: Tensor
     """(N, 3) logarithm of the standard deviation along each axis."""
     rotations: Tensor
-    """(N, 4) quaternions w, x, y, z from the axes to the scene, of any length but 0."""
+    """(N, 4) quaternions w, x, y, z from the axes to the scene, of any non-zero length."""
     logits: Tensor
     """(N,) opacity before the sigmoid."""
     colors: Tensor
-    """(N, 3) coefficients of the harmonic of degree 0 for red, green and blue: the part of a colour that is the same
-    from everywhere is 0.5 + DC * colors."""
+    """(N, 3) coefficients of degree 0 for red, green and blue. 0.5 + DC * colors is the part of the colour that does
+    not depend on the view."""
     harmonics: Tensor
     """(N, 3, K) coefficients of degrees 1 to D for each channel, in the order of `spherical_harmonics`; K is 0, 3, 8
     or 15."""
     extras: Mapping[str, Tensor] = field(default_factory=dict)
-    """Further columns (N, ...) by name, such as velocities. Files hold none of them."""
+    """Further columns (N, ...) by name, such as velocities. They are not written to files."""
 
     @classmethod
     def of(cls, columns: Mapping[str, Tensor]) -> Gaussians:
@@ -56,7 +56,7 @@ class Gaussians:
 
     @classmethod
     def joined(cls, parts: Sequence[Gaussians]) -> Gaussians:
-        """Return several Gaussians as one, those of the first part first.
+        """Concatenate Gaussians.
 
         Args:
             parts: at least one, all with the same columns.
@@ -83,10 +83,10 @@ class Gaussians:
         return float(self.log_scales.exp().median()) if len(self) else 0.0
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        """Return what a function makes of every column.
+        """Apply a function to every column.
 
         Args:
-            function: is applied to each.
+            function: the function.
         """
         return Gaussians.of({name: function(values) for name, values in self.columns.items()})
 
@@ -101,12 +101,12 @@ class Gaussians:
 
 
 class Splats(NamedTuple):
-    """Gaussians as a file holds them."""
+    """Gaussians and their settings of drawing, as stored in a file."""
 
     gaussians: Gaussians
     """The Gaussians."""
     look: Look
-    """How they are drawn."""
+    """The settings of drawing."""
 
 
 @runtime_checkable
@@ -114,24 +114,24 @@ class HasGaussians(Protocol):
     """A model that consists of Gaussians."""
 
     def gaussians(self, time: float | None = None) -> Gaussians:
-        """Return them as they are at a time, without gradient.
+        """Return the Gaussians at a time, without gradient.
 
         Args:
             time: in [0, 1]; None for a still scene.
         """
 
     def look(self) -> Look:
-        """Return how they are drawn."""
+        """Return the settings of drawing."""
 
 
 @runtime_checkable
 class RendersGaussians(HasGaussians, Protocol):
-    """A model that renders some of its Gaussians as well as all."""
+    """A model that can render a part of its Gaussians."""
 
     def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
-        """Render given Gaussians, such as some of its own, as `Model.render_view` does all of them.
+        """Render the given Gaussians, such as a part of the model's.
 
         Args:
-            gaussians: what is drawn, in the frame of the scene.
+            gaussians: Gaussians in the frame of the scene.
             view, background: as in `Model.render_view`.
         """

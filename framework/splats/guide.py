@@ -1,4 +1,4 @@
-"""Distances that a field has found, which guide Gaussians until images have shown them more."""
+"""Distances from a field, which supervise Gaussians in the first half of the training."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor, nn
 from nerfloom.data.pixels.batch import ViewBatch
 
 GUIDED_UNTIL = 0.5
-"""Share of the budget after which distances guide no longer; until then their weight falls evenly."""
+"""Share of the budget during which distances are used. Their weight falls linearly to 0."""
 
 GUIDE = {True: (0.1, "captures leave room for floaters"), False: (0.0, "the scene ends at its box")}
-"""Weight of a field's distances, and why, by whether there may be something outside the scene's box."""
+"""Weight of a field's distances, and the reason, for unbounded and bounded scenes."""
 
 
 def guidance(progress: float) -> float:
-    """Return the weight, from 1 to 0, that the distances have.
+    """Return the relative weight of the distances, from 1 to 0.
 
     Args:
         progress: share of the budget that is spent.
@@ -26,7 +26,7 @@ def guidance(progress: float) -> float:
 
 
 class FoundDistances(nn.Module):
-    """Distances in some pixels of the training images; none at first, and as many as a checkpoint has."""
+    """Distances in some pixels of the training images; none at first. Their number is restored from checkpoints."""
 
     images: Tensor
     """(K,) int64 image of each pixel."""
@@ -45,7 +45,7 @@ class FoundDistances(nn.Module):
         return len(self.images)
 
     def set(self, images: Tensor, pixels: Tensor, distances: Tensor) -> None:
-        """Replace them.
+        """Replace the distances.
 
         Args:
             images: (K,) int64 image of each pixel.
@@ -55,10 +55,10 @@ class FoundDistances(nn.Module):
         self.images, self.pixels, self.distances = images, pixels, distances
 
     def of_image(self, index: int, height: int, width: int) -> Tensor:
-        """Return the distances (H, W) that an image shows, 0 where none is known.
+        """Return the distances (H, W) of an image, 0 where unknown.
 
         Args:
-            index: which training image.
+            index: number of the training image.
             height, width: its size, pixels.
         """
         here = self.images == index
@@ -69,13 +69,13 @@ class FoundDistances(nn.Module):
     def known(
         self, batch: ViewBatch, progress: float, measured_weight: float, found_weight: float
     ) -> tuple[Tensor | None, float]:
-        """Return the distances (H, W) to learn an image from, 0 where unknown, and their weight; None without any.
+        """Return the target distances (H, W) of an image, 0 where unknown, and their weight; None if there are none.
 
         Args:
-            batch: the image; its own distances are taken if it has some and their weight is not 0.
+            batch: the image; its measured distances are used if it has some and their weight is not 0.
             progress: share of the budget that is spent.
-            measured_weight: weight of its own distances.
-            found_weight: weight at first of those that a field has found.
+            measured_weight: weight of measured distances.
+            found_weight: initial weight of the field's distances.
         """
         if batch.distances is not None and measured_weight > 0:
             return batch.distances, measured_weight

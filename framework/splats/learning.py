@@ -1,4 +1,4 @@
-"""Numbers that a budget decides of Gaussians that learn: how many, how fast, and when there come more."""
+"""The number of Gaussians, their learning rates and the times of their growth, from the budget."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 from nerfloom.splats.gaussians import MAX_DEGREE
 
 USUAL_STEPS = 30_000
-"""Steps of a run of 3D Gaussian Splatting, for which its learning rates are."""
+"""Number of steps that the learning rates of 3D Gaussian Splatting are made for."""
 
 MOST_MOVES = 16
-"""Maximum number of changes that are wanted in a run. More gave a capture of 2,000 steps half as many Gaussians again,
-and no better images."""
+"""Maximum number of changes planned for a run. With more, a capture of 2,000 steps got half again as many Gaussians and
+no better images."""
 FEWEST_STEPS, MOST_STEPS = 20, 100
-"""Least and most steps between two changes of the number of Gaussians."""
+"""Minimum and maximum number of steps between two changes of the number of Gaussians."""
 
 
 def number_for(seconds: float, most: int) -> int:
@@ -22,18 +22,18 @@ def number_for(seconds: float, most: int) -> int:
 
 
 def rate_factor(steps: float, most: float) -> float:
-    """Return the factor, at most `most`, of learning rates in a run of so many `steps`: fewer have to go farther."""
+    """Return the factor of learning rates for `steps` steps, at most `most`: shorter runs have a larger one."""
     return min(max((USUAL_STEPS / steps) ** 0.44, 1.0), most)
 
 
 def steps_per_move(steps: float, first: int, most: int, per_doubling: float) -> int:
-    """Return after how many steps the number of Gaussians changes, so that there are changes enough in a short run.
+    """Return the number of steps between changes of the number of Gaussians. Short runs have fewer.
 
     Args:
         steps: steps of the run during growth.
         first: number of Gaussians at the start.
         most: maximum number.
-        per_doubling: changes that double the number, about (`Strategy.changes_per_doubling`).
+        per_doubling: approximate number of changes that double the number (`Strategy.changes_per_doubling`).
     """
     doublings = math.log2(max(most / max(first, 1), 1.0))
     moves = min(max(per_doubling * doublings, 1.0), MOST_MOVES)
@@ -41,7 +41,7 @@ def steps_per_move(steps: float, first: int, most: int, per_doubling: float) -> 
 
 
 def open_degree(progress: float) -> int:
-    """Return the degree up to which harmonics count; all do after half of the budget.
+    """Return the highest degree of harmonics in use; all are in use after half of the budget.
 
     Args:
         progress: share of the budget that is spent.

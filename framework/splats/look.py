@@ -1,10 +1,9 @@
-"""A way of drawing belongs to Gaussians: drawn otherwise than in training, they look different.
+"""The settings of drawing that Gaussians were trained with. With other settings they look different.
 
-A PLY file says it in comments of its header. `SplatRenderMode: default` or `mip` (with opacity that makes up for the
-blur of small Gaussians) is what Brush and PlayCanvas's splat-transform write and read; `mip-0.1` of NeRFICG names the
-blur too; Postshot writes `antialiased 0` or `1`. `SplatBlur` and `SplatSort` are our own, and say what the others leave
-open. A file without them comes from elsewhere, where Gaussians are sorted by depth, as in the code of 3D Gaussian
-Splatting and in gsplat.
+A PLY file stores them in comments of its header. `SplatRenderMode: default` or `mip` (with opacity that makes up for
+the blur of small Gaussians) is what Brush and PlayCanvas's splat-transform write and read; `mip-0.1` of NeRFICG names
+the blur too; Postshot writes `antialiased 0` or `1`. `SplatBlur` and `SplatSort` are Nerfloom's own. Gaussians of a
+file without them are sorted by depth, as in the code of 3D Gaussian Splatting and in gsplat.
 """
 
 from __future__ import annotations
@@ -20,51 +19,51 @@ from nerfloom.base.errors import DataError, printable
 from nerfloom.kernels.splats.project import BLUR
 
 Sort = Literal["distance", "depth"]
-"""What Gaussians are sorted by: distance from the camera, or depth along its optical axis."""
+"""Sort key of Gaussians: distance from the camera, or depth along its optical axis."""
 LEAST_BLUR, MOST_BLUR = 1e-3, 10.0
-"""Range of the blur: without any, a Gaussian seen edge-on has no area."""
+"""Range of the blur. Without blur, a flat Gaussian seen edge-on has no area."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """A way of drawing Gaussians."""
+    """Settings of drawing."""
 
     antialiased: bool = False
-    """Whether opacity makes up for the blur of small Gaussians."""
+    """Whether lower opacity compensates for the blur of small Gaussians."""
     blur: float = BLUR
     """Variance added in both directions on the image, pixels^2."""
     sort: Sort = "distance"
-    """What Gaussians are sorted by."""
+    """Sort key of Gaussians."""
 
     def words(self) -> str:
-        """Return how they are drawn, for people."""
+        """Return a description of the settings."""
         mode = "antialiased" if self.antialiased else "default render mode"
         return f"{mode}, blurred by {self.blur:g} pixels^2, sorted by {self.sort}"
 
 
 OURS = Look()
-"""How Gaussians are drawn by default."""
+"""The default settings."""
 ELSEWHERE = Look(sort="depth")
-"""How Gaussians of a file that does not say it are drawn."""
+"""The settings for files that state none."""
 
 
 def comments(look: Look) -> list[str]:
-    """Return the comments of a file that say how its Gaussians are drawn.
+    """Return the comments of a file that state the settings of drawing.
 
     Args:
-        look: how.
+        look: the settings.
     """
     blur = [] if look.blur == BLUR else [f"SplatBlur: {look.blur:g}"]
     return [f"SplatRenderMode: {'mip' if look.antialiased else 'default'}", *blur, f"SplatSort: {look.sort}"]
 
 
 def look_of(lines: Sequence[str], file: Path, otherwise: Look = ELSEWHERE) -> Look:
-    """Return how the Gaussians of a file are drawn; what it says and is not known is said on the terminal.
+    """Return the settings of drawing from a file's comments. Unknown values are reported on the terminal.
 
     Args:
-        lines: its comments, of which later ones count.
+        lines: the file's comments; later ones override earlier ones.
         file: its path, for messages.
-        otherwise: how they are drawn where no comment says anything.
+        otherwise: the settings that no comment states.
 
     Raises:
         DataError: if they are discs of 2D Gaussian Splatting.

@@ -1,7 +1,7 @@
 """Moves of Gaussians by Markov chain Monte Carlo (Kheradmand et al. 2024, "3D Gaussian Splatting as MCMC").
 
-Gaussians that have become transparent are moved to opaque ones, and new ones are added there, so that what is drawn
-stays as it was; noise moves those that are nearly transparent, and so looks for places where they are needed.
+Transparent Gaussians are moved to opaque ones, and new ones are added there, without a change of the picture. Noise
+moves nearly transparent Gaussians, which lets them explore.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from nerfloom.splats.strategy import Change, Strategy
 DEAD = 0.005
 """Opacity at or below which a Gaussian counts as dead."""
 GROWTH = 1.05
-"""Ratio of the number of Gaussians after a change to that before it, until there are as many as there may be."""
+"""Growth factor of the number of Gaussians at each change, up to the maximum number."""
 MOST_COPIES = 51
-"""Gaussians that one may become at a time."""
+"""Maximum number of copies of a Gaussian in one change."""
 NOISE_SHARPNESS, NOISE_FROM = 100.0, 0.005
-"""How steeply noise ends with opacity, and at which opacity half of it is left."""
+"""Steepness of the sigmoid that reduces noise with opacity, and the opacity at its midpoint."""
 
 
 class Mcmc(Strategy):
@@ -40,12 +40,11 @@ def moved(gaussians: Gaussians, added: int) -> Change | None:
     """Move dead Gaussians to live ones, and add more.
 
     Args:
-        gaussians: all of them.
-        added: how many more there are to be.
+        gaussians: all N Gaussians.
+        added: number of Gaussians to add.
 
     Returns:
-        Which of them stay, and those that are added: each that was chosen, as many times as it is to be there. None
-        if nothing is to be done.
+        The Gaussians that stay, and the new ones: all copies of each chosen Gaussian. None if nothing changes.
     """
     opacity = torch.sigmoid(gaussians.logits)
     alive = (opacity > DEAD) & gaussians.finite()
@@ -65,7 +64,7 @@ def moved(gaussians: Gaussians, added: int) -> Change | None:
 
 
 def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what each of several Gaussians at one place must be, so that together they look like the one.
+    """Return the parameters of n equal Gaussians that together look like one.
 
     Equation 9 of the paper: alpha' = 1 - (1 - alpha)^(1/n), and scales times
     alpha / sum_{i=1}^{n} sum_{k=0}^{i-1} binom(i-1, k) (-1)^k alpha'^{k+1} / sqrt(k+1).
@@ -73,12 +72,12 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
     Args:
         logits: (K,) opacity before the sigmoid.
         log_scales: (K, 3).
-        counts: (K,) int64 n, how many it becomes; at most MOST_COPIES.
+        counts: (K,) int64 n, number of copies, at most MOST_COPIES.
 
     Returns:
-        (K,) logits and (K, 3) logarithms of scales of each of the n.
+        (K,) logits and (K, 3) logarithms of scales of each copy.
     """
-    # In float64: the sum alternates, and its terms are up to ten thousand times as large as what is left of them.
+    # In float64: the sum alternates, and its terms are up to ten thousand times larger than the result.
     alpha = torch.sigmoid(devices.to_float64(logits)).clamp(1e-6, 1 - 1e-6)
     n = counts.to(alpha)[:, None]
     each = -torch.expm1(torch.log1p(-alpha) / n[:, 0])
@@ -94,18 +93,18 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
 
 @torch.no_grad()
 def shaken(gaussians: Gaussians, size: float | Tensor) -> tuple[Tensor | slice, Tensor]:
-    """Return noise for the centres of those that are nearly transparent (the paper's equation 7).
+    """Return noise for the centres of nearly transparent Gaussians (the paper's equation 7).
 
-    On a device that runs ahead of Python, it is noise for all of them, as nobody waits to know which these are; that of
-    the others is hardly any.
+    On a device that runs ahead of Python, all Gaussians get noise, to avoid a synchronisation; it is negligible for
+    opaque ones.
 
     Args:
-        gaussians: all of them.
+        gaussians: all N Gaussians.
         size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit; possibly () on the
             device.
 
     Returns:
-        which (K,), and by how much (K, 3), scene units.
+        Indices (K,) of Gaussians, or a slice, and shifts (K, 3) of their centres, scene units.
     """
     opacity = torch.sigmoid(gaussians.logits)
     chosen: Tensor | slice = slice(None)

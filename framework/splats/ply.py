@@ -1,16 +1,16 @@
 """Gaussians in PLY files, in the layout of the code of 3D Gaussian Splatting (Kerbl et al. 2023).
 
 A vertex is a Gaussian, and its properties are parameters before their activations: centre x, y, z; normals nx, ny, nz,
-which are 0 and which readers ignore; f_dc_0 to f_dc_2, the coefficients of degree 0; f_rest_0 to f_rest_(3K-1), those
-of higher degrees, all of red before all of green before all of blue; opacity (before the sigmoid); scale_0 to scale_2
+which are 0 and ignored by readers; f_dc_0 to f_dc_2, the coefficients of degree 0; f_rest_0 to f_rest_(3K-1), those of
+higher degrees, all of red before all of green before all of blue; opacity (before the sigmoid); scale_0 to scale_2
 (logarithms); rot_0 to rot_3 (a quaternion w, x, y, z).
 
-Mip-Splatting's files have a property `filter_3D` besides: the standard deviation of a smoothing filter in space, which
+Mip-Splatting's files also have a property `filter_3D`: the standard deviation of a smoothing filter in space, which
 is a part of the Gaussian (Yu et al. 2024, section 4.1). With f for it, scales are sqrt(s^2 + f^2), and opacity is that
-stored times the root of the ratio of the products of s^2 and of s^2 + f^2. So they are read, and images are antialiased
-with the blur of that method, 0.1 pixels^2 (section 4.2, and kernel_size of its code).
+stored times the root of the ratio of the products of s^2 and of s^2 + f^2. The reader applies the filter, and images
+are antialiased with that method's blur, 0.1 pixels^2 (section 4.2, and kernel_size of its code).
 
-How the Gaussians are drawn stands in comments (`nerfloom.splats.look`).
+The settings of drawing are stored in comments (`nerfloom.splats.look`).
 
 Harmonics have the order and the signs of `kernels.encodings.spherical_harmonics`, and are evaluated at the direction
 from the camera to the Gaussian: in utils/sh_utils.py of https://github.com/graphdeco-inria/gaussian-splatting degree 1
@@ -36,13 +36,13 @@ from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
 from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
 
 SURE = 16.0
-"""Logit that stands for an opacity of 1, whose logit is infinite; other programs write it so. -SURE stands for 0."""
+"""Finite logit for an opacity of 1; -SURE for 0. Other programs write infinite logits."""
 TERMS = {0: 0, 9: 3, 24: 8, 45: 15, 72: 24}
-"""Number of properties f_rest to coefficients a channel."""
+"""Number of coefficients per channel, by the number of properties f_rest."""
 FILTER = "filter_3d"
-"""Name of the smoothing filter's property, in small letters; programs differ in that."""
+"""Name of the smoothing filter's property in lower case; programs differ in case."""
 MIP_SPLATTING = replace(ELSEWHERE, antialiased=True, blur=0.1)
-"""How Gaussians with a filter are drawn, where no comment says otherwise."""
+"""Default settings of drawing for Gaussians with a filter."""
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATIONS = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -64,7 +64,7 @@ def ply_size(count: int, terms: int, look: Look = OURS) -> int:
     Args:
         count: number of Gaussians.
         terms: coefficients of degrees 1 and higher for each channel.
-        look: how they are drawn.
+        look: the settings of drawing.
     """
     names = property_names(terms)
     return (
@@ -78,7 +78,7 @@ def write_ply(file: Path, gaussians: Gaussians, look: Look = OURS) -> None:
     Args:
         file: path of the PLY file.
         gaussians: N Gaussians on the CPU.
-        look: how they are drawn.
+        look: the settings of drawing.
 
     Raises:
         OSError: if the file cannot be written.
@@ -95,11 +95,11 @@ def write_ply(file: Path, gaussians: Gaussians, look: Look = OURS) -> None:
 
 
 def read_ply(file: Path) -> Splats:
-    """Read Gaussians from a PLY file, in any order of properties, with others besides, ascii, binary or compressed.
+    """Read Gaussians from a PLY file: ascii, binary or compressed, with properties in any order.
 
-    Gaussians with parameters that are not finite, or without a rotation, are left out, which is said on the terminal.
-    An infinite opacity, as other programs write it for an opaque Gaussian, becomes `SURE`. Degree 4 is left out.
-    Centres that the file holds in double precision, as of a survey, stay in it.
+    Gaussians with parameters that are not finite, or with a zero rotation, are removed, with a message on the terminal.
+    An infinite opacity, which other programs write for opaque Gaussians, becomes `SURE`. Degree 4 is dropped.
+    Centres in double precision stay so.
 
     Args:
         file: path of the PLY file.
@@ -121,7 +121,7 @@ def read_ply(file: Path) -> Splats:
 
 
 def smoothed(gaussians: Gaussians, filters: Tensor) -> Gaussians:
-    """Return Gaussians that are smoothed by a filter in space, and as much fainter as they are larger (Mip-Splatting).
+    """Return Gaussians smoothed by a filter in space, with opacity lowered to compensate (Mip-Splatting).
 
     Args:
         gaussians: N Gaussians.
@@ -139,7 +139,7 @@ def smoothed(gaussians: Gaussians, filters: Tensor) -> Gaussians:
 
 
 def _stored(file: Path, vertex: PlyElement) -> Gaussians:
-    """Return the Gaussians that stand in the vertices of a file."""
+    """Return the Gaussians in the vertices of a file."""
     names = set(vertex.names)
     needed = (*_DC, "opacity", *_SCALES, *_ROTATIONS)
     missing = [name for name in needed if name not in names]
@@ -181,7 +181,7 @@ def _stored(file: Path, vertex: PlyElement) -> Gaussians:
 def _together(columns: Sequence[np.ndarray], kind: type = np.float32) -> Tensor:
     """Return columns (N,) side by side, (N, C), of a floating-point type."""
     values: np.ndarray = np.empty((len(columns[0]) if columns else 0, len(columns)), kind)
-    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is left out later
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 are removed later
         for index, column in enumerate(columns):
             values[:, index] = column
     return torch.from_numpy(values)
@@ -192,14 +192,14 @@ def _finite_logits(logits: Tensor) -> Tensor:
 
 
 def usable(gaussians: Gaussians, file: Path) -> Gaussians:
-    """Return those Gaussians that can be rendered; how many cannot is said on the terminal.
+    """Return the Gaussians that can be rendered, and report the number of others on the terminal.
 
     Args:
-        gaussians: those that a file holds.
+        gaussians: all Gaussians of a file.
         file: its path, for messages.
 
     Raises:
-        DataError: if there is none.
+        DataError: if none can be rendered.
     """
     lengths = gaussians.rotations.norm(dim=-1)
     good = gaussians.finite() & gaussians.log_scales.exp().isfinite().all(-1) & lengths.isfinite() & (lengths > 0)

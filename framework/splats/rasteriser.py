@@ -18,31 +18,31 @@ from nerfloom.splats.gaussians import COLUMNS, MAX_DEGREE, Gaussians
 from nerfloom.splats.start import morton
 
 MORTON_CELLS = 2**20
-"""Cells along an axis by which Gaussians are sorted."""
+"""Number of cells along an axis for sorting Gaussians along a curve."""
 
 
 class Projected(NamedTuple):
     """N Gaussians on an image."""
 
     records: Tensor
-    """(N, C) what the image needs of each, in the layout of the rasteriser: `kernels.splat_project.Record`."""
+    """(N, C) records, in the layout of the rasteriser (`kernels.splats.project.Record`)."""
     keys: Tensor | None = None
-    """(N,) positive numbers that sort them, smallest first; None for their distances."""
+    """(N,) positive sort keys, smallest first; None to sort by distance."""
 
 
 class Rasteriser:
-    """Draws Gaussians as 3D Gaussian Splatting does, by compiled kernels where there are some.
+    """The rasteriser of 3D Gaussian Splatting, with compiled kernels where available.
 
-    A part that draws otherwise replaces one or all of `project`, `tile` and `blend`.
+    Another rasteriser overrides one or all of `project`, `tile` and `blend`.
     """
 
     def project(self, gaussians: Gaussians, camera: SplatCamera, degree: int = MAX_DEGREE) -> Projected:
-        """Return Gaussians on an image, with a gradient.
+        """Project Gaussians to an image. Differentiable.
 
         Args:
             gaussians: N Gaussians.
             camera: the image.
-            degree: highest degree of the harmonics that count.
+            degree: highest degree of the harmonics in use.
         """
         g = gaussians
         columns = g.means, g.log_scales, g.rotations, g.logits, g.colors, g.harmonics
@@ -50,20 +50,20 @@ class Rasteriser:
         return Projected(records, sort_keys(g.means, camera))
 
     def prepared(self, gaussians: Gaussians) -> Callable[[SplatCamera], Projected] | None:
-        """Return a faster `project`, without gradient, of Gaussians that do not change; None if there is none.
+        """Return a faster `project`, without gradient, for Gaussians that do not change; None if there is none.
 
         Args:
-            gaussians: N Gaussians. Those that no picture shows may be left out.
+            gaussians: N Gaussians. Invisible ones may be dropped.
         """
         return None
 
     def tile(self, shown: Projected, camera: SplatCamera, entries: int | None = None) -> TileLists:
-        """Return the Gaussians that each tile of an image may show, from front to back.
+        """List the Gaussians of each tile of an image, from front to back.
 
         Args:
             shown: N Gaussians on the image.
             camera: the image.
-            entries: number of entries for which there is memory; None for as many as there are.
+            entries: capacity of the lists; None for no limit.
         """
         gradients = torch.is_grad_enabled()
         return tile_lists(shown.records, camera.width, camera.height, gradients, entries, shown.keys)
@@ -77,11 +77,11 @@ class Rasteriser:
         channels: int = CHANNELS["rgb"],
         median: bool = False,
     ) -> Blended:
-        """Return an image of Gaussians, with a gradient.
+        """Blend Gaussians to an image. Differentiable.
 
         Args:
             shown: N Gaussians on the image.
-            lists: those that each tile may show.
+            lists: the Gaussians of each tile.
             camera: the image.
             background: (3,) colour behind everything.
             channels: number of channels, a value of `CHANNELS`.
@@ -102,7 +102,7 @@ class Rasteriser:
 
         Args:
             shown, camera, background, channels, median: as in `blend`.
-            capacity: number of entries of lists on a device that runs ahead of Python, which is waited for otherwise.
+            capacity: estimated capacity of the lists, which avoids a synchronisation.
         """
         pixels = camera.width * camera.height
         lists = self.tile(shown, camera, None if capacity is None else capacity.of(shown.records, pixels))
@@ -112,7 +112,7 @@ class Rasteriser:
 
 
 class PackingRasteriser(Rasteriser):
-    """A rasteriser that packs Gaussians that do not change, on a CPU with compiled kernels."""
+    """A rasteriser that packs unchanging Gaussians, on a CPU with compiled kernels."""
 
     def prepared(self, gaussians: Gaussians) -> Callable[[SplatCamera], Projected] | None:
         if not native.available() or gaussians.means.device.type != "cpu" or (found := packed(gaussians)) is None:
@@ -121,14 +121,14 @@ class PackingRasteriser(Rasteriser):
 
 
 RASTERISER = PackingRasteriser()
-"""How Gaussians are drawn by default."""
+"""The default rasteriser."""
 
 
 def packed(gaussians: Gaussians) -> PackedGaussians | None:
-    """Return Gaussians packed along a curve through space, without those that no picture shows; None if all are so.
+    """Pack Gaussians along a curve through space, without invisible ones; None if all are invisible.
 
     Args:
-        gaussians: N of them, not changed.
+        gaussians: N Gaussians, not modified.
     """
     shown = gaussians[gaussians.finite() & (gaussians.rotations.square().sum(1) > 1e-24)]
     shown = shown[torch.sigmoid(shown.logits) > MIN_ALPHA]

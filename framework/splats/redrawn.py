@@ -1,4 +1,4 @@
-"""Gaussians that do not change between pictures, as while a scene is looked at or evaluated."""
+"""Gaussians that do not change between pictures, as in a viewer or an evaluation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from nerfloom.splats.rasteriser import Projected, Rasteriser
 
 
 class Redrawn:
-    """Gaussians that are prepared when they are drawn for the second time.
+    """Gaussians that are prepared when they are drawn a second time.
 
     Preparing takes as long as a few pictures; after a step of training a viewer draws only one.
 
     Args:
-        gaussians: what is drawn; it must not change.
-        rasteriser: how it is drawn.
-        time: of the scene; None if it is still.
+        gaussians: the Gaussians; they must not change.
+        rasteriser: the rasteriser.
+        time: time of the scene; None for a still scene.
     """
 
     def __init__(self, gaussians: Gaussians, rasteriser: Rasteriser, time: float | None = None) -> None:

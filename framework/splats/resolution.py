@@ -11,21 +11,21 @@ from torch import Tensor
 from nerfloom.base.pace import Pace, StepTimes
 
 REDUCED_SHARE = 0.4
-"""Share of the budget for reduced images where there are enough steps at full size."""
+"""Share of the budget for reduced images if there are enough steps at full size."""
 ENOUGH_STEPS, SHARE_POWER, LEAST_WHOLE = 700, 0.7, 0.1
-"""Steps at full size that should fit into a whole budget; exponent of the share for full size as a function of their
-number; and the least share for full size."""
+"""Number of full-size steps that counts as enough; exponent of the full-size share as a function of the number of
+steps; minimum full-size share."""
 LEAST_SIDE = 150
-"""Minimum side of reduced images, pixels of a square with as many."""
+"""Minimum side of a square with the area of a reduced image, pixels."""
 QUICKER = 3.0
-"""Assumed ratio of the time of a step to that of a step with images of half the size, until both are measured."""
+"""Assumed ratio of step times with full and half-size images, until both are measured."""
 
 
 def octaves_at(progress: float, share: float, most: int) -> int:
-    """Return how often images are halved at some point of a run.
+    """Return the number of halvings of the images at a point of the run.
 
-    They are halved once in the share of the budget that is for reduced images, twice in the first half of this share,
-    three times in the first quarter, and so on: each size has as much time as all smaller ones together.
+    Images are halved once during `share` of the budget, twice in its first half, three times in its first quarter, and
+    so on. Each size takes as much time as all smaller ones together.
 
     Args:
         progress: share of the budget that is spent.
@@ -49,7 +49,7 @@ def share_for(steps: float) -> float:
 
 
 def most_octaves(pixels: float) -> int:
-    """Return how often an image can be halved: once, or more often while a square of as many pixels has `LEAST_SIDE`.
+    """Return the maximum number of halvings: at least 1, and more while the side stays above `LEAST_SIDE`.
 
     Args:
         pixels: number of pixels of the whole image.
@@ -70,11 +70,11 @@ class ImageSizes:
     def __init__(self, share: float, most: int, paced: bool) -> None:
         self.share, self.most, self.paced = share, most, paced
         self.steps: Counter[int] = Counter()
-        """Number of steps so far, by how often their images were halved."""
+        """Number of steps so far, by number of halvings."""
         self._times, self._octaves = StepTimes(), 0
 
     def next(self, progress: float) -> int:
-        """Return how often the images of the next step are halved.
+        """Return the number of halvings for the next step.
 
         Args:
             progress: share of the budget that is spent.
@@ -86,7 +86,7 @@ class ImageSizes:
         return octaves
 
     def learn(self, pace: Pace) -> None:
-        """Measure the last step, whose images had the size that `next` returned, or the whole one if it was not called.
+        """Measure the last step. Its images had the size of the last `next`, or full size if it was not called.
 
         Args:
             pace: the run after this step.
@@ -97,7 +97,7 @@ class ImageSizes:
             self.share = share_for(pace.budget / whole)
 
     def steps_until(self, pace: Pace, end: float) -> float | None:
-        """Return how many steps there will be until some point of the run, at measured times; None before any.
+        """Return the number of steps until a point of the run, from measured times; None before the first.
 
         Args:
             pace: the run now.
@@ -120,7 +120,7 @@ def reduced(image: Tensor, octaves: int) -> Tensor:
 
     Args:
         image: (H, W, C) the whole image.
-        octaves: how often it is halved.
+        octaves: number of halvings.
     """
     for _ in range(octaves):
         image = halved(image)
@@ -128,11 +128,11 @@ def reduced(image: Tensor, octaves: int) -> Tensor:
 
 
 def reduced_distances(distances: Tensor, octaves: int) -> Tensor:
-    """Return distances (H, W) halved a number of times, as `halved_distances` does it once.
+    """Apply `halved_distances` a number of times.
 
     Args:
         distances: (H, W), 0 where unknown.
-        octaves: how often they are halved.
+        octaves: number of halvings.
     """
     for _ in range(octaves):
         distances = halved_distances(distances)
@@ -140,7 +140,7 @@ def reduced_distances(distances: Tensor, octaves: int) -> Tensor:
 
 
 def halved(image: Tensor) -> Tensor:
-    """Return an image of half the size, each pixel of which is the mean of four.
+    """Return an image of half the size; each pixel is the mean of four.
 
     Args:
         image: (H, W, C); an odd last row or column is left out.
@@ -150,9 +150,9 @@ def halved(image: Tensor) -> Tensor:
 
 
 def halved_distances(distances: Tensor) -> Tensor:
-    """Return distances at half the size, the least of four that are known, 0 where none is.
+    """Return distances at half the size: the minimum of four known distances, 0 where none is known.
 
-    A mean would lie between what is in front and what is behind; where few pixels are known, none is lost.
+    A mean would lie between foreground and background.
 
     Args:
         distances: (H, W), 0 where unknown; an odd last row or column is left out.
@@ -168,7 +168,7 @@ def enlarged(image: Tensor, whole: Tensor, octaves: int) -> Tensor:
     Args:
         image: (H >> octaves, W >> octaves, C) the reduced image.
         whole: (H, W, C) the whole one, whose last rows and columns fill what reducing left out.
-        octaves: how often the image was halved.
+        octaves: number of halvings of the image.
     """
     if octaves == 0:
         return image

@@ -1,4 +1,4 @@
-"""Settings by which Gaussians start, grow and move, and what a budget decides of them."""
+"""Settings for the start, growth and drawing of Gaussians, and the values that depend on the budget."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
 from nerfloom.splats.resolution import REDUCED_SHARE
 
 PIXELS_PER_SECOND = 25 * 400 * 400
-"""Pixels that training draws in a second, about, on two cores; for what is decided by the budget."""
+"""Approximate number of pixels that training draws per second on two cores."""
 MOST_STEPS_PER_SECOND = 100
-"""However small the images are."""
+"""Maximum training speed assumed for small images."""
 MOST_GAUSSIANS, MOST_RATE = 1_000_000, 8.0
-"""Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
+"""Largest number of Gaussians and largest factor of learning rates that a budget chooses."""
 LARGE_IMAGE = 250_000
-"""Pixels from which training begins with images of half the size."""
+"""Number of pixels above which training begins with reduced images."""
 LONG_RUN, NEVER = 15_000, 10**9
-"""Steps of a run in which opacity is reset, which it takes a thousand steps to recover from."""
+"""Minimum length of a run with resets of opacity, steps, and a period that is never reached. Recovery from a reset
+takes a thousand steps."""
 PACED_WORDS = {True: "the time is limited, not the steps", False: "they are given, or the time has no limit"}
 RESET_WORDS = {
     True: ("the run is long", "resets of opacity", "every 3,000 steps"),
@@ -37,7 +38,7 @@ RESET_WORDS = {
 class SplattingConfig(
     AppearanceConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
 ):
-    """Settings of a method whose Gaussians start somewhere, grow, move and are drawn."""
+    """Settings of a method that trains Gaussians."""
 
     RANGES: ClassVar[dict[str, Range]] = {
         "degree": (0, MAX_DEGREE),
@@ -57,53 +58,57 @@ class SplattingConfig(
     }
     """Allowed range of each numeric setting."""
     degree: int = 3
-    """Highest degree of the spherical harmonics that colours are made of."""
+    """Highest degree of the spherical harmonics of colours."""
     antialiased: bool = False
-    """Compensate the minimum width of a Gaussian on an image by its opacity (Mip-Splatting)."""
+    """Lower the opacity of small Gaussians to compensate for their blur (Mip-Splatting)."""
     blur: float = OURS.blur
     """Variance added to every Gaussian on an image, pixels^2: 0.3 in 3DGS and gsplat, 0.1 in Mip-Splatting."""
     sort: Sort = OURS.sort
-    """What Gaussians are sorted by. distance: from the camera, so that turning it changes nothing. depth: along its
-    axis, as 3DGS, gsplat and most viewers sort."""
+    """Sort key of Gaussians. distance: distance from the camera; turning the camera does not change it. depth: depth
+    along the camera's axis, as in 3DGS, gsplat and most viewers."""
     num_gaussians: Auto[int] = AUTO
-    """Maximum number of Gaussians; by the budget if not given."""
+    """Maximum number of Gaussians. Default: from the budget."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"
-    """Where Gaussians start: at the points of a reconstruction, on surfaces that a short run of a field finds, in
-    the visual hull of the images' silhouettes, or anywhere in the box. auto: the first of points and field that there
-    is."""
+    """Where Gaussians start. points: at the points of a reconstruction. field: on surfaces from a short training of a
+    field. silhouettes: in the visual hull of images with alpha. random: anywhere in the box. auto: points if the data
+    has them, else field."""
     start_gaussians: Auto[int] = AUTO
-    """Gaussians at the start, and their maximum at the points of a reconstruction; two thirds of --num-gaussians if not
-    given."""
+    """Number of Gaussians at the start; the maximum number if they start at points. Default: two thirds of
+    --num-gaussians."""
     field_steps: Auto[int] = AUTO
-    """Maximum number of training steps of that field; by the budget if not given. They end after a fifth of
-    --max-seconds."""
+    """Maximum number of training steps of the field of --start field. It trains for at most a fifth of --max-seconds.
+    Default: from the budget."""
     rate_factor: Auto[float] = AUTO
-    """Factor of all learning rates; by the budget if not given, as fewer steps have to go farther."""
+    """Factor of all learning rates. Default: from the budget; shorter runs have a larger factor."""
     position_rate: float = 8e-5
-    """Learning rate of centres before that factor, in sizes of the scene."""
+    """Learning rate of centres relative to the size of the scene, before --rate-factor."""
     reduced_until: Auto[float] = AUTO
-    """Share of the budget in which images are half as wide and high, a quarter in its first half, and so on. If not
-    given: 0.4 of large images, else 0."""
+    """Share of the budget with reduced images: half the size, a quarter in the first half of the share, and so on.
+    Default: 0.4 for large images, else 0."""
     paced: Auto[bool] = AUTO
-    """Whether measured times of steps change the share of reduced images and the steps between moves. If not given:
-    with --max-seconds, if neither --reduced-until nor --steps-per-move is given."""
+    """Adapt the share of reduced images and --steps-per-move to measured step times. Default: with --max-seconds in one
+    process, unless --reduced-until or --steps-per-move is given."""
     strategy: Literal["adc", "mcmc"] = "adc"
-    """How Gaussians come and go. adc: transparent ones are dropped, and those whose image positions have large
-    gradients are cloned or split (adaptive density control of 3DGS). mcmc: transparent ones are moved to opaque ones
+    """How Gaussians are added and removed. adc: drop transparent Gaussians; clone or split those with large gradients
+    of the image position (adaptive density control of 3DGS). mcmc: move transparent Gaussians to opaque ones
     (3DGS-MCMC)."""
     growth_end: float = 0.8
     """Share of the budget after which no Gaussian is added or moved."""
     steps_per_move: Auto[int] = AUTO
-    """Steps between two changes of the Gaussians' number. If not given: 100, or fewer, down to 20, where too few
-    changes would be left to reach --num-gaussians."""
+    """Steps between two changes of the number of Gaussians. Default: 100, or down to 20 in runs that are too short to
+    reach --num-gaussians otherwise."""
     steps_per_reset: Auto[int] = AUTO
-    """Steps after which strategy adc makes all Gaussians nearly transparent; by the budget if not given."""
+    """With --strategy adc, steps between resets that make all Gaussians nearly transparent. Default: from the
+    budget."""
     noise: float | None = None
-    """Noise of nearly transparent Gaussians, times the learning rate of centres; by the start if not given."""
+    """Noise on the centres of nearly transparent Gaussians, relative to their learning rate. Default: 0 if Gaussians
+    start on a field's surfaces in a bounded scene, else 5e5."""
     opacity_penalty: float | None = None
-    """Weight of the mean opacity in the loss; by the start if not given."""
+    """Weight of the mean opacity in the loss. Default: 0 if Gaussians start on a field's surfaces in a bounded scene,
+    else 0.002."""
     scale_penalty: float | None = None
-    """Weight of the mean scale, in scene extents, in the loss; by the start if not given."""
+    """Weight of the mean scale, in scene extents, in the loss. Default: 0 if Gaussians start on a field's surfaces in a
+    bounded scene, else 0.01."""
 
     def look(self) -> Look:
         """Return how Gaussians are drawn."""
@@ -114,7 +119,7 @@ SplattingConfigT = TypeVar("SplattingConfigT", bound=SplattingConfig)
 
 
 def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingConfigT, list[Decision]]:
-    """Decide how many Gaussians there are and how fast they learn, by the budget and the size of the images.
+    """Fill in the number of Gaussians and their learning rates from the budget and the size of the images.
 
     Returns:
         The settings, and a record of each that was filled in.

@@ -8,7 +8,7 @@ The format is that of https://github.com/antimatter15/splat (convert.py and main
     opacity     1 x 8 bits    255 sigmoid(logit)
     rotation    4 x 8 bits    128 (q + 1) of w, x, y and z of a unit quaternion
 
-There are no harmonics of higher degrees: colours are the same from everywhere.
+There are no harmonics of higher degrees: colours do not depend on the view.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.ply import usable
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
-"""A Gaussian."""
+"""Layout of one Gaussian."""
 SMALLEST = 1e-30
-"""Standard deviation that stands for 0, whose logarithm is infinite."""
+"""Standard deviation that replaces 0, so that the logarithm is finite."""
 
 
 def read_splat(file: Path) -> Gaussians:
     """Read Gaussians from a .splat file, of degree 0.
 
-    Those that are not finite are left out, which is said on the terminal. Opacities of 0 and 1, which have no finite
-    logit, become 1/1020 and 1019/1020, the middle of what is rounded to them.
+    Gaussians that are not finite are removed, with a message on the terminal. Opacities of 0 and 1 become 1/1020 and
+    1019/1020, the centres of the intervals that round to them; their own logits are infinite.
 
     Args:
         file: path of the file.
@@ -53,7 +53,7 @@ def read_splat(file: Path) -> Gaussians:
         )
     rows = np.frombuffer(content, ROW)
     scales = rows["scale"].astype(np.float64)
-    with np.errstate(invalid="ignore"):  # what is not finite, or negative, is left out below
+    with np.errstate(invalid="ignore"):  # values that are negative or not finite are removed below
         log_scales = np.log(np.where(scales == 0, SMALLEST, scales))
     color = rows["color"].astype(np.float64)
     opacity = color[:, 3].clip(0.25, 254.75) / 255

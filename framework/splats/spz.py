@@ -3,7 +3,7 @@
 The format is described in https://github.com/nianticlabs/spz (README.md and src/cc/load-spz.cc). A header of 16 bytes
 (magic NGSP, version, number of Gaussians, degree, fractional bits, flags) is followed by one array an attribute:
 
-    positions    3 x 24 bits    fixed point, with as many fractional bits as the header says
+    positions    3 x 24 bits    fixed point, with the header's number of fractional bits
     opacities    1 x 8 bits     255 sigmoid(logit)
     colours      3 x 8 bits     255 (0.15 f + 0.5) of the coefficient f of degree 0
     scales       3 x 8 bits     16 (log + 10)
@@ -11,19 +11,18 @@ The format is described in https://github.com/nianticlabs/spz (README.md and src
                  32 bits        version 3: which of x, y, z, w is largest, and the others in 10 bits each
     harmonics    3K x 8 bits    128 (f + 1) of degrees 1 and higher; red, green, blue of each coefficient in a row
 
-**Axes.** The README says that SPZ is RUB (x right, y up, z back) and PLY is RDF (x right, y down, z front). Neither is
-true of a captured scene, whose axes are anyone's; what counts is that y and z change sign between the two, half a turn
-about x. So `read_spz` gives what a PLY file of the same scene gives, and what Niantic's library gives when asked for
-RDF, number for number. (Converters that leave axes alone exist.) With y and z also change sign: y and z of quaternions,
-and the harmonics that are odd in y and z together (`SIGNS`).
+**Axes.** The README says that SPZ is RUB (x right, y up, z back) and PLY is RDF (x right, y down, z front). The axes of
+a captured scene are arbitrary; what matters is that y and z change sign between the two formats. `read_spz` returns the
+values of a PLY file of the same scene, equal to those of Niantic's library in RDF. (Some converters do not change the
+axes.) The sign also changes for y and z of quaternions and for harmonics that are odd in y and z together (`SIGNS`).
 
-**How they are drawn.** The lowest bit of the flags says that the Gaussians were trained with antialiasing. What else
-`nerfloom.splats.look` says stands in the comment of the gzip file (RFC 1952, FCOMMENT), which other programs skip.
+**How they are drawn.** The lowest bit of the flags says that the Gaussians were trained with antialiasing. The other
+settings of `nerfloom.splats.look` are in the comment of the gzip file (RFC 1952, FCOMMENT), which other programs skip.
 
-**Versions.** Version 2 is written, since some programs read no other, and 2 and 3 are read. With 8 bits of x, y and z,
-w has no bits to speak of where it is near 0, and such a rotation may be off by twelve degrees. But a Gaussian has 24
-descriptions, as its axes can be exchanged and turned around, and in one of them w is at least 0.85. That is written,
-and its rotation is off by a degree at most.
+**Versions.** Version 2 is written, since some programs read no other; 2 and 3 are read. With 8 bits of x, y and z, w
+near 0 is inaccurate, and a rotation may be wrong by twelve degrees. But a Gaussian has 24 equivalent descriptions,
+since its axes can be permuted and reversed, and in one of them w is at least 0.85. That one is written; its error is at
+most one degree.
 """
 
 from __future__ import annotations
@@ -56,21 +55,22 @@ MOST = 10_000_000
 BITS = (5, 4)
 """Bits of harmonics of degree 1, and of higher degrees, as in Niantic's library."""
 FRACTIONAL_BITS = 12
-"""Bits of a position behind the point, as in Niantic's library; more for small Gaussians, fewer for large scenes."""
+"""Fractional bits of a position, as in Niantic's library; more for small Gaussians, fewer for large scenes."""
 STEPS = 16
-"""Minimum number of steps of a position in the standard deviation of a typical Gaussian, where the range allows it."""
+"""Minimum number of position steps per standard deviation of a typical Gaussian, if the range allows it."""
 SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 """Factors of harmonics of degrees 1 to 3 when y and z change sign."""
 RATIO = 1032
 """Maximum ratio of sizes before and after compression by gzip."""
 FLAT = 3.0
-"""Logarithm of the largest over the smallest size that is written, beyond which nobody sees it clipped."""
+"""Logarithm of the ratio of the largest to the smallest size that is not reported as clipped; smaller sizes are
+invisible."""
 ANTIALIASED = 1
 """Bit of the header's flags."""
 FCOMMENT, COMMENT_START, LONGEST_COMMENT = 16, 10, 1000
-"""Of gzip's header: the flags' value if it has a comment alone; where that begins; its maximum length, bytes."""
+"""In the gzip header: the flags with only a comment, the offset of the comment, and its maximum length, bytes."""
 SURPLUS = 1 << 24
-"""Maximum number of bytes behind the last array, where extensions of the format stand."""
+"""Maximum number of bytes after the last array, for extensions of the format."""
 
 
 def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> None:
@@ -80,7 +80,7 @@ def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS, lo
         file: path of the file.
         gaussians: N Gaussians on the CPU.
         bits: as in `encoded`.
-        look: how they are drawn.
+        look: the settings of drawing.
 
     Raises:
         ConfigError: if the format cannot hold them.
@@ -99,8 +99,8 @@ def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OUR
 
     Args:
         gaussians: N finite Gaussians on the CPU.
-        bits: to which harmonics of degree 1, and of higher degrees, are rounded, at most 8. Fewer compress better.
-        look: how they are drawn.
+        bits: number of bits of harmonics of degree 1 and of higher degrees, at most 8. Fewer compress better.
+        look: the settings of drawing.
 
     Raises:
         ConfigError: if the format cannot hold them.
@@ -140,13 +140,13 @@ def _comment(packed: bytes) -> list[str]:
 
 
 def fractional_bits(gaussians: Gaussians) -> int:
-    """Return the number of bits behind the point with which positions are written.
+    """Return the number of fractional bits for positions.
 
     Args:
         gaussians: N finite Gaussians.
 
     Raises:
-        ConfigError: if a position is out of range even without such bits.
+        ConfigError: if a position is out of range even with 0 fractional bits.
     """
     if not len(gaussians):
         return FRACTIONAL_BITS
@@ -161,7 +161,7 @@ def fractional_bits(gaussians: Gaussians) -> int:
 
 
 def out_of_range(gaussians: Gaussians) -> list[str]:
-    """Return sentences on what the format's range costs these Gaussians, beyond its usual rounding.
+    """Return sentences about losses from the format's range, beyond its usual rounding.
 
     Args:
         gaussians: N finite Gaussians.
@@ -187,13 +187,13 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 
 
 def _rounded(harmonics: np.ndarray, bits: tuple[int, int]) -> np.ndarray:
-    """Return bytes (N, 3, K), multiples of the step that the number of bits leaves; 256 has 9 bits and becomes 255."""
+    """Return bytes (N, 3, K), rounded to multiples of the step; 256 becomes 255."""
     steps = np.array([2 ** (8 - bits[0])] * 3 + [2 ** (8 - bits[1])] * 12, np.float32)[: harmonics.shape[2]]
     return _bytes(np.rint(128 * (harmonics + 1) / steps) * steps)
 
 
 def rounded_harmonics(harmonics: Tensor, bits: tuple[int, int]) -> Tensor:
-    """Return harmonics as they are read back, in the axes in which they were given.
+    """Return harmonics as they are read back, in their original axes.
 
     Args:
         harmonics: (N, 3, K) on the CPU.
@@ -223,7 +223,7 @@ def _largest_real_part(rotations: Tensor, log_scales: Tensor) -> tuple[Tensor, T
     best = torch.cat([(part @ conjugate.T).abs().argmax(-1) for part in unit.split(1 << 18)])
     turned = quaternion_product(unit, group[best])
     turned = torch.where(turned[:, :1] < 0, -turned, turned)
-    # The new axis j is the old axis that g turns it to, but for its sign.
+    # The new axis j is the old axis that g rotates it to, up to sign.
     units = torch.cat([torch.zeros(3, 1), torch.eye(3)], dim=-1).double()
     images = quaternion_product(quaternion_product(group[:, None], units), conjugate[:, None])[..., 1:]
     return turned, log_scales.gather(1, images.abs().argmax(-1)[best])
@@ -232,8 +232,8 @@ def _largest_real_part(rotations: Tensor, log_scales: Tensor) -> tuple[Tensor, T
 def read_spz(file: Path) -> Splats:
     """Read Gaussians from an SPZ file of version 2 or 3, in the axes of PLY files.
 
-    Opacities of 0 and 1, which have no finite logit, become 1/1020 and 1019/1020, the middle of what is rounded to
-    them. Degree 4 is left out, and so are extensions.
+    Opacities of 0 and 1 become 1/1020 and 1019/1020, the centres of the intervals that round to them; their own logits
+    are infinite. Degree 4 and extensions are dropped.
 
     Args:
         file: path of the file.
@@ -271,7 +271,7 @@ def read_spz(file: Path) -> Splats:
 
 
 def _look(file: Path, flags: int) -> Look:
-    """Return how the Gaussians are drawn: by the flags, then by the comment."""
+    """Return the settings of drawing from the flags and the comment."""
     with file.open("rb") as stream:
         lines = _comment(stream.read(COMMENT_START + LONGEST_COMMENT))
     return replace(look_of(lines, file, ELSEWHERE), antialiased=bool(flags & ANTIALIASED))
@@ -282,7 +282,7 @@ def _float(values: np.ndarray) -> Tensor:
 
 
 def _sizes(version: int, terms: int) -> tuple[int, ...]:
-    """Return the bytes a Gaussian has in each array."""
+    """Return the number of bytes per Gaussian in each array."""
     return 9, 1, 3, 3, 3 if version == 2 else 4, 3 * terms
 
 

@@ -1,4 +1,4 @@
-"""First Gaussians: at given points, with sizes by their distances and colours by the images."""
+"""Initial Gaussians at given points, with sizes from distances between points and colours from the images."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from nerfloom.scene.silhouettes import Silhouettes, visual_hull
 from nerfloom.splats.gaussians import Gaussians
 
 OPACITY = 0.1
-"""Of every Gaussian at the start."""
+"""Initial opacity."""
 HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
 FEW = 1_000
-"""Maximum number of Gaussians whose distances to the cameras are looked at."""
+"""Maximum number of Gaussians used to find distances from the cameras."""
 NARROW = 0.5
-"""Width of images in distances from the camera, 28 degrees, below which a lens is long."""
+"""Ratio of image width to distance, 28 degrees, below which a lens counts as long."""
 PLACES = {
     "points": "at the points of a reconstruction",
     "field": "on the surfaces of a field",
     "silhouettes": "in the visual hull",
     "random": "anywhere in the box",
 }
-"""Kinds of first points, in words."""
+"""Descriptions of the kinds of initial points."""
 NEIGHBOURS = 3
-"""Whose mean distance is a Gaussian's first size."""
+"""Number of neighbours; their mean distance is a Gaussian's initial size."""
 
 
 def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OPACITY, size: float = 1.0) -> Gaussians:
@@ -44,7 +44,7 @@ def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OP
         points: (N, 3) scene coordinates.
         colors: (N, 3) in [0, 1].
         degree: highest degree of the harmonics.
-        opacity: of each.
+        opacity: opacity of each Gaussian.
         size: standard deviation, in mean distances to the nearest neighbours.
     """
     count = len(points)
@@ -59,10 +59,10 @@ def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OP
 
 
 def neighbour_distance(points: Tensor) -> Tensor:
-    """Return the mean distance (N,) of each point to its three nearest neighbours, or nearly so.
+    """Return the approximate mean distance (N,) of each point to its three nearest neighbours.
 
-    Neighbours are looked for among the points next to it on four curves that fill space (Morton order, shifted by four
-    offsets), which finds most of them.
+    Candidates are adjacent points on four space-filling curves (Morton order with four offsets), which finds most
+    neighbours.
 
     Args:
         points: (N, 3).
@@ -82,7 +82,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
             gap = (along[step:] - along[:-step]).norm(dim=-1)
             infinite = gap.new_full((step,), torch.inf)
             found += [torch.cat([gap, infinite])[:, None], torch.cat([infinite, gap])[:, None]]
-        # The same neighbour may be met on several curves: distances that are equal count once.
+        # Several curves may find the same neighbour: equal distances count once.
         near = torch.cat(found, 1).sort(1).values
         near[:, 1:][near[:, 1:] == near[:, :-1]] = torch.inf
         best[order] = near.sort(1).values[:, :NEIGHBOURS]
@@ -91,7 +91,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
 
 
 def thinned(points: Tensor, count: int) -> Tensor:
-    """Return at most `count` of some points, evenly spaced along a curve that fills space (Morton order).
+    """Return at most `count` points, evenly spaced along a space-filling curve (Morton order).
 
     Args:
         points: (N, 3), which may be in the order of a scanner's lines.
@@ -106,7 +106,7 @@ def thinned(points: Tensor, count: int) -> Tensor:
 
 
 def morton(cells: Tensor) -> Tensor:
-    """Return the place (N,) int64 of cells along a curve that fills space.
+    """Return the index (N,) int64 of cells along a space-filling curve.
 
     Args:
         cells: (N, 3) int64, from 0 below 2^20.
@@ -122,12 +122,12 @@ def morton(cells: Tensor) -> Tensor:
 
 
 def seen_colors(points: Tensor, dataset: Dataset, views: int = 2) -> Tensor:
-    """Return the mean colour (N, 3) in [0, 1] that the nearest cameras see of each point, grey where none does.
+    """Return the mean colour (N, 3) in [0, 1] of each point in the nearest cameras, grey where none sees it.
 
     Args:
         points: (N, 3) scene coordinates.
-        dataset: images; of one with alpha, only pixels that are not transparent count.
-        views: how many images count.
+        dataset: images; transparent pixels do not count.
+        views: number of images per point.
     """
     cameras = dataset.cameras
     total, count = points.new_zeros(len(points), 3), points.new_zeros(len(points))
@@ -170,14 +170,14 @@ def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tenso
 def scene_size(scene: Scene, means: Tensor | None = None, cameras: Cameras | None = None) -> float:
     """Return the size of a scene, scene units: 1.3 times the median distance of Gaussians from the cameras.
 
-    That is what 3D Gaussian Splatting takes of cameras all around: 1.1 times the largest distance of one from their
-    middle, here where no Gaussians are given. Of cameras side by side it would be less than what they see is away.
-    Through long lenses a scene is smaller than its distance says, by as much as their images are narrow.
+    For cameras around a scene this agrees with 3D Gaussian Splatting: 1.1 times the largest distance of a camera from
+    their centre, which is used without Gaussians. For cameras side by side that would be too small. With long lenses
+    the size is reduced in proportion to the width of the images.
 
     Args:
         scene: facts about the data.
         means: (N, 3) centres of Gaussians, scene units; None if there are none yet.
-        cameras: M training cameras, for the width of what their images show; as wide as usual if None.
+        cameras: M training cameras, for the width of their images; None for usual lenses.
     """
     if scene.camera_to_worlds is None:
         return float((scene.box[1] - scene.box[0]).norm()) / 2
@@ -190,13 +190,13 @@ def scene_size(scene: Scene, means: Tensor | None = None, cameras: Cameras | Non
 
 
 def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Dataset, count: int) -> Tensor:
-    """Return the points (N, 3) at which Gaussians start, scene coordinates.
+    """Return the initial points (N, 3) of Gaussians, scene coordinates.
 
     Args:
         kind: points: those of a reconstruction. silhouettes: random ones on the surface of the visual hull of images
             with alpha. random: anywhere in the scene's box.
         dataset: the images.
-        count: number of random points, and maximum number of those of a reconstruction.
+        count: number of random points, or maximum number of points of a reconstruction.
 
     Raises:
         ConfigError: if the data has no points, or no pinhole images with alpha.

@@ -1,4 +1,4 @@
-"""The interface of strategies: how the Gaussians of a model come and go while it learns."""
+"""The interface of strategies, which add and remove Gaussians during training."""
 
 from __future__ import annotations
 
@@ -12,46 +12,45 @@ from nerfloom.splats.gaussians import Gaussians
 
 
 class Change(NamedTuple):
-    """Gaussians that stay, and those that are added behind them."""
+    """The Gaussians that stay, and new ones that follow them."""
 
     kept: Tensor
-    """(K,) int64 which of them stay as they are."""
+    """(K,) int64 indices of the Gaussians that stay."""
     fresh: Gaussians
-    """Those that are added, with new optimiser state."""
+    """New Gaussians, with new optimiser state."""
 
 
 class Strategy(nn.Module, ABC):
-    """A way in which Gaussians come and go.
+    """A strategy that adds, removes and moves Gaussians.
 
-    Its buffers are a part of checkpoints.
+    Its buffers are saved in checkpoints.
     """
 
     changes_per_doubling: ClassVar[float] = 5.0
-    """About how many changes double the number of Gaussians: growth by gradients was seen to need 4.5 to 6."""
+    """Approximate number of changes that double the number of Gaussians; measured for growth by gradients: 4.5 to 6."""
 
     def watch(self, records: Tensor, camera: SplatCamera) -> None:
-        """See a training image before its backward pass, as to keep the gradient of what it shows; nothing by default.
+        """See a training image before its backward pass, to retain gradients for example; nothing by default.
 
         Args:
             records: (N, C) Gaussians on the image, with a graph.
-            camera: of the image.
+            camera: camera of the image.
         """
 
     def after_every_step(self, finite: bool | Tensor) -> None:
-        """Do what follows each step, with its gradients in place; nothing by default.
+        """Called after each step, with its gradients in place; does nothing by default.
 
         Args:
-            finite: whether the step counts; if this is still on the device, () bool, nothing may change where it is
-                False.
+            finite: whether the step counts, possibly () bool on the device; if it is False, nothing may change.
         """
 
     def reset(self, gaussians: Gaussians, step: int) -> dict[str, Tensor]:
-        """Return new values of whole columns, whose optimiser state then starts anew; none by default.
+        """Return new values of whole columns; their optimiser state is reset. None by default.
 
-        It is asked every few steps (`steps_per_move`), and before `grow`, which is left out if it returns something.
+        Called every `steps_per_move` steps, before `grow`, which is skipped if this returns values.
 
         Args:
-            gaussians: all of them.
+            gaussians: all N Gaussians.
             step: number of training steps done before this one.
 
         Returns:
@@ -61,12 +60,12 @@ class Strategy(nn.Module, ABC):
 
     @abstractmethod
     def grow(self, gaussians: Gaussians, most: int, extent: float) -> Change | None:
-        """Return which Gaussians stay, and those that are added; None if nothing changes.
+        """Return the Gaussians that stay and the new ones; None if nothing changes.
 
-        It is asked every few steps (`steps_per_move`). A Gaussian is moved by adding it elsewhere.
+        Called every `steps_per_move` steps. To move a Gaussian, remove it and add it elsewhere.
 
         Args:
-            gaussians: all of them, at rest if they move with time.
+            gaussians: all N Gaussians, at rest if they move with time.
             most: maximum number of Gaussians afterwards.
             extent: size of the scene, scene units.
         """

@@ -1,4 +1,4 @@
-"""Gaussians as an optimiser changes them: a column for each parameter, by name, and a row for each Gaussian."""
+"""Gaussians as a table for the optimiser: a named column for each parameter, and a row for each Gaussian."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Column(nn.Module):
 
     Args:
         shape: shape of one Gaussian's values.
-        optimised: settings of the optimiser.
+        optimised: optimiser settings.
         in_extents: whether the values are lengths, stored in units of the scene's extent. One learning rate then suits
             scenes of any size.
     """
@@ -63,8 +63,8 @@ def usual_columns(degree: int, rate: float, position_rate: float) -> dict[str, C
 
     Args:
         degree: highest degree of the harmonics.
-        rate: learning rate of scales; those of the others are in a fixed ratio to it.
-        position_rate: learning rate of centres, extents of the scene. The run's schedule applies to it alone.
+        rate: learning rate of scales; the others have a fixed ratio to it.
+        position_rate: learning rate of centres, extents of the scene. Only this rate follows the run's schedule.
     """
 
     def column(shape: tuple[int, ...], name: str, factor: float) -> Column:
@@ -112,12 +112,12 @@ def as_rows(columns: Columns, gaussians: Gaussians, extent: Tensor | float = 1.0
 
 
 def row_changes(columns: Columns, kept: Tensor, fresh: Gaussians, extent: Tensor | float = 1.0) -> list[RowChange]:
-    """Return the changes of columns after which some Gaussians stay and others follow them.
+    """Return the changes of columns that keep some Gaussians and append others.
 
     Args:
         columns: the columns.
-        kept: (K,) int64 which of them stay.
-        fresh: those that are added.
+        kept: (K,) int64 indices of the Gaussians that stay.
+        fresh: the new Gaussians.
         extent: size of the scene, scene units.
     """
     rows = as_rows(columns, fresh, extent)

@@ -11,7 +11,7 @@ from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_r
 from nerfloom.splats.gaussians import Gaussians
 
 DIRECTIONS = 64
-"""Number of directions at which harmonics are compared; 16 unknowns need at least as many."""
+"""Number of directions at which harmonics are compared; 16 unknowns need at least 16."""
 TOLERANCE = 1e-4
 """Maximum deviation of a rotation's R R^T from the identity."""
 
@@ -19,8 +19,8 @@ TOLERANCE = 1e-4
 def transformed(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Tensor) -> Gaussians:
     """Return Gaussians moved by the similarity x -> scale * rotation @ x + shift.
 
-    They look the same from a camera that is moved likewise: what a direction d showed, `rotation @ d` shows now.
-    Columns that a method added are left out, since it is not known how they turn.
+    They look the same from a camera moved by the same similarity: direction d becomes `rotation @ d`.
+    Columns that a method added are dropped, since their transformation is unknown.
 
     Args:
         gaussians: N Gaussians.
@@ -79,7 +79,7 @@ def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
 
 
 def rotated_harmonics(harmonics: Tensor, rotation: Tensor) -> Tensor:
-    """Return coefficients with which the function of directions is rotated: what d showed, `rotation @ d` shows.
+    """Return the coefficients of the rotated function: its value at d moves to `rotation @ d`.
 
     Rotations do not mix degrees. The matrix of each degree (Wigner's D, in the real basis) is found by solving for it
     at more directions than it has columns, in float64, which is exact up to rounding.

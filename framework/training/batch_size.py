@@ -8,19 +8,19 @@ from nerfloom.base.config import RayConfig
 from nerfloom.base.pace import Pace
 
 SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
-"""Minimum and maximum number of rays per step, if it depends on the number of samples or on the time."""
+"""Minimum and maximum number of rays per step, if it depends on the number of samples or on time."""
 BATCH_CHANGES = 1.2
-"""Ratio of two numbers of rays up to which recorded steps keep theirs: a recording is for one size."""
+"""With CUDA graphs, resize batches only beyond this factor: a graph has a fixed size."""
 SHARE_OF_LAST = 0.2
-"""Share that the last measurement has in the running mean."""
+"""Weight of the last measurement in the running mean."""
 
 
 class BatchSize:
-    """Number of rays of a training step: as configured, to have a number of samples, or by how fast steps are.
+    """Number of rays of a training step: as configured, for a number of samples, or adapted to the speed of steps.
 
     Args:
         config: settings of a method that casts rays.
-        recorded: whether steps are recorded and repeated, so that each change costs time.
+        recorded: whether steps are CUDA graphs, so that each change costs time.
     """
 
     def __init__(self, config: RayConfig, recorded: bool) -> None:
@@ -31,10 +31,10 @@ class BatchSize:
         self._drawn = self._last = 0
 
     def keep_pace(self, pace: Pace) -> None:
-        """Limit the number of rays by the time, so that there are enough steps.
+        """Limit the number of rays so that enough steps fit into the time budget.
 
-        If the time is enough for N rays, it is enough for N / R steps of R rays. There are S steps for each ray of a
-        step if R is the square root of N / S. The first steps are small, as it is not known how long they take.
+        N rays in the budget make N / R steps of R rays. There are S steps per ray of a step if R is the square root of
+        N / S. The first steps are small, since their duration is unknown.
 
         Args:
             pace: the run before a step.
@@ -56,7 +56,7 @@ class BatchSize:
         """Return the number of rays of the next step.
 
         Args:
-            samples: number of samples that it is to have; None if the number of rays is given.
+            samples: wanted number of samples; None for a configured number of rays.
             samples_per_ray: mean over recent steps.
         """
         if samples is None:

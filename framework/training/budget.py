@@ -1,4 +1,4 @@
-"""The part of its budget that a run has spent, and the reason why it ends."""
+"""The spent fraction of a run's budget, and the reason why training ends."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from nerfloom.base.config import TrainConfig
 from nerfloom.training.state import State
 
 EVALUATION_SHARE, EVALUATION_SECONDS = 0.5, 10.0
-"""Maximum time of an evaluation that nobody has asked for, as a fraction of that of training; and what it may always
-take, seconds."""
+"""Maximum time of an automatic evaluation: this fraction of the training time, or this many seconds if that is more."""
 
 
 def spent(config: TrainConfig, state: State) -> float:
-    """Return the fraction of the budget that is spent, 0 to 1: of steps or seconds, whichever is larger.
+    """Return the spent fraction of the budget, 0 to 1: of steps or seconds, whichever is larger.
 
     Without a limit it is 0.
 
@@ -29,12 +28,12 @@ def spent(config: TrainConfig, state: State) -> float:
 
 
 def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) -> str | None:
-    """Return why training ends before the next step, for people; None if it goes on.
+    """Return why training ends before the next step, as text; None if it continues.
 
     Args:
         config: settings, with the budget and the target.
         state: state of the run.
-        stopped: numbers of the signals received, the first of which counts before all else.
+        stopped: numbers of the signals received; the first one takes precedence over all other reasons.
     """
     if stopped:
         return "stopped by " + signal.Signals(stopped[0]).name
@@ -49,7 +48,7 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
 
 
 def evaluation_seconds(config: TrainConfig, state: State) -> float | None:
-    """Return how long an evaluation may take, seconds; None if all images are asked for.
+    """Return the maximum time of an evaluation, seconds; None with `--eval all`.
 
     Args:
         config: settings of the run.

@@ -31,24 +31,24 @@ UNSEALED, SEALED = 1, 2
 SEAL = b"\nsha256:"
 """Bytes before the hexadecimal hash at the end of the file."""
 PIECE = 2**24
-"""Bytes that are read and hashed at a time."""
+"""Bytes to read and hash at a time."""
 SAFE_TORCH = "2.10"
 """First version of PyTorch whose `weights_only` reader is not known to execute code (CVE-2026-24747)."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
 def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool, before: int | None = None) -> Path:
-    """Write a checkpoint; then, unless all are kept, remove all checkpoints of earlier steps but one.
+    """Write a checkpoint; then, unless all are kept, remove all but one checkpoint of earlier steps.
 
-    Checkpoints of later steps are damaged, as the run continued from an earlier one; they stay, and are not counted.
+    Checkpoints of later steps are damaged, since the run continued from an earlier one. They stay and do not count.
 
     Args:
         folder: folder of the checkpoints, created if missing.
         step: number of training steps done, which is in the file's name.
         state: tensors and plain data.
         keep_all: whether all checkpoints are kept.
-        before: step of the earlier checkpoint to keep, which the run last wrote or continued from. If None, or if there
-            is no such checkpoint, that of the last step before `step` is kept.
+        before: step of the earlier checkpoint to keep: the run last wrote it or continued from it. If None or missing,
+            the checkpoint of the last step before `step` is kept.
 
     Returns:
         The checkpoint's path.
@@ -65,8 +65,8 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
         content.write(SEAL + hashlib.sha256(content.getbuffer()).hexdigest().encode())
         write_atomically(path, lambda file: file.write(content.getbuffer()))
     except (OSError, RuntimeError) as error:
-        raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints stand") from error
-    for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # left by a process that was killed while writing
+        raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints are unchanged") from error
+    for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # from a process killed while writing
         remnant.unlink(missing_ok=True)
     earlier = [other for other in list_checkpoints(folder) if other.name < path.name]
     previous = None if before is None else checkpoint_path(folder, before)
@@ -96,7 +96,7 @@ def list_checkpoints(folder: Path) -> list[Path]:
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint; no code in it is executed (`weights_only`) unless PyTorch is older than `SAFE_TORCH`.
+    """Read a checkpoint without executing code in it (`weights_only`), if PyTorch is `SAFE_TORCH` or newer.
 
     Args:
         path: file to read.
@@ -113,7 +113,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     try:
         sealed = _is_sealed(path)
         if uncompressed_size(path) > path.stat().st_size:  # torch writes uncompressed, but reads compressed
-            raise CheckpointError(f"{path} is damaged: it would unfold to more than it holds")
+            raise CheckpointError(f"{path} is damaged: its uncompressed size is larger than the file")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns of foreign pickles, which are refused below
             state = torch.load(path, map_location=device, weights_only=True)
@@ -132,7 +132,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
 
 
 def _is_sealed(path: Path) -> bool:
-    """Return whether a file ends with a seal; raise CheckpointError if it is not the seal of the bytes before it."""
+    """Return whether a file ends with a seal; raise CheckpointError if the seal does not match the bytes before it."""
     length = len(SEAL) + 2 * hashlib.sha256().digest_size
     with path.open("rb") as file:
         remaining = max(file.seek(0, os.SEEK_END) - length, 0)
@@ -169,7 +169,7 @@ def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, A
 
 
 def find_newest(folder: Path, device: torch.device | str = "cpu") -> tuple[Path, dict[str, Any]] | None:
-    """Return the newest readable checkpoint in a folder; one that cannot be read is reported and skipped.
+    """Return the newest readable checkpoint in a folder; unreadable ones are reported and skipped.
 
     Args:
         folder: folder of the checkpoints.
@@ -186,7 +186,7 @@ def find_newest(folder: Path, device: torch.device | str = "cpu") -> tuple[Path,
         try:
             return path, load_checkpoint(path, device)
         except CheckpointError as error:
-            say(f"{error}; trying the one before")
+            say(f"{error}; trying the previous one")
     if paths:
         raise CheckpointError(f"none of the {len(paths)} checkpoints in {folder} can be read")
     return None

@@ -1,9 +1,9 @@
 """Learning curves: PSNR and SSIM of held-out images over the training time.
 
-Evaluations of all held-out images are rare, and their number is the user's choice. Between them a few images, evenly
-spaced and always the same, are evaluated on a schedule by time, so that every run has a curve. If whole images would
-take too long, only every n-th row and column of pixels is rendered. Their rays are those of the whole image, so that
-their PSNR estimates that of the whole image without bias. SSIM is computed on the image that those pixels form.
+Evaluations of all held-out images are rare, and the user sets their schedule. Between them a few images, evenly spaced
+and always the same, are evaluated on a time schedule, so that every run has a curve. If whole images would take too
+long, only every n-th row and column of pixels is rendered, with the same rays as in the whole image. Their PSNR is an
+unbiased estimate of the whole image's. SSIM is computed on the image of these pixels.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ FEW = 3
 SHARE = 0.05
 """Maximum time of these evaluations, as a fraction of the seconds of training."""
 MARGIN = 0.8
-"""Fraction of that time that is planned; the next evaluation's time is estimated from that of the last."""
+"""Fraction of that time to plan with; the next evaluation's time is estimated from the last one's."""
 SPACING = 1.15
-"""Minimum ratio of the seconds of training at an evaluation and at the one before."""
+"""Minimum ratio of the training times at consecutive evaluations."""
 NUM_LOOKS = 10
-"""Number of evaluations in a run for which the pixel stride is chosen."""
+"""Number of evaluations per run that the pixel stride is chosen for."""
 PICTURE_SPEED = 2.0
-"""Assumed ratio, before the first evaluation, of rays per second in rendering and in training. Measured: 2 to 7."""
+"""Ratio of rays per second in rendering and in training, assumed before the first evaluation. Measured: 2 to 7."""
 MOST_PIXELS = 2**14
 """Maximum number of evaluated pixels per image; more would add little precision."""
 LEAST_SIDE = 16
@@ -41,8 +41,8 @@ LEAST_SIDE = 16
 
 Entry: TypeAlias = (
     tuple[float, int, float] | tuple[float, int, float, float | None, int | None, int, float | None, bool]
-)  # not quoted: Python 3.10 leaves a text within tuple[...] as it is, and checkpoints are checked against this type
-"""A point in a checkpoint; points of early versions have the first three values only."""
+)  # not quoted: Python 3.10 does not resolve strings within tuple[...], and checkpoints are checked against this type
+"""A point in a checkpoint; points of early versions have only the first three values."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def rows(points: Sequence[Point]) -> list[dict[str, Any]]:
 
 
 def num_rays(sizes: Sequence[tuple[int, int]], stride: int, rays_per_pixel: int) -> int:
-    """Return the number of rays to render every n-th row and column of some images.
+    """Return the number of rays in every n-th row and column of images.
 
     Args:
         sizes: (height, width) of each image, pixels.
@@ -94,9 +94,9 @@ def num_rays(sizes: Sequence[tuple[int, int]], stride: int, rays_per_pixel: int)
 
 
 def pixel_stride(sizes: Sequence[tuple[int, int]], rays_per_pixel: int, rays: float) -> int:
-    """Return the smallest stride at which some images take at most about a given number of rays together.
+    """Return the smallest stride at which images together take at most about a given number of rays.
 
-    With it, no image has more than MOST_PIXELS pixels, and no shorter side becomes less than LEAST_SIDE pixels.
+    No image then has more than MOST_PIXELS pixels, and no shorter side less than LEAST_SIDE pixels.
 
     Args:
         sizes: (height, width) of each image, pixels.
@@ -116,7 +116,7 @@ def is_due(points: Sequence[Point], seconds: float, cost: float, *, last: bool =
         points: evaluations of a few images so far.
         seconds: seconds of training so far.
         cost: estimated seconds of the evaluation.
-        last: whether training ends here, so that there is no later evaluation.
+        last: whether training ends here.
     """
     spent = sum(point.evaluation_seconds or 0.0 for point in points)
     if spent + cost > MARGIN * SHARE * seconds:
@@ -141,7 +141,7 @@ class FewImages:
         self._sizes = [(int(cameras.heights[view]), int(cameras.widths[view])) for view in self._views]
 
     def look_if_due(self, model: Renderable, looks: Sequence[Entry], report: StepReport, *, last: bool) -> Point | None:
-        """Evaluate the images if it is time to.
+        """Evaluate the images if an evaluation is due.
 
         Args:
             model: the model.
@@ -150,7 +150,7 @@ class FewImages:
             last: whether training ends with that step.
 
         Returns:
-            The evaluation; None if it is not time.
+            The evaluation; None if none is due.
         """
         if not self._views or (looks and not last and report.seconds < SPACING * looks[-1][0]):
             return None
@@ -159,7 +159,7 @@ class FewImages:
         if not is_due(points, report.seconds, cost, last=last):
             return None
         if not points and runs_ahead(model.device):
-            self._measure(model, stride)  # compiles what rendering needs, which is not the cost of the next ones
+            self._measure(model, stride)  # compiles kernels, which must not count as this evaluation's time
         start = time.perf_counter()
         found = self._measure(model, stride)
         cost = time.perf_counter() - start
@@ -168,8 +168,8 @@ class FewImages:
     def _plan(self, points: Sequence[Point], report: StepReport) -> tuple[int, float]:
         """Return the pixel stride of the next evaluation and its estimated seconds.
 
-        The first evaluation, of as few pixels as possible, measures the time of a ray; the second chooses the stride by
-        the time that the run allows, and all later ones keep it.
+        The first evaluation uses as few pixels as possible and measures the time per ray. The second chooses the stride
+        from the available time, and all later ones keep it.
         """
         if not points:
             stride = pixel_stride(self._sizes, self._rays_per_pixel, 0)
@@ -186,7 +186,7 @@ class FewImages:
     def _measure(self, model: Renderable, stride: int) -> Measured:
         """Return the mean PSNR and SSIM of every `stride`-th row and column.
 
-        Images are rendered with the mean appearance whatever --eval-appearance is: fitting one to each takes long.
+        Rendering uses the mean appearance regardless of --eval-appearance, since fitting one per image is slow.
         """
         background = model.background
         measured = [measure_view(model, self._dataset, view, background, stride) for view in self._views]

@@ -30,14 +30,14 @@ MAX_FILES = 5000
 
 
 def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None, str]:
-    """Return the data folder and its format; for None, no folder and the format of the embedded scene.
+    """Return the data folder and its format.
 
-    A path inside a data folder, such as transforms.json or sparse/0, stands for the folder. Formats that cannot be
-    loaded are reported and ignored.
+    A path inside a data folder, such as transforms.json or sparse/0, stands for the folder. Formats that fail to load
+    are reported and ignored.
 
     Args:
-        path: the user's path, or None.
-        named: the format that the user named, or None; a named format need not recognise the folder.
+        path: the user's path; None for the embedded scene.
+        named: the format that the user named; None to detect it. A named format need not recognise the folder.
 
     Raises:
         DataError: if the folder does not exist, if no format recognises it, or if several do.
@@ -60,8 +60,8 @@ def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None,
 
 
 def _candidates(path: Path) -> Iterator[Path]:
-    """Yield the folder itself, and its parents as long as its name is that of a part of a data folder."""
-    if os.path.isdir(path):  # `Path.is_dir` raises for names that no file can have
+    """Yield the folder, and its parents while the name is that of a data folder's part."""
+    if os.path.isdir(path):  # `Path.is_dir` raises for invalid file names
         yield path
     elif not os.path.isfile(path):
         return
@@ -73,7 +73,7 @@ def _candidates(path: Path) -> Iterator[Path]:
 
 
 def _formats(names: list[str]) -> dict[str, type[DataParser]]:
-    """Load the formats, skipping broken ones with a warning; a single format was named by the user and must load."""
+    """Load the formats. Broken ones are skipped with a warning, but a single format, named by the user, must load."""
     formats = {}
     for name in names:
         try:

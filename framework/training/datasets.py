@@ -19,14 +19,14 @@ def load_split(run: Run, split: Split, most: int | None = None) -> Dataset:
     Args:
         run: the run, with the data's folder and format and the limit of pixels in memory.
         split: part of the data set.
-        most: maximum number of images, evenly spaced; None for all. Of images at several sizes, and if others are
-            rendered from some, all are loaded.
+        most: maximum number of images, evenly spaced; None for all. No effect on data with images at several scales or
+            with source images.
 
     Raises:
         DataError: if the data is missing or cannot be read.
     """
     memory = PixelMemory.of(run.config.cache_limit, run.config.cache_dir)
-    # In an evaluation masked-out pixels are always ignored, so that metrics are comparable between runs.
+    # Evaluations always ignore masked-out pixels, so that metrics are comparable between runs.
     masks = run.config.masks if split == "train" else "ignored"
     parsed = run.parse(split)
     if most is not None and parsed.num_scales == 1 and parsed.source_images is None:
@@ -35,11 +35,11 @@ def load_split(run: Run, split: Split, most: int | None = None) -> Dataset:
 
 
 def first_split(run: Run, splits: tuple[Split, ...], most: int | None = None) -> Dataset | None:
-    """Parse and decode the first of several splits that can be read; splits that cannot are reported.
+    """Parse and decode the first readable split of several; unreadable ones are reported.
 
     Args:
         run: the run, as for `load_split`.
-        splits: splits in the order in which they are tried.
+        splits: splits to try, in order.
         most: maximum number of images, as for `load_split`.
 
     Returns:

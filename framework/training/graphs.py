@@ -1,15 +1,14 @@
-"""Training steps that are recorded as CUDA graphs and repeated, so that a GPU does not wait for Python.
+"""Training steps captured and replayed as CUDA graphs, so that the GPU does not wait for Python.
 
-A step of nerfacto is some hundreds of small operations; to start them one by one takes longer than the GPU computes. A
-CUDA graph holds what a step has started, with the addresses of its tensors, and starts all of it again at once. What
-differs between steps is in tensors that stay where they are: parameters, Adam's state, learning rates
-(`base.device.StepValue`), the images; random numbers are a function of the generator's seed and the place of the draw
-(Philox; Salmon et al. 2011), and the seed is that of the step. A step that was repeated is therefore the same as one
-that was not.
+A step of nerfacto consists of hundreds of small operations. Launching them one by one takes longer than the GPU's work.
+A CUDA graph records the launches with the addresses of their tensors, and replays all of them at once. Values that
+differ between steps are in tensors at fixed addresses: parameters, Adam's state, learning rates
+(`base.device.StepValue`) and images. Random numbers are a function of the generator's seed, which is the step's, and
+the position of the draw (Philox; Salmon et al. 2011). A replayed step is therefore the same as an ordinary one.
 
-A recording is believed only after a test: in the step after it was made, the step is also taken without it, and both
-must have the same loss and change all that is learnt alike. It is tested once more later, when what a recording might
-still have held on to has changed. Whatever fails, training goes on without recordings, and a line says why.
+Each graph is tested: in the step after its capture, the step also runs without it, and both must give the same loss and
+the same update of all learnt tensors. A second test follows later, when tensors that the graph might have fixed by
+mistake have changed. If anything fails, training continues without graphs, and a message says why.
 """
 
 from __future__ import annotations
@@ -33,43 +32,43 @@ from nerfloom.model import Model
 
 T = TypeVar("T")
 WARM_UP = 3
-"""Number of steps of a kind that are taken before one is recorded: in these, kernels are compiled, libraries set up and
-constants brought to the device."""
+"""Number of steps of a kind before one is captured. They compile kernels, set up libraries and copy constants to the
+device."""
 TOLERANCE = 0.1
-"""Largest difference between a repeated step's change of a tensor and that of the step without it, relative to the
-latter. The two are not the same to the bit, since sums are added up in any order on a GPU; a step with another draw,
-learning rate or number differs by its whole size."""
+"""Maximum difference between the updates of a tensor by a replayed and an ordinary step, relative to the latter. The
+bits differ, since the order of sums on a GPU varies; a step with another draw, learning rate or number differs by its
+whole size."""
 LOSS_TOLERANCE = 0.01
-"""Largest difference between the losses of both, relative to that of the step without a recording."""
+"""Maximum difference between the losses of both, relative to the ordinary step's."""
 TESTED = 0, 64
-"""Numbers of repetitions of a recording before it is tested. In 64 steps an occupancy grid has been updated four times
-and more, learning rates have changed, and other tensors may have moved."""
+"""Numbers of replays before each test of a graph. In 64 steps an occupancy grid has been updated at least four times,
+learning rates have changed, and other tensors may have moved."""
 MOST_KINDS = 4
-"""Number of kinds of steps whose recordings are kept, with the memory that each holds: those that were taken last."""
+"""Maximum number of kinds of steps whose graphs are kept, most recent first; each graph holds memory."""
 WAITED = "called a synchronizing CUDA operation"
-"""What torch warns of where Python waits for a GPU, if it is asked to."""
+"""Part of torch's warning where Python waits for the GPU."""
 FLAG = "--machine.cuda-graphs"
 
 
 class Recorder(Protocol):
-    """A way to record what a function starts on a device."""
+    """Captures the operations that a function launches on a device."""
 
     def run(self, function: Callable[[], T]) -> T:
-        """Call `function` as it is recorded later, and return its result."""
+        """Call `function` in the same way as for a capture, and return its result."""
 
     def watched(self, function: Callable[[], T]) -> tuple[T, str | None]:
-        """Call `function` likewise, and return its result, and where it waited for the device; None if nowhere."""
+        """Call `function` like `run`, and return its result and where it waited for the device; None if nowhere."""
 
     def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], None]]:
-        """Record `function` without running what it starts.
+        """Capture `function` without running its operations.
 
         Returns:
-            Its result, whose tensors get their values when what was recorded runs, and a function that runs it.
+            Its result, whose tensors get their values in a replay, and the function that replays it.
         """
 
 
 class CudaRecorder:
-    """CUDA graphs on a stream of their own, as autograd's nodes must run on the stream on which they were made.
+    """CUDA graphs on their own stream, since autograd's nodes must run on the stream that created them.
 
     Args:
         device: the GPU.
@@ -87,10 +86,10 @@ class CudaRecorder:
         return result
 
     def watched(self, function: Callable[[], T]) -> tuple[T, str | None]:
-        """Call `function` on the stream, and return its result, and where it waited for the GPU; None if nowhere.
+        """Call `function` on the stream, and return its result and where it waited for the GPU; None if nowhere.
 
-        A recording of what waits fails, and leaves torch's allocator and generator in a state from which nothing goes
-        on; so this is found out before.
+        Capturing a step that synchronises fails, and leaves torch's allocator and generator unusable. This call detects
+        such a step before.
         """
         before = torch.cuda.get_sync_debug_mode()
         with warnings.catch_warnings(record=True) as warned:
@@ -104,15 +103,15 @@ class CudaRecorder:
         return result, places[0] if places else None
 
     def record(self, function: Callable[[], T]) -> tuple[T, Callable[[], None]]:
-        """Record `function` as a graph, and return its result, with the graph's memory, and what replays it.
+        """Capture `function` as a graph, and return its result, in the graph's memory, and the replay function.
 
         Raises:
-            ConfigError: if that fails, and leaves the GPU or its generator in a state from which nothing can go on.
+            ConfigError: if that fails and leaves the GPU or its generator unusable.
         """
         graph = torch.cuda.CUDAGraph()
-        gc.collect()  # as torch itself does up to 2.8
+        gc.collect()  # as torch does up to 2.8
         collecting = gc.isenabled()
-        gc.disable()  # to free a kernel or another graph while one is recorded would spoil it
+        gc.disable()  # freeing a kernel or another graph would break the capture
         try:
             with torch.cuda.graph(graph, stream=self.stream):
                 result = function()
@@ -121,7 +120,7 @@ class CudaRecorder:
                 torch.rand((), device=self.device)
                 torch.cuda.synchronize(self.device)
             except RuntimeError:
-                raise ConfigError(f"recording a CUDA graph failed ({_one_line(failure)}); use {FLAG} off") from failure
+                raise ConfigError(f"capturing a CUDA graph failed ({_one_line(failure)}); use {FLAG} off") from failure
             raise
         finally:
             if collecting:
@@ -131,25 +130,25 @@ class CudaRecorder:
 
 @dataclass
 class _Kind(Generic[T]):
-    """A kind of step: how many of it were taken, and its recording."""
+    """A kind of step, with its graph."""
 
     taken: int = 0
-    """Number of steps that were taken to warm up."""
+    """Number of warm-up steps."""
     recorded: tuple[T, Callable[[], None]] | None = None
-    """The result of the recorded step, and what repeats it."""
+    """The result of the captured step, and its replay function."""
     repeated: int = 0
-    """Number of steps that were taken by repeating it."""
+    """Number of replays."""
     passed: int = 0
-    """Number of tests in which repeating it has done what the step itself does."""
+    """Number of passed tests."""
 
 
 class StepGraphs(Generic[T]):
-    """Steps of a run, recorded and repeated by their kind.
+    """Steps of a run, captured and replayed by kind.
 
     Args:
-        recorder: records them.
-        learnt: returns all tensors that a step changes for good: parameters, and the optimiser's state.
-        must: whether a step that cannot be recorded is an error.
+        recorder: captures the steps.
+        learnt: returns all tensors that a step changes permanently: parameters, and the optimiser's state.
+        must: whether a step that cannot be captured is an error.
         loss: returns the loss () of a step's result, which is tested too; None if there is none.
     """
 
@@ -162,40 +161,40 @@ class StepGraphs(Generic[T]):
     ) -> None:
         self._recorder, self._learnt, self._must, self._loss = recorder, learnt, must, loss
         self.repeated = 0
-        """Number of steps that were taken by repeating one."""
+        """Number of replayed steps."""
         self._kinds: dict[Hashable, _Kind[T]] = {}
         self._told: set[str] = set()
         self._given_up = self._announced = False
 
     def forget(self) -> None:
-        """Drop all recordings, since tensors have moved."""
+        """Drop all graphs, after tensors have moved."""
         self._kinds.clear()
 
     def take(self, kind: StepKind) -> bool:
-        """Return whether a step of a `kind` is to be taken by `run`; if not, say why, once.
+        """Return whether to take a step of a `kind` with `run`; if not, print the reason once.
 
         Raises:
-            ConfigError: if it is not, and must be.
+            ConfigError: if steps must be captured and this one cannot be.
         """
         if kind.varies is not None:
             self._refuse(kind.varies)
         return kind.varies is None and not self._given_up
 
     def run(self, kind: StepKind, seed: Callable[[], None], step: Callable[[], T]) -> T:
-        """Take a step, by repeating a recorded one of the same kind if there is one.
+        """Take a step, by replaying a graph of the same kind if there is one.
 
         Args:
-            kind: its kind.
+            kind: the step's kind.
             seed: seeds the generators for this step.
-            step: takes it; a function of the values of tensors, and of `kind`, alone.
+            step: takes the step; it depends only on values of tensors and on `kind`.
 
         Returns:
-            The step's result. Its tensors are written to by the next step.
+            The step's result. The next step overwrites its tensors.
 
         Raises:
-            ConfigError: if the step cannot be recorded, and must be.
+            ConfigError: if steps must be captured and this one cannot be.
         """
-        kept = self._kinds[kind.of] = self._kinds.pop(kind.of, _Kind())  # the last one taken is the last in the table
+        kept = self._kinds[kind.of] = self._kinds.pop(kind.of, _Kind())  # the most recent kind is the last
         if len(self._kinds) > MOST_KINDS:
             self._kinds.pop(next(iter(self._kinds)))
         if kept.recorded is None:
@@ -223,11 +222,11 @@ class StepGraphs(Generic[T]):
             kept.recorded = self._recorder.record(step)
         except ConfigError:
             raise
-        except Exception as error:  # of torch, CUDA or Triton: any of them may find what cannot be recorded
-            self._give_up(f"recording one failed ({_one_line(error)})")
+        except Exception as error:  # torch, CUDA or Triton: each may refuse a capture
+            self._give_up(f"capturing one failed ({_one_line(error)})")
 
     def _test(self, kept: _Kind[T], seed: Callable[[], None], step: Callable[[], T]) -> T:
-        """Take a step without and with its recording, and drop the latter if they differ."""
+        """Take a step without and with its graph, and drop the graph if they differ."""
         assert kept.recorded is not None
         result, repeat = kept.recorded
         tensors = self._learnt()
@@ -243,18 +242,18 @@ class StepGraphs(Generic[T]):
         apart = _distance(tensors, after)
         fault = None
         if not bool((apart <= TOLERANCE * moved).all()):  # NaN is not
-            fault = "change what the step itself changes"
+            fault = "make the same update as an ordinary one"
         if self._loss is not None and not _close(self._loss(result), wanted):
-            fault = "have the loss of the step itself"
+            fault = "have the same loss as an ordinary one"
         if fault is not None:
             _restore(tensors, after)
-            self._give_up(f"a repeated step did not {fault}")
+            self._give_up(f"a replayed step did not {fault}")
             return expected
-        tells = bool((moved > 0).any())  # a step that was dropped tells nothing
+        tells = bool((moved > 0).any())  # a dropped step proves nothing
         kept.passed += tells
         if tells and not self._announced:
             self._announced = True
-            say("training steps are recorded as CUDA graphs and repeated")
+            say("training steps are captured as CUDA graphs and replayed")
         return result
 
     def _give_up(self, why: str) -> None:
@@ -264,10 +263,10 @@ class StepGraphs(Generic[T]):
 
     def _refuse(self, why: str) -> None:
         if self._must:
-            raise ConfigError(f"{FLAG} on: steps cannot be repeated as CUDA graphs, because {why}; leave it out")
+            raise ConfigError(f"{FLAG} on: steps cannot be replayed as CUDA graphs, because {why}; leave it out")
         if why not in self._told:
             self._told.add(why)
-            say(f"note: steps are not repeated as CUDA graphs, because {why}")
+            say(f"note: steps are not replayed as CUDA graphs, because {why}")
 
 
 def _one_line(error: Exception) -> str:
@@ -285,14 +284,14 @@ def _restore(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
 
 
 def _close(loss: Tensor, wanted: Tensor | None) -> bool:
-    """Return whether a loss is that which is wanted, or neither is finite."""
+    """Return whether two losses agree, or neither is finite."""
     assert wanted is not None
     return bool(torch.isclose(loss, wanted, LOSS_TOLERANCE, 0.0) | ~(loss.isfinite() | wanted.isfinite()))
 
 
 @torch.no_grad()
 def _distance(some: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
-    """Return the Euclidean distance between each two tensors, (K,) float64; what is infinite in both is alike."""
+    """Return the Euclidean distance of each pair of tensors, (K,) float64; equal infinities have distance 0."""
     pairs = zip(some, others, strict=True)
     return torch.stack([torch.where(a == b, 0.0, a.double() - b.double()).norm() for a, b in pairs])
 
@@ -303,32 +302,32 @@ def make_graphs(
     learnt: Callable[[], Sequence[Tensor]],
     loss: Callable[[Any], Tensor] | None = None,
 ) -> StepGraphs[Any] | None:
-    """Return the recorded steps of a run; None if they are switched off or the device has no graphs.
+    """Return the step graphs of a run; None if they are off or the device has none.
 
     Args:
         mode: auto, on or off, as configured.
         device: the device of training.
-        learnt: returns all tensors that a step changes for good.
+        learnt: returns all tensors that a step changes permanently.
         loss: returns the loss () of a step's result; None if there is none.
 
     Raises:
-        ConfigError: if they are switched on, and the device has none.
+        ConfigError: if they are on and the device has none.
     """
     if mode == "on" and device.type != "cuda":
-        raise ConfigError(f"{FLAG} on: only GPUs that PyTorch names cuda have graphs, and this run is on {device.type}")
+        raise ConfigError(f"{FLAG} on: only CUDA devices have graphs, and this run is on {device.type}; leave it out")
     if mode == "off" or device.type != "cuda":
         return None
     return StepGraphs(CudaRecorder(device), learnt, mode == "on", loss)
 
 
 def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple[Hashable, ...]) -> StepKind:
-    """Return the kind of a whole training step, the drawing of its batch included.
+    """Return the kind of a whole training step, including the draw of its batch.
 
     Args:
         model: the model to train.
         source: source of the batches.
         step: number of training steps done.
-        batch: the numbers that the source is asked for.
+        batch: the requested sizes of the batch.
     """
     if processes().count > 1:
         return StepKind(varies="several processes exchange their gradients")

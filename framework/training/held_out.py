@@ -1,4 +1,4 @@
-"""The held-out images of a run, which are looked at while it is trained."""
+"""Evaluations of a run's held-out images during training."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nerfloom.training.state import State
 PICTURE_SHARE = 0.1
 """Maximum time for TensorBoard's images, as a fraction of the training time."""
 SECONDS_TO_A_TARGET = 15.0
-"""Seconds of training between evaluations of all images, if a PSNR is to be reached and no other number is given."""
+"""Default seconds of training between evaluations of all images, with a target PSNR."""
 
 
 class HeldOut:
@@ -33,34 +33,34 @@ class HeldOut:
 
     Args:
         config: the settings, decided.
-        model: the model that is trained.
-        dataset: the held-out images, or a few of them; None if nothing is to be evaluated.
+        model: the model in training.
+        dataset: the held-out images, or a few of them; None for no evaluation.
         folder: folder of the learning curve; None to write none.
     """
 
     def __init__(self, config: TrainConfig, model: Model[Any], dataset: Dataset | None, folder: Path | None) -> None:
         self.config, self.model, self._given, self._folder = config, model, dataset, folder
         self.load_all: Callable[[], Dataset | None] | None = None
-        """Loads all held-out images, when they are first needed; None if `dataset` has them all."""
+        """Loads all held-out images on first use; None if `dataset` has them all."""
         limit = config.max_eval_images
         self._few = None if dataset is None else FewImages(dataset, limit, model.rays_per_pixel)
         self._last = self._picture_seconds = 0.0
 
     @cached_property
     def dataset(self) -> Dataset | None:
-        """All held-out images; None if nothing is to be evaluated."""
+        """All held-out images; None for no evaluation."""
         return self._given if self.load_all is None or self._given is None else self.load_all()
 
     def resume(self, state: State) -> None:
-        """Go on after the last evaluation of a restored `state`."""
+        """Continue after the last evaluation of a restored `state`."""
         self._last = state.curve[-1][0] if state.curve else 0.0
 
     def evaluate_if_due(self, state: State, board: TensorBoard) -> None:
-        """Evaluate one or all of the images if it is time to.
+        """Show one image or evaluate all of them, if due.
 
         Args:
-            state: the run's state, to whose curve an evaluation of all images is added.
-            board: where pictures and results are shown.
+            state: the run's state; its curve receives an evaluation of all images.
+            board: receives pictures and results.
         """
         config, step = self.config, state.step
         if self._given is None or config.max_eval_images == 0:
@@ -92,14 +92,14 @@ class HeldOut:
             self.write_curve(state)
 
     def _seconds_per_image(self, state: State) -> float:
-        """Return how long a whole image takes by the last evaluation of a few; infinity before the first."""
+        """Return the seconds of a whole image, estimated from the last evaluation of a few; infinity without one."""
         if not state.looks:
             return math.inf
         last = Point(*state.looks[-1])
         return (last.evaluation_seconds or 0.0) / (last.images or 1) * last.pixel_stride**2
 
     def _show(self, index: int, dataset: Dataset, step: int, board: TensorBoard) -> None:
-        """Show image `index` beside what the model renders of it."""
+        """Show image `index` beside its render."""
         background = self.model.background
         picture, seconds = timed_view(self.model, dataset.view(index), background)
         target = composite(dataset.image(index).float() / 255, background)
@@ -108,12 +108,12 @@ class HeldOut:
         board.image("eval/comparison", composed(panels), step)
 
     def look_if_due(self, state: State, report: StepReport, board: TensorBoard, *, last: bool) -> None:
-        """Evaluate a few of the images if it is time to.
+        """Evaluate a few of the images, if due.
 
         Args:
-            state: the run's state, to whose looks the evaluation is added.
+            state: the run's state; its `looks` receive the evaluation.
             report: report of the last training step.
-            board: where results are shown.
+            board: receives the results.
             last: whether training ends with that step.
         """
         if self._few is None:

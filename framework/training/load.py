@@ -1,4 +1,4 @@
-"""The one function that opens what a user names: a run, a folder of runs, or a file of Gaussians."""
+"""Loading of a run, a folder of runs, or a file of Gaussians."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def load(
     """Load a trained run or a file of Gaussians.
 
     Args:
-        path: the run's folder, its config.yml, a folder above it, whose newest run is taken, or a file of Gaussians
-            (.ply, .spz, .splat) in the frame of the input.
-        checkpoint: checkpoint of a run; the newest readable one if None.
+        path: the run's folder, its config.yml, a folder above it (for its newest run), or a file of Gaussians (.ply,
+            .spz, .splat) in the frame of the input.
+        checkpoint: checkpoint of a run; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.
-        data: folder of the data: where that of a run is now, or that of a file of Gaussians, which may have none.
-        rays_per_pixel: rays per rendered pixel; the run's if None.
-        eval_appearance: appearance of held-out images; the run's if None.
-        data_format: format of the data of a file of Gaussians, and its flags; recognised if None.
-        up: upward direction of a file of Gaussians without data, along z if None.
+        data: folder of the data, if a run's has moved; optional data for a file of Gaussians.
+        rays_per_pixel: rays per rendered pixel; None for the run's setting.
+        eval_appearance: appearance of held-out images; None for the run's setting.
+        data_format: data format for a file of Gaussians, with its flags; None to detect it.
+        up: up axis of a file of Gaussians without data; None for z.
 
     Raises:
         ConfigError: if settings are missing or do not fit.

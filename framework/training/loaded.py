@@ -1,4 +1,4 @@
-"""A trained run or a file of Gaussians, opened by a command or a notebook to be rendered and evaluated."""
+"""A loaded run or file of Gaussians, for rendering and evaluation."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from nerfloom.training.run import Run
 
 @dataclass(frozen=True, repr=False)
 class Loaded:
-    """Something to look at, and where it comes from, as `nerfloom.load` opens it."""
+    """A renderable and its origin: the result of `nerfloom.load`."""
 
     model: Renderable
-    """What is looked at, on its device: a `nerfloom.Model` in evaluation mode, or Gaussians."""
+    """The renderable, on its device: a `nerfloom.Model` in evaluation mode, or Gaussians."""
     placement: Placement
     """Placement of the input in the scene of `model`."""
     method: str
     """Name of the method that made it."""
     origin: Path
-    """The run's folder, or the file of Gaussians: what commands take to open it again."""
+    """The run's folder, or the file of Gaussians, for commands that load it again."""
     checkpoint: Path
-    """File from which the parameters were read."""
+    """File of the parameters."""
     step: int = 0
-    """Number of training steps done; 0 if it is not known."""
+    """Number of training steps done; 0 if unknown."""
     source: Run | None = None
-    """Method, settings, data and folder; None for Gaussians that were given without data."""
+    """Method, settings, data and folder; None for Gaussians without data."""
     _datasets: dict[Split, Dataset] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -44,12 +44,12 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True if it is a run, with a folder of its own, and no file of Gaussians."""
+        """True for a run, False for a file of Gaussians."""
         return self.origin != self.checkpoint
 
     @property
     def folder(self) -> Path:
-        """Folder for results: that of the run, or the one that the file is in."""
+        """Folder for results: the run's folder, or the folder of the file."""
         return self.origin if self.is_run else self.origin.parent
 
     @property
@@ -59,13 +59,13 @@ class Loaded:
 
     @property
     def run(self) -> Run:
-        """The run; of Gaussians, a run in name that holds the data given with them.
+        """The run. For Gaussians with data it is a placeholder that holds the data.
 
         Raises:
-            ConfigError: for Gaussians that were given without data.
+            ConfigError: for Gaussians without data.
         """
         if self.source is None:
-            raise ConfigError(f"{self.origin} is no run, and does not know its photographs: --data DIR")
+            raise ConfigError(f"{self.origin} is not a run, so that its photographs are unknown: give --data DIR")
         return self.source
 
     def dataset(self, split: Split = "test") -> Dataset:
@@ -75,8 +75,8 @@ class Loaded:
             split: train, val or test.
 
         Raises:
-            ConfigError: for Gaussians that were given without data.
-            DataError: if the data cannot be read any more.
+            ConfigError: for Gaussians without data.
+            DataError: if the data cannot be read.
         """
         if split not in self._datasets:
             self._datasets[split] = load_split(self.run, split).to(self.model.device)
@@ -92,7 +92,7 @@ class Loaded:
 
         Args:
             camera: a view, or one camera.
-            time: time in [0, 1] of a moving scene; that of the view if None.
+            time: time in [0, 1] of a moving scene; None for the view's.
 
         Raises:
             ValueError: if there are several cameras.
@@ -108,12 +108,12 @@ class Loaded:
     def evaluate(
         self, split: Split = "test", max_images: int | None = None, lpips_weights: str | Path | None = None
     ) -> dict[str, Any]:
-        """Return PSNR in dB, SSIM, at five scales too, LPIPS and rendering speed, by their names in eval.json.
+        """Return PSNR in dB, SSIM and multi-scale SSIM, LPIPS and rendering speed, by their names in eval.json.
 
         Args:
             split: the images to compare with: train, val or test.
-            max_images: maximum number of images, evenly spread over the split; None for all.
-            lpips_weights: file of LPIPS's weights; that of the run's settings if None.
+            max_images: maximum number of images, evenly spaced; None for all.
+            lpips_weights: file of LPIPS weights; None for the run's setting.
         """
         weights = self.run.config.lpips_weights if lpips_weights is None else Path(lpips_weights)
         return evaluate(self.model, self.dataset(split), max_images=max_images, lpips_weights=weights).results

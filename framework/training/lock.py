@@ -1,4 +1,4 @@
-"""The lock of a run's folder, which one process holds at a time; the system releases it when the process ends."""
+"""The lock of a run's folder. One process holds it at a time; the system releases it when the process ends."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathlib import Path
 from nerfloom.base.errors import ConfigError
 
 LOCK = ".lock"
-"""Name of the locked file. It names the process that holds the lock; unlocked, it means nothing."""
+"""Name of the lock file. It names the process that holds the lock; its content is meaningless when unlocked."""
 
 
 @contextmanager
 def sole_user(folder: Path) -> Iterator[None]:
     """Lock a run's folder for this process, within a `with` block.
 
-    On systems and file systems without locks, nothing is locked.
+    No effect on systems and file systems without locks.
 
     Args:
         folder: the run's folder, created if missing.
@@ -29,7 +29,7 @@ def sole_user(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # A symbolic link could point to another file, which would be overwritten.
+        # A symbolic link could point to another file, which this would overwrite.
         opened = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
     except OSError as error:
         raise ConfigError(f"cannot write the run's folder {folder}: {error.strerror or error}") from error

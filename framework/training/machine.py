@@ -1,4 +1,4 @@
-"""Description of the machine and the versions with which something was measured."""
+"""Description of the machine and the versions, for measurements."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def processor() -> str:
 
 
 def commit() -> str | None:
-    """Return the commit of the running checkout, with + if files differ from it; None for an installed package."""
+    """Return the commit of the running checkout, with + for local changes; None for an installed package."""
     root = Path(nerfloom.__file__).parents[1]
     if not (root / ".git").exists():
         return None

@@ -1,8 +1,8 @@
-"""Gradients of several processes: each takes the mean of all before the optimiser's step.
+"""Averages of gradients over several processes, before the optimiser's step.
 
-`torch.nn.parallel.DistributedDataParallel` does so in hooks of autograd, which never run for tables whose gradient is
-deferred (`kernels.adam.deferred`). So the gradients are summed explicitly: large tables where they are, and all
-other parameters in one tensor, as each exchange takes time of its own.
+`torch.nn.parallel.DistributedDataParallel` averages in autograd hooks, which never run for tables with deferred
+gradients (`kernels.adam.deferred`). This module sums gradients explicitly: large tables in place, and all other
+parameters in one tensor, since each exchange has an overhead.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from nerfloom.base.processes import add_up, gathered, processes
 from nerfloom.training.optim import Adam
 
 LARGE = 2**18
-"""Number of elements from which a gradient is summed on its own."""
+"""Minimum number of elements of a gradient that is summed separately."""
 
 
 @torch.no_grad()
 def mean_gradients(optimizer: Adam, finite: bool | Tensor) -> bool | Tensor:
     """Replace the gradients by their means over all processes, unless one of them is not finite.
 
-    Where a process has no gradient of a parameter, it is taken as zero; a parameter without any gradient gets none.
+    A missing gradient of a process counts as zero. A parameter without a gradient in any process gets none.
 
     Args:
         optimizer: the optimiser, after the backward pass.
-        finite: whether all gradients of this process are finite, possibly still on the device, () bool.
+        finite: whether all gradients of this process are finite; () bool if still on the device.
 
     Returns:
-        Whether all gradients of all processes are finite; known to Python if there are several.
+        Whether all gradients of all processes are finite; a Python bool if there are several processes.
 
     Raises:
         LostProcessError: if another process has ended, or the parameters of the processes differ in size.

@@ -20,17 +20,17 @@ from nerfloom.renderable import parts
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015), and a sparse one for groups with `sparse` set.
+    """Adam (Kingma and Ba 2015), with a sparse variant for groups with `sparse` set.
 
-    A sparse group holds tables (E, F) of which a step uses few entries (`kernels.adam.adam`). The gradient of a
-    table is the one that the backward pass left in `deferred`, or else `grad`.
+    A sparse group holds tables (E, F), and a step uses few of their entries (`kernels.adam.adam`). The gradient of a
+    table is its entry of `deferred`, or else `grad`.
 
-    Groups and states have the form of PyTorch's optimisers, but this is none of them: making one imports PyTorch's
-    compiler, which takes longer than all else before the first step.
+    Groups and states have the form of PyTorch's optimisers. The class does not derive from them, since that imports
+    PyTorch's compiler, which takes longer than everything else before the first step.
 
     Args:
         groups: parameter groups.
-        deferred: gradients by table, for tables whose gradient is not accumulated by autograd.
+        deferred: gradients by table, for tables whose gradient autograd does not accumulate.
         lr, betas, eps: defaults for groups without their own.
     """
 
@@ -44,7 +44,7 @@ class Adam:
     ) -> None:
         defaults: dict[str, Any] = {"lr": lr, "betas": betas, "eps": eps, "sparse": False}
         self.param_groups = [defaults | group | {"params": list(group["params"])} for group in groups]
-        """Settings of each group, which may be changed between steps, and its parameters as `params`."""
+        """Settings of each group, with its parameters as `params`; settings may change between steps."""
         self.state: dict[Tensor, dict[str, Tensor]] = {}
         """Moments and counts of each parameter."""
         self.deferred = deferred
@@ -66,7 +66,7 @@ class Adam:
 
     @property
     def entries(self) -> tuple[int, int]:
-        """Number of entries of sparse groups that were updated, and that there are, both summed over all steps."""
+        """Updated entries and existing entries of sparse groups, both summed over all steps."""
         updated, there = (a + b for a, b in zip(self._entries, self._entries_on_device.tolist(), strict=True))
         return updated, there
 
@@ -76,27 +76,27 @@ class Adam:
         return [parameter for group in self.param_groups for parameter in group["params"]]
 
     def tensors(self) -> list[Tensor]:
-        """Return the tensors of the states of all parameters, and what is counted on the device."""
+        """Return the state tensors of all parameters, and the counts on the device."""
         return [*(t for p in self.parameters for t in self.state[p].values()), self._entries_on_device]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return groups and states for a checkpoint, as PyTorch's optimisers do: parameters are their numbers."""
+        """Return groups and states for a checkpoint, in the format of PyTorch's optimisers."""
         numbers = {parameter: number for number, parameter in enumerate(self.parameters)}
         groups = [group | {"params": [numbers[p] for p in group["params"]]} for group in self.param_groups]
         return {"state": {numbers[p]: dict(state) for p, state in self.state.items()}, "param_groups": groups}
 
     def load_state_dict(self, saved: Mapping[str, Any]) -> None:
-        """Continue with groups and states from `state_dict`, or from one of PyTorch's optimisers of the same groups.
+        """Continue with groups and states from `state_dict`, or from a PyTorch optimiser with the same groups.
 
         Args:
-            saved: content of a checkpoint; its tensors are not copied, and are changed by later steps.
+            saved: content of a checkpoint. Its tensors are not copied, and later steps change them.
 
         Raises:
             ValueError: if the number of groups, or of parameters in a group, differs.
         """
         own, groups = self.param_groups, saved["param_groups"]
         if [len(group["params"]) for group in groups] != [len(group["params"]) for group in own]:
-            raise ValueError("its groups of parameters are others")
+            raise ValueError("its parameter groups differ")
         numbers = [number for group in groups for number in group["params"]]
         self.state = {
             parameter: {name: value.to(parameter.device) for name, value in saved["state"][number].items()}
@@ -122,7 +122,7 @@ class Adam:
 
     @torch.no_grad()
     def gradient(self, parameter: Tensor) -> Tensor:
-        """Return the gradient of a `parameter` as its `grad`, with what was deferred; zeros if there is none."""
+        """Return the gradient of a `parameter` as its `grad`, including its deferred part; zeros if there is none."""
         deferred = self.deferred.get(parameter)
         if deferred is not None and deferred.pending:
             total = deferred.summed(parameter)
@@ -132,7 +132,7 @@ class Adam:
         return parameter.grad
 
     def finite(self, loss: Tensor) -> bool | Tensor:
-        """Return whether a loss and all gradients are finite; the answer may still be on the device, () bool.
+        """Return whether a loss and all gradients are finite; () bool if still on the device.
 
         Args:
             loss: a scalar.
@@ -140,13 +140,13 @@ class Adam:
         return all_finite([loss.detach(), *(grad for p in self.parameters for grad in self._gradients(p))])
 
     def _gradients(self, parameter: Tensor) -> list[Tensor]:
-        """Return the gradient of a parameter, and what is deferred of it; empty if it has none."""
+        """Return the gradient of a parameter and its deferred parts; empty if it has none."""
         deferred = self.deferred.get(parameter)
         own = [] if parameter.grad is None else [parameter.grad]
         return own if deferred is None else own + deferred.gradients
 
     def bring_rates(self) -> None:
-        """Take the groups' learning rates to devices that run ahead of Python, for the steps from now on."""
+        """Copy the groups' learning rates to asynchronous devices, for the next steps."""
         self._rates = self._rates or [StepValue(group["lr"]) for group in self.param_groups]
         for rate, group in zip(self._rates, self.param_groups, strict=True):
             rate.set(group["lr"])
@@ -163,8 +163,8 @@ class Adam:
         The state of a parameter whose shape has changed starts from zero.
 
         Args:
-            finite: whether the step's loss and gradients are finite. If this is still on the device, () bool, nothing
-                is changed where it is False.
+            finite: whether the step's loss and gradients are finite; () bool if still on the device. If False, the step
+                changes nothing.
         """
         found_inf = (~finite).float() if isinstance(finite, Tensor) else None
         for index, group in enumerate(self.param_groups):
@@ -189,7 +189,7 @@ class Adam:
         """
         parameter = change.parameter
         if parameter not in self.state:
-            raise ValueError("rows were changed of a parameter that the optimiser does not hold")
+            raise ValueError("change_rows: the optimiser does not hold this parameter")
         added = 0 if change.fresh is None else len(change.fresh)
         rows = parameter.index_select(0, change.kept)
         parameter.data = rows if change.fresh is None else torch.cat([rows, change.fresh.to(rows)])
@@ -213,7 +213,7 @@ class Adam:
         self._count(updated, len(parameter))
 
     def _count(self, updated: int | Tensor, there: int) -> None:
-        if isinstance(updated, Tensor):  # added up in place, so that a repeated step counts too
+        if isinstance(updated, Tensor):  # in place, so that a replayed step counts too
             self._entries_on_device[0].add_(updated)
             self._entries_on_device[1].add_(there)
         else:
@@ -236,8 +236,8 @@ def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
     """Return Adam over the model's parameter groups, each with its initial learning rate as `initial_lr`.
 
     Args:
-        model: the model, whose parameter groups are those of `Model.groups`.
-        config: the run's settings, the defaults of the groups.
+        model: the model; `Model.groups` gives the parameter groups.
+        config: the run's settings, which are the groups' defaults.
 
     Raises:
         ConfigError: if the parameters and Adam's state need more memory than the machine has.
@@ -267,8 +267,8 @@ def learning_rate_factor(
         config: the run's settings: schedule, final fraction and warm-up steps.
         step: number of training steps done.
         progress: fraction of the budget spent, clamped to [0, 1].
-        schedule: a group's own schedule; the run's if None.
-        warmup_steps: a group's own number of warm-up steps; the run's if None.
+        schedule: a group's own schedule; None for the run's.
+        warmup_steps: a group's own number of warm-up steps; None for the run's.
     """
     progress = min(max(progress, 0.0), 1.0)
     steps = config.lr_warmup_steps if warmup_steps is None else warmup_steps
@@ -287,10 +287,10 @@ def _decay(schedule: str, final: float, progress: float) -> float:
 
 
 def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress: float) -> None:
-    """Set each group's learning rate for a step, by the run's schedule and warm-up or the group's own.
+    """Set each group's learning rate for a step, from the run's schedule and warm-up or the group's own.
 
     Args:
-        optimizer: the optimiser, whose groups have their initial learning rate as `initial_lr`.
+        optimizer: the optimiser; each group has its initial learning rate as `initial_lr`.
         config: the run's settings.
         step: number of training steps done.
         progress: fraction of the budget spent, 0 to 1.
@@ -302,7 +302,7 @@ def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress:
 
 
 def first_non_finite(model: Model, optimizer: Adam) -> str | None:
-    """Return the name of the first parameter that is not finite or has such a gradient; None if there is none.
+    """Return the name of the first parameter with non-finite values or gradients; None if there is none.
 
     Args:
         model: the model.

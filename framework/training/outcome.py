@@ -11,7 +11,7 @@ class Outcome:
     """End of training: its reason and the last checkpoint."""
 
     reason: str
-    """Reason for which training stopped, for people."""
+    """Why training stopped, as text."""
     stopped_by: int | None
     """Number of the signal that stopped training; None if no signal did."""
     checkpoint: Path | None

@@ -1,4 +1,4 @@
-"""Preparation of training: the scene's profile, and space that the images' silhouettes show to be empty."""
+"""Preparation of training: decided settings, the scene's profile, and space known to be empty."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from nerfloom.training.speed import with_speed
 
 
 def decided(method: Method, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
-    """Decide the settings that a method leaves to the data, and the box of a scene that moves.
+    """Decide the settings that a method leaves to the data, and the box of a moving scene.
 
     A method that learns motion and samples with an occupancy grid gets the smallest box that the silhouettes allow.
 
@@ -49,7 +49,7 @@ def decided(method: Method, config: TrainConfig, dataset: Dataset) -> tuple[Data
         dataset: the training images.
 
     Returns:
-        The data set, perhaps with a smaller box, the settings, and each decision with its reason.
+        The data set, possibly with a smaller box; the settings; and each decision with its reason.
 
     Raises:
         ConfigError: if the method cannot draw the images' cameras.
@@ -90,16 +90,16 @@ def _check_cameras(method: str, drawn: tuple[str, ...] | None, dataset: Dataset)
         return
     instead = "take a method that casts rays, such as nerfacto"
     if isinstance(dataset.cameras, NdcCameras):
-        raise ConfigError(f"{method} draws no normalised device coordinates: leave out --ndc, or {instead}")
+        raise ConfigError(f"{method} cannot draw normalised device coordinates: leave out --ndc, or {instead}")
     if (model := dataset.cameras.model) not in drawn:
         raise ConfigError(
-            f"{method} cannot draw {model} cameras, only {', '.join(drawn)}; cut perspective images out of them first,"
+            f"{method} cannot draw {model} cameras, only {', '.join(drawn)}; convert the images to these first,"
             f" or {instead}"
         )
 
 
 def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:
-    """Return `config` with `shorter` times the steps that were `decided`, if it names no other than its `default`."""
+    """Scale the `decided` number of steps by `shorter`, unless `config` differs from the `default`."""
     assert isinstance(config, SamplingConfig)
     assert isinstance(default, SamplingConfig)
     assert isinstance(decided, SamplingConfig)
@@ -111,19 +111,19 @@ def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: Trai
 def profile_of(
     method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, decided: Sequence[Decision]
 ) -> SceneProfile:
-    """Return the profile of the scene, with each setting that was chosen by the data and the reason.
+    """Return the profile of the scene, with each setting chosen from the data and the reason.
 
     Args:
         method: the method's name.
         config: the run's settings.
         model: the model to train.
         dataset: the training images.
-        decided: settings that the method chose by the data.
+        decided: decisions of the method.
     """
     scene, decisions = model.scene, []
     if dataset.opaque is not None and config.masks == "auto":
-        reason = "they cut away over half of the pixels, of each photograph others"
-        decisions.append(Decision("masks", "what they do not keep is empty", f"{reason} (else: --masks ignored)"))
+        reason = "they remove over half of the pixels, and differ between photographs"
+        decisions.append(Decision("masks", "masked-out pixels are empty", f"{reason} (else: --masks ignored)"))
     if config.background == "auto":
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
@@ -153,7 +153,7 @@ def profile_of(
 
 
 def _warning_of_folds(dataset: Dataset) -> list[Decision]:
-    """Return a warning if something that repeats seems to have folded the reconstruction; none otherwise."""
+    """Return a warning if a repeated structure seems to have folded the reconstruction."""
     ahead = -dataset.cameras.camera_to_worlds[:, :, 2].cpu().numpy()
     thumbnails = np.stack([thumbnail(dataset.image(index).cpu().numpy()) for index in range(len(dataset))])
     pairs = folds(dataset.names, ahead, thumbnails)
@@ -163,19 +163,19 @@ def _warning_of_folds(dataset: Dataset) -> list[Decision]:
     reason = (
         f"{dataset.names[first]} and {dataset.names[second]} look alike, but their cameras look "
         f"{angle_between(ahead[first], ahead[second]):.0f} degrees apart (such pairs: {len(pairs)}): something that "
-        "repeats, like a label printed twice, was taken for one. ns-process-data finds poses without the fold, "
+        "repeats, like a label printed twice, was matched as one. ns-process-data finds poses without the fold, "
         "if enough photographs lie between these two"
     )
     return [Decision("warning, poses", "they seem to be folded", reason)]
 
 
 def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None) -> None:
-    """Show a model that renders from images those of training, and those of held-out scenes that are given to it.
+    """Give the images to a model that renders from images: the training set, and source images of held-out scenes.
 
     Args:
         model: any model.
         train_set: the training images.
-        eval_set: the held-out images; None without.
+        eval_set: the held-out images; None if there are none.
     """
     if isinstance(model, RendersFromImages):
         model.show_images(train_set)
@@ -184,7 +184,7 @@ def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None)
 
 
 def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
-    """Empty the cells of the occupancy grids by what the training images show, and by what they do not show.
+    """Empty the cells of the occupancy grids that silhouettes exclude or that no training image shows.
 
     Args:
         config: the run's settings.
@@ -207,7 +207,7 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
 
 
 def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> None:
-    """Empty the cells of nested boxes that no training image shows, or only from nearer than all that it shows.
+    """Empty the cells of nested boxes that no training image shows, or only in front of everything it shows.
 
     Args:
         config: the run's settings.
@@ -261,7 +261,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
 
 
 def _hull(silhouettes: Silhouettes, sampler: SkipsCells, dataset: Dataset) -> Tensor:
-    """Return the cells of `sampler` that `silhouettes`, those of `dataset`, do not show to be empty."""
+    """Return the cells of `sampler` that the `silhouettes` of `dataset` do not exclude."""
     boxes, n, times, travel = (
         nested_boxes(sampler.box.cpu(), sampler.levels),
         sampler.resolution,
@@ -286,11 +286,11 @@ def _no_silhouettes(dataset: Dataset) -> str | None:
 
 
 def _no_hull(dataset: Dataset) -> str | None:
-    """Return why no cell can be emptied by the images' alpha; None if some can."""
+    """Return why the images' alpha cannot empty cells; None if it can."""
     obstacle = _no_silhouettes(dataset)
     if obstacle is not None or dataset.times is None or dataset.travel is not None:
         return obstacle
     if dataset.scene.unbounded:
-        return "how fast something moves is found in a box alone"
+        return "the speed of motion can only be found in a bounded scene"
     few = f"{len(dataset)} images at {len(dataset.times.unique())} times"
     return f"{few} are too few to tell how fast something moves: it takes {LEAST_IMAGES} at {LEAST_TIMES} times"

@@ -1,4 +1,4 @@
-"""Display of training while it runs: a progress bar, and curves and images for TensorBoard."""
+"""Display of training: a progress bar, and curves and images for TensorBoard."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from nerfloom.training.state import State
 
 SECONDS_BETWEEN_STATES = 0.1
-"""Seconds between changes of the progress bar, which shows losses: reading them means to wait for a GPU."""
+"""Seconds between updates of the progress bar. It shows losses, and reading them waits for a GPU."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class StepReport:
     """Report of a training step."""
 
     step: int
-    """Number of training steps done, with this one."""
+    """Number of training steps done, including this one."""
     seconds: float
     """Seconds of training so far."""
     progress: float
@@ -37,16 +37,16 @@ class StepReport:
     terms: dict[str, Tensor]
     """Loss terms () of the batch, by name, possibly on the device."""
     psnr: float
-    """PSNR of the batches, dB, smoothed; on other devices than the CPU that of the last step that was read."""
+    """Smoothed PSNR of the batches, dB; on a GPU as of the last read step."""
     rays_per_second: float
-    """Rays per second of the last steps of which errors were read: on the CPU of this step."""
+    """Rays per second; on a GPU between the last two reads."""
     held_out: tuple[float, float] | None
-    """PSNR of the newest evaluation of held-out images, dB, and the seconds of training since; None before the first
-    that this process has made."""
+    """PSNR of the newest evaluation of held-out images, dB, and the seconds of training since; None before this
+    process's first evaluation."""
 
     @cached_property
     def losses(self) -> dict[str, float]:
-        """Loss terms of the batch, by name; they are read from the device when they are first asked for."""
+        """Loss terms of the batch, by name, read from the device on first use."""
         values = torch.stack(list(self.terms.values())).tolist() if self.terms else []
         return dict(zip(self.terms, values, strict=True))
 
@@ -67,9 +67,9 @@ class StepReport:
 
 
 def share_and_time(first: StepReport, last: StepReport) -> str:
-    """Return the share of the budget that is spent, and the time of training that is left, as text.
+    """Return the spent percentage of the budget and the training time left, as text.
 
-    The time is that of the speed between two reports of this process: an earlier one may have been on another machine.
+    The time follows from two reports of this process, since an earlier process may have run on another machine.
 
     Args:
         first: report of the first training step of this process.
@@ -105,7 +105,7 @@ class ProgressBar:
         self._bar.stop()
 
     def show(self, report: StepReport) -> None:
-        """Show the `report` of the last training step, unless another was shown a moment ago."""
+        """Show the `report` of the last training step, unless the display was updated a moment ago."""
         self._first = self._first or report
         now = time.monotonic()
         if console.is_terminal and now - self._last_state > SECONDS_BETWEEN_STATES:
@@ -118,7 +118,7 @@ class ProgressBar:
 
 
 class Rate:
-    """Rays per second from one wait for the device to the next: a step that does not wait seems to be short."""
+    """Rays per second between waits for the device, since a step without a wait seems too short."""
 
     def __init__(self) -> None:
         self.per_second = 0.0
@@ -129,8 +129,8 @@ class Rate:
 
         Args:
             rays: number of its rays.
-            seconds: time that it took.
-            waited: whether it has waited for the device.
+            seconds: its duration.
+            waited: whether it waited for the device.
         """
         self._rays += rays
         self._seconds += seconds
@@ -152,7 +152,7 @@ class TensorBoard:
 
     @cached_property
     def _writer(self) -> Any:
-        from torch.utils.tensorboard import SummaryWriter  # slow to import, so not before there is something to write
+        from torch.utils.tensorboard import SummaryWriter  # slow to import
 
         return SummaryWriter(str(self._folder))
 
@@ -163,7 +163,7 @@ class TensorBoard:
                 self._writer.add_scalar(name, value, step)
 
     def step(self, report: StepReport, state: State, groups: Sequence[Mapping[str, Any]]) -> None:
-        """Write what is known after a training step.
+        """Write the report and the learning rates of a training step.
 
         Args:
             report: its report.

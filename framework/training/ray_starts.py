@@ -1,4 +1,4 @@
-"""Decision whether rays start at their near ends, or only where several training images look."""
+"""Decision whether rays start at the near plane, or only where several training images look."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ from nerfloom.samplers.choice import SamplingConfig
 from nerfloom.scene.shared_space import SharedSpace, share_cut_off
 
 MOST_CUT_OFF = 0.002
-"""Maximum share of a reconstruction's points that rays may miss where they start late."""
+"""Maximum fraction of a reconstruction's points that late ray starts may cut off."""
 LATEST, MOST_LATE = 0.8, 0.02
-"""Without points: what is seen is taken to be no nearer than this share of the distance to what all cameras look at,
-and the maximum share of rays that may start behind that."""
+"""Without points: assumed distance of the nearest content, as a fraction of the distance to the point that all cameras
+look at, and the maximum fraction of rays that may start behind it."""
 TESTED_RAYS = 20_000
-"""Number of rays that are tested."""
+"""Number of tested rays."""
 UNKNOWN = "no points say whether anything is cut off"
-"""Reason to start at the near ends where nothing can be tested."""
+"""Reason to start at the near plane if nothing can be tested."""
 
 
 def starts_checked(
     config: TrainConfig, settings: TrainConfig, made: list[Decision], dataset: Dataset
 ) -> tuple[TrainConfig, list[Decision]]:
-    """Let rays start at their near ends where they would else start behind what they are likely to show.
+    """Let rays start at the near plane if late starts would cut off content.
 
-    The cells that images show are coarse beside cameras that stand close together right before the scene: of LLFF's
-    fern they cut off 9 % of what rays meet, and 2 dB. The points of a reconstruction say whether they do. Without
-    points, the rays' starts are compared with the place that all cameras look at: at fern they are behind it, in
-    captures that go around something they are well before it.
+    The cells are coarse if cameras stand close together right in front of the scene. In LLFF's fern they cut off 9 % of
+    the points on rays, which costs 2 dB. The points of a reconstruction show this. Without points, the rays' starts are
+    compared with the point that all cameras look at: in fern they lie behind it, in captures around an object well
+    before it.
 
     Args:
         config: the run's settings.
-        settings: the same, as far as the method has decided what they leave open.
-        made: the decisions that were made.
+        settings: the same settings after the method's decisions.
+        made: the method's decisions.
         dataset: the training images.
 
     Returns:
@@ -62,7 +62,7 @@ def starts_checked(
 
 
 def nearest_shown(dataset: Dataset) -> Tensor:
-    """Return the distance (M,) from each camera before which its image shows nothing, as far as points tell.
+    """Return the distance (M,) from each camera up to which its image shows nothing, according to its points.
 
     Args:
         dataset: M training images.
@@ -73,17 +73,17 @@ def nearest_shown(dataset: Dataset) -> Tensor:
 
 @torch.no_grad()
 def share_late(space: SharedSpace, cameras: Cameras, near: float, far: float) -> float | None:
-    """Return the share of the pixels' rays that start hardly before what the cameras look at, or behind it.
+    """Return the fraction of the pixels' rays that start close to the point that all cameras look at, or behind it.
 
-    What is seen is taken to be no nearer to a camera than `LATEST` of the way to the point nearest to all optical axes.
+    Close means beyond `LATEST` of the distance to the point nearest to all optical axes.
 
     Args:
         space: cells where no ray starts.
         cameras: M cameras.
-        near, far: distances at which rays start and end else, scene units.
+        near, far: near and far distance of the rays, scene units.
 
     Returns:
-        A share in [0, 1]; None if that point is behind most of the cameras, so that they look apart.
+        A fraction in [0, 1]; None if that point is behind most of the cameras, since they look apart.
     """
     target = looked_at(cameras.camera_to_worlds)
     if target is None:
@@ -103,12 +103,13 @@ def _why_not(dataset: Dataset, least: int) -> str | None:
     if known is not None:
         some = known[evenly_spaced(len(known), TESTED_RAYS).to(known.pixels.device)]
         cut = share_cut_off(space, cameras.pixel_rays(some.pixels, scene.near, scene.far), some.distances)
-        reason = f"{100 * cut:.2g} % of the points that they show are before where {least} photographs look"
+        reason = f"{100 * cut:.2g} % of the points lie before the space that {least} photographs show"
         return None if cut <= MOST_CUT_OFF else reason
     late = share_late(space, cameras, scene.near, scene.far)
     if late is None:
         return f"the photographs look apart, and {UNKNOWN}"
     reason = (
-        f"{100 * late:.2g} % of the rays reach what {least} photographs show only near what all look at, or behind it"
+        f"{100 * late:.2g} % of the rays reach space that {least} photographs show only close to the point that all "
+        "cameras look at, or behind it"
     )
     return None if late <= MOST_LATE else reason

@@ -22,12 +22,12 @@ SUMMARY = "summary.json"
 def write_evaluation(path: Path, run: Run, checkpoint: Path | None, found: Evaluation, device: torch.device) -> None:
     """Write the metrics of an evaluation as JSON: nerfstudio's keys, and the metrics of each image.
 
-    Metrics that are not finite are null, and so are the means over them.
+    Non-finite metrics and their means are null.
 
     Args:
         path: file to write; its folder is created if missing.
         run: the evaluated run.
-        checkpoint: the evaluated checkpoint, of which the name is written; None if there is no file of it.
+        checkpoint: the evaluated checkpoint, for its name; None without a file.
         found: the metrics.
         device: device of the evaluation.
 
@@ -59,7 +59,7 @@ def write_summary(path: Path, trainer: Trainer, outcome: Outcome) -> None:
     Args:
         path: file to write.
         trainer: the trainer, after training.
-        outcome: reason for which training ended.
+        outcome: the end of training.
     """
     state = trainer.state
     write_report(
@@ -72,7 +72,7 @@ def write_summary(path: Path, trainer: Trainer, outcome: Outcome) -> None:
             "seconds": state.seconds,
             "rays": state.rays,
             "rays_per_second": state.rays / max(state.seconds, 1e-9),
-            # Of the last steps, without proposals' own; None of a method that casts no rays.
+            # Mean of the last steps, without the samples of proposals; None if the method casts no rays.
             "samples_per_ray": state.samples_per_ray if isinstance(trainer.model, RayModel) else None,
             "skipped_steps": state.skipped,
             "peak_memory_bytes": peak_memory(trainer.device),

@@ -4,7 +4,7 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
     config.yml                    all settings, plain YAML
     dataparser_transforms.json    from the input's frame to the scene's
     nerfstudio_models/            checkpoints
-    scene_profile.json            properties of the scene and the settings chosen by them
+    scene_profile.json            properties of the scene and the settings chosen from them
     learning_curve.json           seconds, step, PSNR and SSIM of held-out images, and their number
     skip_report.json              skipped work, and the time that it saved
     summary.json                  steps, seconds, rays, memory, parameters, and the machine
@@ -44,7 +44,7 @@ from nerfloom.training.run_path import CONFIG, config_file
 TRANSFORMS = "dataparser_transforms.json"
 """Name of the placement in a run's folder."""
 PLACED_ALIKE = 1e-3
-"""Distance between two placements of a camera, relative to the furthest from the origin, that does not count."""
+"""Tolerated distance between two placements of a camera, relative to the furthest camera's distance from the origin."""
 
 
 @dataclass(frozen=True)
@@ -68,50 +68,50 @@ class Run:
         return self.folder / CONFIG
 
     def parse(self, split: Split) -> ParsedScene:
-        """Read a `split` of the run's data; of the training images, those that the settings choose.
+        """Read a `split` of the run's data. For training images, the settings may select some.
 
         Raises:
-            DataError: if the data is missing or cannot be read, or is not placed as when the run was trained.
-            ConfigError: if the settings choose training images that the data does not have.
+            DataError: if the data is missing or unreadable, or its placement has changed since training.
+            ConfigError: if the settings select training images that the data does not have.
         """
         data = self.config.data
         if data is not None and not os.path.exists(data):
-            raise DataError(f"{data}, the run's data, is not there; say where it is now: --data DIR")
+            raise DataError(f"the run's data {data} does not exist; give its new location: --data DIR")
         parsed = self._placed_as_trained(self.parser.parse(data, split), split)
         if split != "train":
             return parsed
         return chosen_images(parsed, self.config.max_train_images, self.config.train_image_indices)
 
     def _placed_as_trained(self, parsed: ParsedScene, split: Split) -> ParsedScene:
-        """Return the data placed as the trained run has recorded it: elsewhere, every picture would be off."""
+        """Return the data with the placement that the trained run recorded; another one would shift all pictures."""
         file = self.folder / TRANSFORMS
         if not file.is_file():
             return parsed
         try:
             then = read_transforms(file)
         except DataError as error:
-            say(f"warning: {error}; going on without a check of how the data is placed")
+            say(f"warning: {error}; the placement of the data is not checked")
             return parsed
         moved = _moved(parsed, then)
         if moved >= PLACED_ALIKE and any(field.name == "placement" for field in dataclasses.fields(self.parser)):  # type: ignore[arg-type]
             say(
-                f"{self.config.data}: images or settings are others than when {self.folder} was trained; cameras are "
-                "placed as they were then, but other images may be held out"
+                f"{self.config.data}: images or settings have changed since {self.folder} was trained; cameras keep "
+                "their placement, but other images may be held out"
             )
             parser = dataclasses.replace(self.parser, placement=file)  # type: ignore[type-var]
             parsed = parser.parse(self.config.data, split)
             moved = _moved(parsed, then)
         if not moved < PLACED_ALIKE:
             raise DataError(
-                f"{self.config.data}: cameras are placed otherwise than when {self.folder} was trained, by up to "
-                f"{100 * moved:.2g} % of their distance from the origin: images were added or removed since, or the "
-                "format's settings changed; restore them, or train anew"
+                f"{self.config.data}: cameras have moved since {self.folder} was trained, by up to "
+                f"{100 * moved:.2g} % of their distance from the origin: images were added or removed, or the "
+                "format's settings changed; restore them, or train again"
             )
         return parsed
 
 
 def _moved(parsed: ParsedScene, then: Placement) -> float:
-    """Return how far cameras have moved since another placement, relative to the furthest from the origin."""
+    """Return how far cameras have moved since another placement, relative to the furthest camera's distance."""
     now, origins = parsed.placement, parsed.cameras.camera_to_worlds[:, :, 3].double()
     moved = (then.points(now.original_points(origins)) - origins).norm(dim=-1).max()
     return max(float(moved / origins.norm(dim=-1).max().clamp(min=1e-9)), abs(then.scale / now.scale - 1))
@@ -122,7 +122,7 @@ def run_folder(method: str, config: TrainConfig) -> Path:
 
     Args:
         method: the method's name.
-        config: the run's settings, which may name the experiment and the time stamp.
+        config: the run's settings.
     """
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
     timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
@@ -140,7 +140,7 @@ def create_folder(run: Run) -> None:
             f"{run.folder} already holds a run; continue it with 'ns-train --resume {run.folder}', "
             "or choose another --timestamp"
         )
-    paths = {"data": run.config.data, "lpips_weights": run.config.lpips_weights}  # wherever the run is evaluated from
+    paths = {"data": run.config.data, "lpips_weights": run.config.lpips_weights}  # valid from any working folder
     resolved: dict[str, Any] = {name: path.resolve() for name, path in paths.items() if path is not None}
     config = dataclasses.replace(run.config, **resolved)
     document = {
@@ -162,7 +162,7 @@ def read_run(path: Path) -> Run:
     Its keys are `method`, optionally `dataparser` (with `name` and the format's flags), and the method's settings.
 
     Args:
-        path: the file, or what `config_file` finds one in.
+        path: the file, or a folder for `config_file`.
 
     Raises:
         ConfigError: if a method, format or key is unknown, or a value has the wrong type.
@@ -201,7 +201,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def finite_or_null(content: Any) -> Any:
-    """Return plain data with None, JSON's null, for each number that is not finite, of which JSON has none.
+    """Return plain data with None for each non-finite number, since JSON has none.
 
     Args:
         content: plain data.
@@ -214,7 +214,7 @@ def finite_or_null(content: Any) -> Any:
 
 
 def write_report(path: Path, content: Any) -> None:
-    """Write plain data as `write_json` does, but only warn if the file cannot be written, so that training continues.
+    """Write plain data as `write_json` does, but only warn on failure, so that training continues.
 
     Args:
         path: file to write.

@@ -1,4 +1,4 @@
-"""Paths of runs and of their files, found without torch."""
+"""Paths of runs and their files. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ CONFIG = "config.yml"
 CHECKPOINTS = "nerfstudio_models"
 """Name of the checkpoints' folder in a run's folder."""
 LEVELS = ("*", "*/*", "*/*/*")
-"""Where runs lie below a folder: outputs/{experiment}/{method}/{timestamp}."""
+"""Patterns of runs below a folder: outputs/{experiment}/{method}/{timestamp}."""
 
 
 def config_file(path: Path) -> Path:
-    """Return the path of a run's config.yml; of a folder of runs, that of the newest, which is said.
+    """Return the path of a run's config.yml. For a folder of runs, choose the newest and print it.
 
-    The newest with a checkpoint is taken if any has one: a later one may have ended before it learnt anything.
+    Runs with a checkpoint take precedence, since a later one may have ended before it learnt anything.
 
     Args:
         path: the file itself, the run's folder, or a folder above it, such as ``outputs``.
@@ -37,7 +37,7 @@ def config_file(path: Path) -> Path:
         return path / CONFIG
     runs = sorted((file for level in LEVELS for file in path.glob(f"{level}/{CONFIG}")), key=os.path.getmtime)
     if not runs:
-        raise ConfigError(f"{path} is not a run's folder, for it has no {CONFIG}, and there is no run below it")
+        raise ConfigError(f"{path} is not a run's folder: it has no {CONFIG}, and there is no run below it")
     newest = next((file for file in reversed(runs) if has_checkpoint(file.parent)), runs[-1])
     later = len(runs) - 1 - runs.index(newest)
     without = f"; {later} later {'have' if later > 1 else 'has'} no checkpoint" if later else ""
@@ -51,16 +51,16 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = None) -> Path:
-    """Return the config.yml of a trained run, or a file of Gaussians, after a look at what is asked for.
+    """Return the config.yml of a trained run, or a file of Gaussians, after checking that all paths exist.
 
     Args:
         path: as for `config_file`, or a file of Gaussians.
-        checkpoint: the checkpoint that is asked for; any if None.
-        data: the folder of the data that is asked for, if any.
+        checkpoint: the requested checkpoint; None for any.
+        data: the requested data folder, if any.
 
     Raises:
         ConfigError: if there is no such run or file.
-        CheckpointError: if there is no such checkpoint, or none.
+        CheckpointError: if the checkpoint is missing, or the run has none.
         DataError: if there is no such data.
     """
     found = config_file(path)
@@ -74,24 +74,24 @@ def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = 
 
 
 def check_data(data: Path) -> None:
-    """Refuse a folder of data, or a part of one, that is not there.
+    """Check that a folder of data, or a part of one, exists.
 
     Args:
         data: path of the folder or of its part.
 
     Raises:
-        DataError: with the nearest name beside it.
+        DataError: if it does not exist; the message suggests the nearest name in the same folder.
     """
     if not os.path.lexists(data):
         raise DataError(f"--data {data}: there is no such folder{_nearest_to(data)}")
 
 
 def check_writable(folder: Path, what: str) -> None:
-    """Refuse a folder that cannot be written to, whether it exists or is to be created; nothing is left there.
+    """Check that an existing or new folder can be written to. Leaves nothing there.
 
     Args:
         folder: the folder.
-        what: what is to be written, for the message.
+        what: what is written there, for the message.
 
     Raises:
         ConfigError: if nothing can be written there.
@@ -106,7 +106,7 @@ def check_writable(folder: Path, what: str) -> None:
 
 
 def _nearest_to(path: Path) -> str:
-    """Return what there is in place of a missing path, as the end of a message."""
+    """Return the end of a message that suggests an existing name for a missing path."""
     missing, above = path, path.absolute().parent
     while not above.is_dir() and above != above.parent:
         missing, above = above, above.parent

@@ -1,4 +1,4 @@
-"""Handling of Ctrl-C and SIGTERM: training ends after a step, other commands at once, with their cleanup."""
+"""Handling of Ctrl-C and SIGTERM: training ends after the current step, other commands at once, after cleanup."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Handler = Callable[[int, FrameType | None], Any]
 
 
 class Stopped(KeyboardInterrupt):
-    """The interruption of the process by a signal: SIGTERM, or Ctrl-C with a message.
+    """Interruption by a signal: SIGTERM, or Ctrl-C with a message.
 
     Args:
         number: the signal's number.
@@ -51,7 +51,7 @@ def orderly_end() -> Iterator[None]:
     def end(number: int, frame: FrameType | None) -> None:
         raise Stopped(number)
 
-    # SIGTERM stays ignored if the parent process has it ignored.
+    # Keep SIGTERM ignored if the parent process ignores it.
     main = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) != signal.SIG_IGN
     with handled((signal.SIGTERM,) if main else (), end):
         yield
@@ -59,7 +59,7 @@ def orderly_end() -> Iterator[None]:
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Record Ctrl-C and SIGTERM within a `with` block, so that training can end after a step; a second ends it now.
+    """Record Ctrl-C and SIGTERM within a `with` block, so that training can end after a step. A second one ends it now.
 
     Yields:
         The numbers of the signals received so far.
@@ -86,7 +86,7 @@ def handled(numbers: tuple[int, ...], handler: Handler) -> Iterator[dict[int, An
         handler: function that is called with the signal's number and the stack frame.
 
     Yields:
-        The previous handlers by signal, which are restored at the end.
+        The previous handlers by signal; they are restored at the end.
     """
     before: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
     try:

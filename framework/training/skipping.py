@@ -26,31 +26,31 @@ if TYPE_CHECKING:
     from nerfloom.training.trainer import Trainer
 
 PROBE_RAYS, WARM_UP_RAYS = 1024, 64
-"""Number of random training rays on which the savings are measured, and of those that are rendered before."""
+"""Numbers of random training rays for measuring the savings, and for the warm-up before."""
 LEAST_TOLD = 0.005
-"""Minimum skipped fraction that is printed."""
+"""Minimum skipped fraction to print."""
 LEAST_FASTER = 1.1
-"""Minimum speed of rendering, relative to that without skipping, that is printed; less is not worth a number."""
+"""Minimum speed-up of rendering to print."""
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One kind of work that is skipped."""
+    """One kind of skipped work."""
 
     name: str
     """Name of the skipped work."""
     skipped: float
     """Skipped fraction of all such work, 0 to 1."""
     rendering_saved: float | None
-    """Seconds to render the probe's rays without skipping over those with it; None if rendering is not affected."""
+    """Speed-up of rendering the probe's rays; None if skipping does not affect rendering."""
     switch: str
     """Flag that turns it off."""
     says: str
-    """Description for people."""
+    """Description as text."""
 
 
 def lines(rungs: list[Rung]) -> list[str]:
-    """Return lines of text for people; `rungs` that skipped less than LEAST_TOLD are omitted."""
+    """Return the descriptions as lines of text, without `rungs` that skipped less than LEAST_TOLD."""
     descriptions = [f"  {rung.says}" for rung in rungs if rung.skipped >= LEAST_TOLD]
     return ["left out:", *descriptions] if descriptions else []
 
@@ -65,17 +65,17 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     rooms = [sampler.room for sampler in parts(model, OccupancySampler)]
     if (rays := sum(room.rays for room in rooms)) > 0:
         share = sum(room.left_out for room in rooms) / rays
-        says = f"rays of batches for whose samples there was no room on the device: {share:.1%}"
-        rungs.append(Rung("rays of batches, for want of room", share, None, "no switch", says))
+        says = f"rays of batches, dropped because the sample buffer was full: {share:.1%}"
+        rungs.append(Rung("rays of batches, buffer full", share, None, "no switch", says))
     splats = getattr(model, "capacity", None)
     if isinstance(splats, Capacity) and splats.entries:
         share = splats.left_out / splats.entries
-        says = f"entries of lists of Gaussians for which there was no room on the device: {share:.1%}"
-        rungs.append(Rung("entries of tiles' lists, for want of room", share, None, "no switch", says))
+        says = f"entries of tiles' lists of Gaussians, dropped because the buffer was full: {share:.1%}"
+        rungs.append(Rung("entries of tiles' lists, buffer full", share, None, "no switch", says))
     if isinstance(sizes := getattr(model, "sizes", None), ImageSizes) and (count := sizes.steps.total()):
         share = 1 - sum(steps / 4**octaves for octaves, steps in sizes.steps.items()) / count
         widths = ", ".join(f"{sizes.steps[o] / count:.0%} of steps 1/{1 << o}" for o in sorted(sizes.steps) if o)
-        says = f"pixels of training images: {share:.0%}, as images have less than their width ({widths})"
+        says = f"pixels of training images: {share:.0%}, since steps use smaller images ({widths})"
         rungs.append(Rung("pixels of training images", share, None, "--reduced-until 0", says))
     updated, there = trainer.optimizer.entries
     if there:
@@ -101,7 +101,7 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
     where = "all cells" if nested else "the box"
     rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of {where} is never sampled")]
     if carved:
-        says = f"{carved:.0%} of {where} from the first step on, for the photographs show nothing there"
+        says = f"{carved:.0%} of {where} from the first step, since the photographs show nothing there"
         switch = "--seen-cells False" if nested else "--silhouette-cells False"
         rungs.append(Rung("cells, outside the visual hull", carved, None, switch, says))
     rungs += [

@@ -1,4 +1,4 @@
-"""The speed of this machine, which is measured before a run decides on its sizes."""
+"""Measurement of this machine's speed, before a run decides on its sizes."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from nerfloom.geometry.points import Points
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 SAMPLES = 2**14
-"""Samples of the step that is timed."""
+"""Number of samples in the timed step."""
 REFERENCE = 11.6e-3
-"""Seconds that it takes on the machine of the trials that settings come from: two quiet cores of an AMD EPYC (Zen 4)
-with AVX-512."""
+"""Seconds of this step on the machine that settings were tuned on: two idle cores of an AMD EPYC (Zen 4) with
+AVX-512."""
 MEASURED_FOR = 0.25
-"""Seconds for which steps are timed."""
+"""Duration of the measurement, seconds."""
 LEAST_BUDGET = 10.0
-"""Seconds of training below which it is not worth the time of a measurement."""
+"""Minimum seconds of training for a measurement."""
 USUAL = 1.4
-"""Ratio to the expected speed up to which a measurement counts as that, so that equal runs decide alike."""
+"""Ignore a measured speed within this factor of the expected one, so that equal runs decide alike."""
 
 
 def with_speed(config: ConfigT) -> tuple[ConfigT, list[Decision]]:
     """Return settings with the speed of this machine.
 
-    It is measured where settings depend on it: in one process, on a CPU, with a budget of `LEAST_BUDGET` seconds.
+    It is measured if settings depend on it: in one process, on a CPU, with a budget of at least `LEAST_BUDGET` seconds.
 
     Args:
-        config: a method's settings; a speed that is given stays.
+        config: a method's settings; a configured speed stays.
 
     Returns:
-        The settings, and a record of a speed that differs from the usual one.
+        The settings, and a decision if the speed differs from the expected one.
     """
     machine = config.machine
     fixed = (config.max_seconds or 0.0) < LEAST_BUDGET or machine.speed is not None or processes().count > 1
@@ -55,7 +55,7 @@ def with_speed(config: ConfigT) -> tuple[ConfigT, list[Decision]]:
 
 
 def step_seconds() -> float:
-    """Return the mean seconds of a small training step of a hash grid and two networks, without the first."""
+    """Return the mean seconds of a small training step of a hash grid and two networks, after a warm-up step."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         grid = HashGrid(max_resolution=256, log2_table_size=16, sparse=True)

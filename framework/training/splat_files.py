@@ -1,4 +1,4 @@
-"""Files of Gaussians, opened as runs are: with their photographs, or alone."""
+"""Loading of files of Gaussians, with or without their photographs."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.training.run import Run
 
 METHOD = "gaussian-splatting"
-"""Method whose results such files hold, whichever program has written them."""
+"""Method of such files, whichever program wrote them."""
 LOOKED_AT = 4
-"""Number of images that are decoded to know whether images have alpha, and how large they are."""
+"""Number of images to decode for the images' size and alpha."""
 DataFormat = tuple[str, DataParser]
 """Name of a data format, and its flags."""
 
@@ -40,14 +40,14 @@ DataFormat = tuple[str, DataParser]
 def load_splats(
     file: Path, data: Path | None, data_format: DataFormat | None, device_type: Any, up: Axis | None = None
 ) -> Loaded:
-    """Load a file of Gaussians, in the scene that its data make; without data, in one that it makes itself.
+    """Load a file of Gaussians, in the scene of its data, or without data in a scene made from the Gaussians.
 
     Args:
-        file: the file, in the frame of the input, or about a local origin that an offset beside it names.
-        data: folder of the photographs; None for none.
-        data_format: format of the data, and its flags; recognised if None.
+        file: the file, in the frame of the input, or about a local origin given by an offset file beside it.
+        data: folder of the photographs; None without.
+        data_format: format of the data, with its flags; None to detect it.
         device_type: auto, cpu, cuda or mps.
-        up: upward direction in the frame of the file, for a file without data; z if None.
+        up: up axis in the frame of the file, for a file without data; None for z.
 
     Raises:
         ConfigError: if the data do not fit.
@@ -59,11 +59,11 @@ def load_splats(
     if data is None and data_format is None:
         source, (about, scene) = None, placed_alone(gaussians, up or "z")
         if up is None:
-            say("without photographs, z is taken to point up (else: --up=-y, as in many captures, or --data DIR)")
+            say("without photographs, z is assumed to point up (else: --up=-y, as in many captures, or --data DIR)")
         placed = transformed(gaussians, *about.similarity())
         placement = about.about(-offset)
     elif up is not None:
-        raise ConfigError("--up is for files of Gaussians alone: the data know which way is up; leave it out")
+        raise ConfigError("--up has no effect with --data, which determines the up direction; leave it out")
     else:
         source = _source(file, data, data_format, machine)
         parsed = source.parse("train")
@@ -80,14 +80,14 @@ def load_splats(
 
 
 def _source(file: Path, data: Path | None, data_format: DataFormat | None, machine: MachineConfig) -> Run:
-    """Return a run in name, which holds the data."""
+    """Return a placeholder run that holds the data."""
     data, name = find_data(data, None if data_format is None else data_format[0])
     parser = load_dataparser(name)() if data_format is None else data_format[1]
     return Run(METHOD, TrainConfig(data=data, machine=machine, vis="none"), name, parser, file.parent)
 
 
 def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: ParsedScene) -> None:
-    """Refuse Gaussians that no camera can see, and say if the file has rounded their centres.
+    """Check that cameras can see the Gaussians, and warn if the file has rounded their centres.
 
     Args:
         file: path of the file.
@@ -104,7 +104,7 @@ def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: Parsed
     if not away < parsed.far:
         raise DataError(
             f"{file}: its Gaussians are {away:,.0f} scene units from the nearest camera, and the scene ends at "
-            f"{parsed.far:g}, so it is in another frame than the data; a file about a local origin needs {beside}"
+            f"{parsed.far:g}; its frame differs from the data's; a file about a local origin needs {beside}"
         )
     if given.means.dtype == torch.float32 and local_origin(given.means, given.typical_size) is not None:
         say(
@@ -114,7 +114,7 @@ def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: Parsed
 
 
 def _scene(parsed: ParsedScene, config: TrainConfig) -> Scene:
-    """Return the description of a scene, of which a few images are decoded."""
+    """Return the description of a scene, after decoding a few images."""
     few = parsed[torch.arange(min(LOOKED_AT, len(parsed.image_paths)))]
     scene = load_dataset(few, "train", PixelMemory.of(config.cache_limit, config.cache_dir), config.masks).scene
     poses = parsed.cameras.camera_to_worlds

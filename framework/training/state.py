@@ -1,4 +1,4 @@
-"""State of a run besides its parameters, as checkpoints hold it."""
+"""State of a run besides its parameters."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class State:
         """Return the PSNR of the newest evaluation of held-out images, dB, and the seconds of training since.
 
         Args:
-            first_step: step up to which evaluations do not count, as an earlier process made them.
+            first_step: ignore evaluations up to this step, since an earlier process made them.
 
         Returns:
             PSNR and seconds; None if there is no such evaluation.
@@ -53,16 +53,16 @@ class State:
 
     @property
     def train_psnr(self) -> float:
-        """PSNR of the batches, dB, by the running mean of their error."""
+        """PSNR of the batches, dB, from the running mean of their error."""
         return min(-10 * float(torch.tensor(max(self.train_mse, 1e-12)).log10()), MAX_PSNR)
 
     def account(self, rays: int, samples_per_ray: float, seconds: float) -> None:
         """Count a training step.
 
         Args:
-            rays: number of its rays, of all processes.
-            samples_per_ray: mean number of their samples; NaN if it is not known, or not yet.
-            seconds: time that it took.
+            rays: number of its rays in all processes.
+            samples_per_ray: mean number of samples per ray; NaN if not known yet.
+            seconds: its duration.
         """
         self.step += 1
         self.seconds += seconds
@@ -70,20 +70,20 @@ class State:
         self.learn_samples_per_ray(samples_per_ray)
 
     def learn_samples_per_ray(self, found: float) -> None:
-        """Take the samples per ray that a step has `found` into their mean; NaN if they are not known, or not yet."""
+        """Update the running mean with a step's samples per ray; no effect if `found` is NaN."""
         if not math.isnan(found):
             self.samples_per_ray += 0.2 * (found - self.samples_per_ray)
 
 
 def agree(state: State, received: Sequence[int]) -> Sequence[int]:
-    """Take over what decides on the next step from the first process: clock, samples per ray and last evaluation.
+    """Copy from the first process what decides on the next step: clock, samples per ray and last evaluation.
 
     Args:
-        state: the state of this process, which is changed.
+        state: the state of this process, changed in place.
         received: numbers of the signals that this process has received.
 
     Returns:
-        Numbers of signals that any of the processes has received; `received` itself if there is one process.
+        The first signal of each process that received one; `received` itself if there is one process.
 
     Raises:
         LostProcessError: if another process has ended.

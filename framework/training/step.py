@@ -24,8 +24,8 @@ class StepResult:
     squared_errors: Tensor
     """Squared error of each pixel, a mean over channels, in the shape of the batch's pixels."""
     finite: bool | Tensor
-    """Whether the loss and all gradients were finite, in every process; if not, the step was dropped. It may still be
-    on the device, () bool."""
+    """Whether the loss and all gradients were finite in every process; if not, the step was dropped. () bool if still
+    on the device."""
 
     def detached(self) -> StepResult:
         """Return the result without the graph of its loss."""
@@ -34,9 +34,9 @@ class StepResult:
 
 
 def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
-    """Take one training step: forward, backward, Adam. A step that is not finite changes no parameter.
+    """Take one training step: forward, backward, Adam. A non-finite step changes no parameter.
 
-    Several processes take the step together, each with its own batch and all with the mean gradient.
+    Several processes take the step together, each with its own batch; all use the mean gradient.
 
     Args:
         model: the model to train.
@@ -50,7 +50,7 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
 
 
 def schedule(model: Model[Any], optimizer: Adam, step: int, progress: float) -> None:
-    """Set what depends on the number of the step: learning rates, and schedules of the model.
+    """Set learning rates and the model's schedules for a step.
 
     Args:
         model: the model to train.
@@ -65,7 +65,7 @@ def schedule(model: Model[Any], optimizer: Adam, step: int, progress: float) -> 
 def learn(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
     """Take the rest of a training step, after `schedule`: forward, backward, Adam.
 
-    Of a model whose steps repeat each other (`Model.step_kind`), this depends on the values of tensors alone.
+    If steps can be replayed (`Model.step_kind`), this depends only on the values of tensors.
 
     Args:
         model: the model to train.
@@ -121,11 +121,11 @@ def backward(loss: Tensor, optimizer: Adam) -> bool | Tensor:
     """Compute the gradients of a loss, for the optimiser's next step.
 
     Args:
-        loss: a scalar; without a graph, as when no ray has a sample, all gradients stay empty.
-        optimizer: the optimiser, whose gradients of the previous step are cleared.
+        loss: a scalar. Without a graph, for example if no ray has a sample, all gradients stay empty.
+        optimizer: the optimiser; gradients of the previous step are cleared.
 
     Returns:
-        Whether the loss and all gradients are finite; possibly still on the device, () bool.
+        Whether the loss and all gradients are finite; () bool if still on the device.
     """
     optimizer.zero_grad()
     if is_bad_here(loss):
@@ -134,5 +134,5 @@ def backward(loss: Tensor, optimizer: Adam) -> bool | Tensor:
         loss.backward()
     finite = optimizer.finite(loss)
     if finite is False and not bool(torch.isfinite(loss)):
-        optimizer.zero_grad()  # so that the loss is found to be the first that is bad
+        optimizer.zero_grad()  # so that the error names the loss
     return finite

@@ -37,11 +37,11 @@ def load_trained(
 
     Args:
         config_path: the run's config.yml, or its folder.
-        checkpoint: checkpoint to load; the newest readable one if None.
+        checkpoint: checkpoint to load; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.
-        data: folder of the data, if it has moved; the run's if None.
-        rays_per_pixel: rays per rendered pixel; the run's if None.
-        eval_appearance: appearance of held-out images; the run's if None.
+        data: folder of the data, if it has moved; None for the run's.
+        rays_per_pixel: rays per rendered pixel; None for the run's setting.
+        eval_appearance: appearance of held-out images; None for the run's setting.
 
     Raises:
         ConfigError: if the run's settings are missing or do not fit.
@@ -87,7 +87,7 @@ def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, An
     Args:
         method: the method.
         config: the run's settings.
-        checkpoint: content of the checkpoint, with the scene for which the model is built.
+        checkpoint: content of the checkpoint, with the model's scene.
         device: device of the model.
 
     Raises:
@@ -103,7 +103,7 @@ def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, An
     except NerfloomError:
         raise
     except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(f"the settings make no model: {_short(error)}") from error
+        raise CheckpointError(f"no model can be built with the settings: {_short(error)}") from error
     restore_model(model, checkpoint, method.name)
     return model
 
@@ -114,14 +114,14 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | N
     Args:
         model: the model.
         checkpoint: content of the checkpoint.
-        method: name of the model's method; None to accept a checkpoint of any.
+        method: name of the model's method; None to accept any method's checkpoint.
 
     Raises:
         CheckpointError: if the checkpoint is of another method, or its parameters have other names or sizes.
     """
     made_by = checkpoint.get("method")
     if None not in (made_by, method) and made_by != method:
-        raise CheckpointError(f"the checkpoint is of {made_by}, and does not fit {method}: name one of its own")
+        raise CheckpointError(f"the checkpoint is of {made_by}, and does not fit {method}: name one of this method")
     try:
         model.load_state_dict(checkpoint["model"])
     except (RuntimeError, TypeError, AttributeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
@@ -130,7 +130,7 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | N
 
 
 def _difference(expected: dict[str, Any], found: Any) -> str:
-    """Return the first difference of names or sizes of parameters, for people; empty if there is none."""
+    """Return the first difference in names or sizes of parameters, as text; empty if there is none."""
     if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
         return ""
     for name, value in expected.items():

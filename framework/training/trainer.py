@@ -45,25 +45,25 @@ from nerfloom.training.trained import restore_model
 STEPS_PER_LOG = 25
 """Steps between points of TensorBoard's curves, and between readings of errors from a device."""
 TOLD_SECONDS = 0.5
-"""Seconds of preparation from which on they are reported."""
+"""Report preparation that takes at least this long, seconds."""
 MAX_BAD_STEPS = 10
-"""Number of consecutive non-finite steps after which a run stops."""
+"""Number of consecutive non-finite steps that stop a run."""
 BetweenSteps = Callable[[StepReport, Sequence[int]], None]
-"""Function of a step's report and of the signals received so far, which grow while it runs."""
+"""Function of a step's report and of the signals received so far; the sequence grows while the function runs."""
 
 
 class Trainer:
     """Trainer of a method on a data set.
 
-    Of several processes, each has a trainer. Only that of the first evaluates and writes.
+    Each of several processes has a trainer. Only the first process evaluates and writes.
 
     Args:
         method: the method.
-        config: its settings; those that are still open are decided by the data.
+        config: its settings; open ones are decided from the data.
         train_set: training images, on the device.
         eval_set: images of the periodic evaluation; None for no evaluation.
         folder: folder of checkpoints, learning curve and TensorBoard's files; None to write nothing.
-        source: source of the batches; chosen by the model and the settings if None.
+        source: source of the batches; None for the one that suits the model and the settings.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Trainer:
         self.config: TrainConfig
         start = time.perf_counter()
         train_set, self.config, self.decisions = decided(method, config, train_set)
-        self._deciding = time.perf_counter() - start  # which counts as training
+        self._deciding = time.perf_counter() - start  # counts as training
         self.train_set, self.eval_set = train_set, eval_set
         self.device = train_set.device
         torch.manual_seed(self.config.machine.seed)
@@ -90,7 +90,7 @@ class Trainer:
         self.state = State()
         self.first_step = 0
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG
-        """Steps after which the errors of batches are read from the device, which is waited for."""
+        """Steps between readings of errors from the device; each reading waits for it."""
         self._unread: list[Tensor] = []
         self._rate = Rate()
         mode = self.config.machine.cuda_graphs
@@ -105,7 +105,7 @@ class Trainer:
 
     @classmethod
     def of(cls, run: Run, train_set: Dataset, eval_set: Dataset | None = None) -> Trainer:
-        """Return the trainer of a run, which writes into its folder.
+        """Return the trainer of a run; it writes into the run's folder.
 
         Args:
             run: method, settings and folder.
@@ -121,7 +121,7 @@ class Trainer:
         return None if self.folder is None else self.folder / FOLDER
 
     def save(self) -> Path | None:
-        """Write a checkpoint, from which training continues with the same bits, and return its path, if any."""
+        """Write a checkpoint and return its path, if any. A run resumed from it has the same bits."""
         self._read_errors(self.state.step)
         self._last_save = self.state.seconds
         step, keep_all, folder = self.state.step, not self.config.save_only_latest_checkpoint, self.checkpoint_folder
@@ -146,7 +146,7 @@ class Trainer:
         }
 
     def _join_first(self) -> None:
-        """Continue from the state of the first process, which alone reads a checkpoint and starts from the images."""
+        """Continue from the state of the first process, which reads the checkpoint and starts from the images."""
         if processes().count > 1:
             content = from_first(self._content(), self.device)
             if not processes().first:
@@ -163,7 +163,7 @@ class Trainer:
             rates = [group["initial_lr"] for group in self.optimizer.param_groups]
             self.optimizer.load_state_dict(checkpoint["optimizer"])
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-                group["initial_lr"] = rate  # a rate given on the command line counts
+                group["initial_lr"] = rate  # the configured rate overrides the checkpoint's
             self.state = checked(State, checkpoint["state"])
             self._unread.clear()
             if self.graphs is not None:
@@ -176,7 +176,7 @@ class Trainer:
         self.held_out.resume(self.state)
 
     def restore_as_configured(self) -> None:
-        """Restore the checkpoint of --load-checkpoint or --load-dir, if given; CheckpointError if it is impossible."""
+        """Restore the checkpoint of --load-checkpoint or --load-dir, if given; raise CheckpointError on failure."""
         if self.config.load_checkpoint is not None:
             self.restore(load_checkpoint(self.config.load_checkpoint, self.device))
         elif self.config.load_dir is not None:
@@ -227,9 +227,9 @@ class Trainer:
         return Outcome(reason, next(iter(stopped), None), saved)
 
     def steps(self) -> Iterator[StepReport]:
-        """Take training steps until the budget is spent, and yield the report of each: a training within another task.
+        """Take training steps until the budget is spent, and yield each report: for training within another task.
 
-        Unlike `train` it evaluates and saves nothing, and catches no signal. It raises what `train_step` raises.
+        Unlike `train`, it does not evaluate, save or handle signals. It raises the same errors as `train_step`.
         """
         self.prepare()
         while reason_to_stop(self.config, self.state, ()) is None:
@@ -242,16 +242,16 @@ class Trainer:
 
     @cached_property
     def profile(self) -> SceneProfile:
-        """The scene's profile, with the settings chosen by it; computed once, as it looks at every image."""
+        """The scene's profile, with the settings chosen from it. Computed once, since it reads every image."""
         return profile_of(self.method.name, self.config, self.model, self.train_set, self.decisions)
 
     def prepare(self, start: bool = True) -> None:
-        """Mark space as empty by what the images show, and start from the images, once, before the first step.
+        """Mark empty space and initialise the model from the images, once, before the first step.
 
-        Its time counts as training time.
+        This counts as training time.
 
         Args:
-            start: whether the model may start from the images; False if its parameters are set by others.
+            start: whether the model may initialise itself from the images; False if the caller sets its parameters.
         """
         if self._prepared:
             return
@@ -261,7 +261,7 @@ class Trainer:
         self.train_set = skip_empty(self.config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)
         if fresh and start and isinstance(self.model, StartsFromImages):
-            seed_step(self.config.machine.seed, -1)  # before all steps, whatever was drawn since the model was made
+            seed_step(self.config.machine.seed, -1)  # independent of earlier draws
             if processes().first:
                 with alone():
                     self.model.start(self.train_set)
@@ -273,7 +273,7 @@ class Trainer:
             say(f"prepared in {seconds:.1f} s, which count as training")
 
     def train_step(self) -> StepReport:
-        """Draw a batch and take one training step; `prepare` is called first.
+        """Draw a batch and take one training step, after `prepare`.
 
         Raises:
             DivergenceError: after MAX_BAD_STEPS consecutive non-finite steps.
@@ -284,7 +284,7 @@ class Trainer:
 
     def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
-        if self.config.max_seconds is not None and processes().count == 1:  # several must take steps of one size
+        if self.config.max_seconds is not None and processes().count == 1:  # several must take equal steps
             self._keep_pace(Pace(state.step, state.seconds, self.config.max_seconds, self.steps_per_read))
         batch, result = self._drawn_and_taken()
         self.source.learn(batch, result.squared_errors)
@@ -314,20 +314,20 @@ class Trainer:
         )
 
     def _keep_pace(self, pace: Pace) -> None:
-        """Let sizes follow the time of the last steps."""
+        """Adapt sizes to the time of the last steps."""
         if isinstance(self.model, KeepsPace):
             self.model.keep_pace(pace)
         if self.batch_size is not None:
             self.batch_size.keep_pace(pace)
 
     def _drawn_and_taken(self) -> tuple[Any, StepResult]:
-        """Return a batch and the result of a step on it; both are written to by the next step."""
+        """Return a batch and the result of a step on it. The next step overwrites both."""
         model, source, optimizer, request = self.model, self.source, self.optimizer, self._request()
         step, progress, seed, rank = self.state.step, self.progress, self.config.machine.seed, processes().rank
         if self.graphs is None:
             seed_step(seed, step, rank)
             return (batch := source.draw(request)), train_step(model, optimizer, batch, step, progress)
-        seed_step(seed, step, BEFORE_STEP)  # for updates of the sampler; what is recorded is seeded anew
+        seed_step(seed, step, BEFORE_STEP)  # for updates of the sampler; the captured part is seeded separately
         schedule(model, optimizer, step, progress)
 
         def taken() -> tuple[Any, StepResult]:
@@ -340,11 +340,11 @@ class Trainer:
         return taken()
 
     def _learnt(self) -> list[Tensor]:
-        """Return all tensors that a step changes for good."""
+        """Return all tensors that a step changes permanently."""
         return [*self.model.parameters(), *self.model.buffers(), *self.optimizer.tensors()]
 
     def _request(self) -> Request:
-        """Return what the next batch is to hold: one ray per pixel at first, later as many as in rendering."""
+        """Return the request for the next batch: at first one ray per pixel, later the rendering's number."""
         config, state = self.config, self.state
         if self.batch_size is None:
             return Request(state.step, 0)
@@ -368,16 +368,16 @@ class Trainer:
             )
 
     def _read_errors(self, done: int) -> None:
-        """Read of the last of `done` steps what was left on the device: errors, and whether they were finite."""
+        """Read errors and finiteness of the last steps from the device, after `done` steps in total."""
         unread = torch.stack(self._unread).tolist() if self._unread else []
         self._unread.clear()
         self.model.read_counts()
         for step, (mse, finite, samples_per_ray) in enumerate(unread, done - len(unread) + 1):
             self.state.learn_samples_per_ray(samples_per_ray)
-            if math.isfinite(mse):  # a dropped step's may be NaN, which would stay in the mean
+            if math.isfinite(mse):  # a NaN of a dropped step would stay in the mean
                 self.state.train_mse += max(0.02, 1 / step) * (mse - self.state.train_mse)
             else:
-                self.optimizer.zero_grad()  # so that the loss is found to be the first that is bad
+                self.optimizer.zero_grad()  # so that the error names the loss
             self._count_bad(step - 1, bool(finite))
 
     # -- reports and checkpoints between steps ----------------------------------------------------------------
@@ -390,7 +390,7 @@ class Trainer:
         return not self._bad_in_a_row  # else the parameters may be damaged; keep older checkpoints
 
     def _try_to_save(self) -> None:
-        """Save a checkpoint; on failure, as with a full disk, warn and train on, to try again later."""
+        """Save a checkpoint. On failure, for example with a full disk, warn, continue and try again later."""
         try:
             self.save()
         except CheckpointError as error:

@@ -56,7 +56,7 @@ def cropped(rays: Rays, crop: Crop) -> Rays:
 
 
 def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor, by_depth: bool) -> Picture:
-    """Return a picture in which pixels outside a crop show the background.
+    """Return a picture with the background in pixels outside a crop.
 
     Args:
         picture: (H, W) rendered view.
@@ -80,7 +80,7 @@ def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor
 
 
 def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor) -> Picture:
-    """Return a picture (H, W) of what lies within a crop, as `meaning` says for the kind of model.
+    """Return a picture (H, W) of the scene inside a crop; `meaning` describes it for each kind of model.
 
     Args:
         model: the model in evaluation mode.
@@ -100,7 +100,7 @@ def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor
 
 
 def meaning(model: Renderable) -> str:
-    """Return what a crop does to pictures of a model, for people.
+    """Return a description of a crop's effect on pictures of a model.
 
     Args:
         model: the model.
@@ -115,7 +115,7 @@ def within(points: Tensor, camera: Cameras, crop: Crop) -> Tensor:
 
     Args:
         points: scene coordinates.
-        camera: one camera, from which the crop's distances are measured.
+        camera: one camera; the crop's distances are measured from it.
         crop: the box and the distances.
     """
     low, high = points.new_tensor(crop.corners)

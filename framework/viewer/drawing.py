@@ -36,7 +36,7 @@ Truth = Callable[[View, Tensor, Tensor], "Tensor | None"]
 
 
 def draw(subject: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None) -> Arrays:
-    """Return what is kept of a piece of a view for the output that is asked for.
+    """Return the part of a piece of a view that the requested output needs.
 
     Args:
         subject: the model and its run.

@@ -20,8 +20,8 @@ FIRST_PIXELS = 6_000
 KEPT_MEASUREMENTS = 16
 """Number of pictures used to estimate the speed."""
 KEEP = (0.5, 1.4)
-"""A stride is kept while its picture takes at most the second value times the budget, and that of the next finer stride
-at least the first value times the budget."""
+"""A stride is kept while its picture takes at most the second value times the budget, and the next finer stride's
+picture at least the first value times the budget."""
 JUMP = 4
 """Maximum ratio of the strides of consecutive passes."""
 LEAST_ROWS = 4

@@ -103,7 +103,7 @@ class Page:
             self._curve.data = data
 
     def _place_camera(self) -> None:
-        """Place the initial camera at the first training camera, looking at what lies in front of it."""
+        """Place the initial camera at the first training camera, with the same view direction."""
         scene = self._studio.subject.model.scene
         poses = scene.camera_to_worlds
         if poses is None or not len(poses) or scene.warped:

@@ -162,7 +162,7 @@ class PathPanel:
     # -- files ------------------------------------------------------------------------------------------------
 
     def _save(self) -> Path | None:
-        """Write the path beside what is looked at, and return the file; None if that was not possible."""
+        """Write the path beside the run or file, and return its file; None if that was not possible."""
         path, folder = self._path(), self._subject().folder
         if path is None:
             self._note.content = "A path needs two cameras."

@@ -14,10 +14,10 @@ LARGEST_REPORT = 2**24
 
 
 def heading(loaded: Loaded) -> str:
-    """Return the method, the folder or file, the step and the PSNR of what is looked at, as Markdown.
+    """Return the method, the folder or file, the step and the PSNR as Markdown.
 
     Args:
-        loaded: what is looked at.
+        loaded: the run or file.
     """
     step = f" · step {loaded.step:,}" if loaded.is_run else ""
     lines = [f"**{_plain(loaded.method)}** · {_plain(loaded.origin.name)}{step}"]

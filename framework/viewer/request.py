@@ -44,9 +44,9 @@ class Crop:
     corners: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Minimum and maximum corner of a box, scene units."""
     near: float = 0.0
-    """Distance from the camera up to which nothing is shown, scene units."""
+    """Nothing nearer to the camera is shown, scene units."""
     far: float = math.inf
-    """Distance from the camera beyond which nothing is shown, scene units."""
+    """Nothing farther from the camera is shown, scene units."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def smaller(width: int, height: int, stride: int) -> tuple[int, int]:
 
     Args:
         width, height: size of the whole picture, pixels.
-        stride: number by which both are divided, rounded up.
+        stride: divisor of both, rounded up.
     """
     return -(-width // stride), -(-height // stride)
 

@@ -1,4 +1,4 @@
-"""A viewer of what is trained, or is being trained in another process: `ns-viewer`."""
+"""A viewer of trained runs, or of runs training in another process: `ns-viewer`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
     """Serve a run or a file of Gaussians to browsers until Ctrl-C.
 
     Args:
-        loaded: what is looked at.
+        loaded: the run or file.
         host: interface to listen on.
         port: port to listen on; the next free one if it is taken.
         follow: whether to show newer checkpoints of the run as they are written.

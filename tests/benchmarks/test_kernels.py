@@ -1,4 +1,4 @@
-"""The benchmark of kernels: what it holds them against, and that it measures each of them."""
+"""The benchmark of kernels: its comparisons, and that it measures every kernel."""
 
 from pathlib import Path
 

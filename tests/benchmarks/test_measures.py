@@ -1,4 +1,4 @@
-"""What the benchmarks compute from what they measure, against numbers worked out by hand."""
+"""Figures computed from measurements, against values worked out by hand."""
 
 import json
 import math

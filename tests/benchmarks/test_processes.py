@@ -1,4 +1,4 @@
-"""python -m benchmarks processes: three kinds of runs, of which two are started by torchrun."""
+"""python -m benchmarks processes: three kinds of runs; torchrun starts two of them."""
 
 import json
 from pathlib import Path

@@ -37,7 +37,7 @@ def test_every_command_has_a_version(monkeypatch: pytest.MonkeyPatch, capsys: py
 @pytest.mark.medium
 def test_data_without_its_flag(shared_tiny: Path, refused: Refused) -> None:
     said = refused(train_command.main, "nerfacto", shared_tiny)
-    assert said.endswith(f"the data is named by a flag: ns-train nerfacto --data {shared_tiny}")
+    assert said.endswith(f": ns-train nerfacto --data {shared_tiny}")
     assert refused(train_command.main, shared_tiny).endswith(f"ns-train nerfacto --data {shared_tiny}")
 
 
@@ -69,7 +69,7 @@ def test_a_runs_folder_stands_for_its_config(trained: Path, tmp_path: Path, refu
 def test_data_that_has_moved(tiny: Path, tmp_path: Path, refused: Refused) -> None:
     run = train(tiny, tmp_path / "out", "--max-num-iterations", 1, "--max-eval-images", 0)
     tiny.rename(tmp_path / "moved")
-    words = f"{tiny}, the run's data, is not there; say where it is now: --data DIR"
+    words = f"the run's data {tiny} does not exist; give its new location: --data DIR"
     assert words in refused(evaluate.main, run)
     assert words in refused(render.main, "orbit", run, "--output-path", tmp_path / "o.gif")
     assert words in refused(train_command.main, "--resume", run)

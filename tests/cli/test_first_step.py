@@ -74,10 +74,10 @@ print(*sys.modules)
 PATHS = {
     "no data": ("ns-train", ["instant-ngp", "--data", "{0}/capturs"], "Did you mean 'capture'?"),
     "no output": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--output-dir", "{0}/file/x"], "cannot write"),
-    "no start": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--load-checkpoint", "{0}/a.ckpt"], "is not there"),
+    "no start": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--load-checkpoint", "{0}/a.ckpt"], "no such file"),
     "no recipe": ("ns-train", ["--load-config", "{0}/recipe.yml"], "No such file"),
     "no run to resume": ("ns-train", ["--resume", "{0}/outputs/one/m/t1"], "No such file"),
-    "the run's data": ("ns-train", ["--resume", "{0}/outputs"], "the run's data, is not there"),
+    "the run's data": ("ns-train", ["--resume", "{0}/outputs"], "give its new location: --data DIR"),
     "no run": ("ns-eval", ["{0}/outputs/one/n"], "No such file"),
     "an empty folder": ("ns-viewer", ["{0}/capture"], "there is no run below it"),
     "no checkpoint": ("ns-eval", ["{0}/outputs"], "holds no checkpoint"),

@@ -79,12 +79,12 @@ def test_what_it_writes_keeps_what_every_method_must(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("name", ["My-Method", "my_method", "3d", "-x", "x-", "x--y", "", "grid.py", "../x", "ünder"])
 def test_names_that_are_none(name: str) -> None:
-    with pytest.raises(ConfigError, match="is no method's name"):
+    with pytest.raises(ConfigError, match="is invalid"):
         check_name(name)
 
 
 def test_names_that_are_taken() -> None:
-    with pytest.raises(ConfigError, match="there is a method 'instant-ngp' already"):
+    with pytest.raises(ConfigError, match="the method 'instant-ngp' already exists"):
         check_name("instant-ngp")
     for name in ("lambda", "torch", "nerfloom", "json"):
         with pytest.raises(ConfigError, match=f"the method's module would be '{name}'"):
@@ -95,7 +95,7 @@ def test_names_that_are_taken() -> None:
 def test_nothing_is_overwritten(tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path, tmp_path / "file"):
-        assert "is there already, and nothing is overwritten" in refused(main, "my-method", "--dir", folder)
+        assert "already exists and is not overwritten" in refused(main, "my-method", "--dir", folder)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert (tmp_path / "file").read_text() == "mine"
     below = tmp_path / "file" / "deeper"

@@ -322,7 +322,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     assert said(*path, status=1).endswith("none: No such file or directory")
     assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender", status=1)
     assert "nerfstudio's; here it is --fps" in said("interpolate", nowhere, "--frame_rate=24")
-    assert "the extension of --output-path says it" in said("spiral", nowhere, "--output-format", "images")
+    assert "the extension of --output-path sets the format" in said("spiral", nowhere, "--output-format", "images")
 
 
 def test_the_bound_of_the_error_is_said(ball_run: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Marching cubes in blocks, against surfaces of which volume, area and distance are known."""
+"""Marching cubes in blocks, against surfaces with known volume, area and distance."""
 
 import math
 

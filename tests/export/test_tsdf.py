@@ -1,4 +1,4 @@
-"""Fusion of depth, against scenes of which depth and surface are known."""
+"""Fusion of depth, against scenes with known depth and surface."""
 
 from types import SimpleNamespace
 from typing import Any

@@ -62,5 +62,5 @@ def test_a_run_goes_on_from_the_one_before(where: str, folder: Path, capsys: pyt
     resume(dataclasses.replace(run, config=dataclasses.replace(run.config, max_num_iterations=6)))
     said = " ".join(capsys.readouterr().err.split())
     assert said.count(f"{newest} is damaged") == 2
-    assert said.count("trying the one before") == 2
+    assert said.count("trying the previous one") == 2
     assert "at step 4" in said

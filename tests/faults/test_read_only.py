@@ -75,7 +75,7 @@ def test_a_disk_that_becomes_read_only(
     trainer.train_step = step  # type: ignore[method-assign,assignment]
     trainer.train()
     said = capsys.readouterr().err
-    assert said.count("earlier checkpoints stand") == 1  # at step 4
+    assert said.count("earlier checkpoints are unchanged") == 1  # at step 4
     assert "Read-only file system" in said
     names = sorted(path.name for path in trainer.checkpoint_folder.iterdir())
     assert names == ["step-000000002.ckpt", "step-000000006.ckpt"]

@@ -61,7 +61,7 @@ def test_a_second_ctrl_c_says_what_was_saved(
     run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=50, steps_per_save=saving_every)
     with pytest.raises(Stopped) as stop:
         start(run)
-    saved = f"step-000000003.ckpt is what was saved; continue with: ns-train --resume {run.folder}"
+    saved = f"the last checkpoint is step-000000003.ckpt; continue with: ns-train --resume {run.folder}"
     assert str(stop.value) == "stopped at once: " + (saved if saving_every == 1 else "nothing was saved")
     assert runs.readable_steps(run.folder) == ([2, 3] if saving_every == 1 else [])
     assert exit_status(stop.value) == 130

@@ -140,7 +140,7 @@ def test_it_is_loaded_and_looked_at_in_python_and_in_the_viewer(file: Path) -> N
     assert picture.size == (800, 800)
     from_outside = float(camera.camera_to_worlds[0, :, 3].norm()) - HALF_WITHIN
     assert float(picture.median_depth[400, 400]) == pytest.approx(from_outside, abs=0.1)
-    with pytest.raises(ConfigError, match="does not know its photographs: --data DIR"):
+    with pytest.raises(ConfigError, match="its photographs are unknown: give --data DIR"):
         found.views("test")
     pictures, studio = list[np.ndarray](), Studio(found)
     request = Request(Pose(tuple(camera.camera_to_worlds[0].flatten().tolist()), math.radians(50)), 80, 80)
@@ -166,7 +166,7 @@ def test_a_camera_path_is_rendered(file: Path) -> None:
 
 
 def test_what_needs_photographs_is_refused_in_one_line(file: Path, refused: Refused) -> None:
-    needs = f"{file} is no run, and does not know its photographs: --data DIR"
+    needs = f"{file} is not a run, so that its photographs are unknown: give --data DIR"
     for path in ("interpolate", "spiral", "time", "dataset"):
         assert refused(render_command.main, path, file, "--output-path", file.parent / "out").endswith(needs)
     assert refused(eval_command.main, file).endswith(needs)
@@ -176,4 +176,4 @@ def test_what_needs_photographs_is_refused_in_one_line(file: Path, refused: Refu
     for what, lacks in (("marching-cubes", "has no density"), ("occupancy", "has no occupancy grid")):
         assert lacks in refused(export_command.main, what, file, "--output-dir", file.parent)
     said = refused(eval_command.main, file, "--data", file.parent, "--up", "x")
-    assert "the data know which way is up" in said
+    assert "--up has no effect with --data" in said

@@ -1,4 +1,4 @@
-"""Gaussians that move: what is drawn stays as it was, and only what is nearly transparent is shaken."""
+"""Moves of Gaussians: pictures do not change, and only nearly transparent Gaussians get noise."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Capacity of lists of tiles: as much as images have needed, no wait for it, and what is left out is counted."""
+"""Capacity of lists of tiles: follows earlier images, does not synchronise, and counts dropped entries."""
 
 from pathlib import Path
 
@@ -69,6 +69,6 @@ def test_training_with_room_learns_what_it_learns_without_and_says_what_was_left
     assert capacity.entries > 0 == capacity.left_out
     records = given.model.columns["means"].values
     assert capacity.of(records, 8**2) is not None  # images of a quarter of the width are drawn at first
-    assert not any("room" in rung.says for rung in skip_report(given) if rung.skipped)
+    assert not any("buffer" in rung.says for rung in skip_report(given) if rung.skipped)
     capacity.left_out = capacity.entries // 10
-    assert any("room" in rung.says and abs(rung.skipped - 0.1) < 0.01 for rung in skip_report(given))
+    assert any("buffer" in rung.says and abs(rung.skipped - 0.1) < 0.01 for rung in skip_report(given))

@@ -165,7 +165,7 @@ def test_paths_through_a_file(capture: Path, capture_run: Path, tmp_path: Path) 
 def test_what_does_not_fit_is_refused(capture: Path, capture_run: Path, tmp_path: Path, refused: Refused) -> None:
     called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path)
     file = tmp_path / "splat.ply"
-    assert refused(eval_command.main, file).endswith("does not know its photographs: --data DIR")
+    assert refused(eval_command.main, file).endswith("its photographs are unknown: give --data DIR")
     data = ("--data", capture)
     for flag, value in (("--rays-per-pixel", 4), ("--load-checkpoint", file), ("--eval-appearance", "half")):
         said = refused(eval_command.main, file, *data, flag, value)

@@ -1,4 +1,4 @@
-"""What differs between images and is learnt with the Gaussians: colours, poses, and depths that are known."""
+"""Parameters of images learnt with the Gaussians (colours, poses), and known depths."""
 
 import dataclasses
 from pathlib import Path

@@ -156,7 +156,7 @@ def test_all_stands_for_every_registered_method(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_photographs_for_one_method_alone_are_refused(shared_tiny: Path, refused: Refused) -> None:
-    assert "--data stands behind the methods" in refused(main, f"instant-ngp --data {shared_tiny}")
+    assert "put --data after the methods" in refused(main, f"instant-ngp --data {shared_tiny}")
 
 
 @pytest.mark.medium
@@ -168,7 +168,7 @@ def test_on_somebodys_data(
     method = " ".join(["instant-ngp", *TINY_NGP])
     stress(monkeypatch, method, "--data", shared_tiny, *only, "--max-num-iterations", 15, "--output-path", path)
     said = capsys.readouterr().err
-    assert "only the ball has: inside" in said
+    assert "pictures of the ball: inside" in said
     content = json.loads(path.read_text())
     assert content["data"] == "ball"  # the folder's name
     assert [verdict["name"] for verdict in content["methods"][0]["verdicts"]] == ["plain", "one-image"]

@@ -117,5 +117,5 @@ def test_a_changed_parameter_is_the_same_one() -> None:
 
 def test_rows_of_a_parameter_that_is_not_optimised_are_refused() -> None:
     optimizer = optimizer_of(torch.nn.Parameter(torch.zeros(3, 2)), sparse=False)
-    with pytest.raises(ValueError, match="that the optimiser does not hold"):
+    with pytest.raises(ValueError, match="the optimiser does not hold"):
         optimizer.change_rows(RowChange(torch.nn.Parameter(torch.zeros(3, 2)), torch.tensor([0])))

@@ -107,7 +107,7 @@ def test_repeated_steps_learn_what_steps_learn(
     kinds = 1 if hierarchical else 2  # steps in which proposals learn, and others
     assert len(recorder.tapes) == kinds
     assert recorder.repeated == STEPS - kinds * WARM_UP
-    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+    assert said == ["training steps are captured as CUDA graphs and replayed"]
     assert (usual.optimizer.entries[0] > 0) == (not hierarchical)
 
 
@@ -148,7 +148,7 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     assert moving or len(kinds) > 1  # of 16 slices in time, 34 steps empty none
     assert recorder.repeated > steps / 4
     assert len(recorder.tapes) <= len(kinds) + 1  # that of the first step
-    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+    assert said == ["training steps are captured as CUDA graphs and replayed"]
     assert repeating.model.sampler.room.left_out == 0
 
 
@@ -269,7 +269,7 @@ def same(found: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
 def test_a_function_of_tensors_alone_is_repeated(said: list[str]) -> None:
     toy = Toy()
     same(steps_of(toy, 9, toy.step, toy.seed), truth(9))
-    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+    assert said == ["training steps are captured as CUDA graphs and replayed"]
 
 
 @pytest.mark.parametrize("fault", ["a number of Python's", "a wait", "an error"])
@@ -302,9 +302,9 @@ def test_what_cannot_be_repeated_is_found_and_said(fault: str, said: list[str]) 
         patch.setattr(FakeRecorder, "record", recording)
         same(steps_of(toy, 9, step, toy.seed), truth(9))
         (line,) = said
-        assert line.startswith("note: steps are not repeated as CUDA graphs, because ")
+        assert line.startswith("note: steps are not replayed as CUDA graphs, because ")
         words = {
-            "a number of Python's": "did not change",
+            "a number of Python's": "did not make the same update",
             "a wait": "_local_scalar_dense",
             "an error": "no kernel image",
         }
@@ -330,7 +330,7 @@ def test_another_loss_is_found(said: list[str]) -> None:
 
     assert taken(None) > 3
     assert taken(torch.sum) == 1
-    assert said[-1].endswith("because a repeated step did not have the loss of the step itself")
+    assert said[-1].endswith("because a replayed step did not have the same loss as an ordinary one")
 
 
 def test_what_moves_later_is_found(said: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -349,7 +349,7 @@ def test_what_moves_later_is_found(said: list[str], monkeypatch: pytest.MonkeyPa
         if steps.take(StepKind()):
             steps.run(StepKind(), toy.seed, step)
     assert steps.repeated == 3
-    assert "did not change what the step itself changes" in said[-1]
+    assert "did not make the same update as an ordinary one" in said[-1]
 
 
 def test_what_stays_infinite_is_alike(said: list[str]) -> None:
@@ -357,7 +357,7 @@ def test_what_stays_infinite_is_alike(said: list[str]) -> None:
     toy = Toy()
     toy.weight[0] = torch.inf
     steps_of(toy, 9, toy.step, toy.seed)
-    assert said == ["training steps are recorded as CUDA graphs and repeated"]
+    assert said == ["training steps are captured as CUDA graphs and replayed"]
 
 
 def test_few_kinds_are_kept(said: list[str]) -> None:
@@ -381,7 +381,7 @@ def test_draws_of_another_step_are_found(said: list[str]) -> None:
         torch.manual_seed(seeded[0])  # as if a repeated step drew from where the generator stood
 
     steps_of(toy, 6, toy.step, seed)
-    assert "did not change what the step itself changes" in said[0]
+    assert "did not make the same update as an ordinary one" in said[0]
 
 
 def test_reasons_are_said_once_each(said: list[str]) -> None:
@@ -506,7 +506,7 @@ def test_a_recording_that_breaks_the_gpu_ends_the_run_in_a_line(
     with nullcontext() if usable else pytest.raises(ConfigError, match=r"invalidated by a wait.*cuda-graphs off"):
         for _ in range(WARM_UP):
             steps.run(StepKind(), lambda: None, step)
-    assert [line.split("because ")[1] for line in said] == ["recording one failed (invalidated by a wait)"] * usable
+    assert [line.split("because ")[1] for line in said] == ["capturing one failed (invalidated by a wait)"] * usable
 
 
 def test_a_step_that_waits_for_the_gpu_is_not_recorded(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> None:

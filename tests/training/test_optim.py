@@ -87,7 +87,7 @@ def test_a_state_of_other_groups_is_refused_and_changes_nothing() -> None:
     optimizer = Adam(groups, {}, 1.0, (0.9, 0.99), 1e-8)
     saved = Adam([{"params": parameters}], {}, 0.5, (0.9, 0.99), 1e-8).state_dict()
     before = optimizer.state
-    with pytest.raises(ValueError, match="groups of parameters are others"):
+    with pytest.raises(ValueError, match="parameter groups differ"):
         optimizer.load_state_dict(saved)
     assert optimizer.state is before
     assert [group["lr"] for group in optimizer.param_groups] == [0.1, 0.01]

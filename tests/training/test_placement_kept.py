@@ -70,7 +70,7 @@ def test_without_a_photograph_the_others_stay_where_they_were(
     for name, pose in now.items():
         torch.testing.assert_close(pose, then[name], rtol=1e-5, atol=1e-5)
     assert min((pose - then[name]).abs().max().item() for name, pose in anew.items()) > 0.01
-    assert f"others than when {tmp_path} was trained" in said
+    assert f"have changed since {tmp_path} was trained" in said
     recorded, found = json.loads((tmp_path / TRANSFORMS).read_text()), run.parse("train")
     assert found.transform is not None
     then = torch.tensor(recorded["transform"], dtype=torch.float64)
@@ -117,5 +117,5 @@ def test_a_damaged_placement_is_reported(tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / TRANSFORMS).write_text(json.dumps({"scale": -1}))
     assert len(run.parse("train").image_paths) == 10
     said = capsys.readouterr().err
-    assert said.count("going on without a check of how the data is placed") == 1
+    assert said.count("the placement of the data is not checked") == 1
     assert TRANSFORMS in said

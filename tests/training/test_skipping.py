@@ -35,9 +35,9 @@ def test_rays_without_room_are_told(shared_tiny: Path, tmp_path: Path) -> None:
     """Off the CPU, where samples have a fixed number of slots."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     trainer.model.sampler.room.rays, trainer.model.sampler.room.left_out = 4000, 100
-    (rung,) = (rung for rung in skip_report(trainer) if "room" in rung.name)
+    (rung,) = (rung for rung in skip_report(trainer) if "buffer full" in rung.name)
     assert rung.skipped == 0.025
-    assert "no room on the device: 2.5%" in "\n".join(lines([rung]))
+    assert "the sample buffer was full: 2.5%" in "\n".join(lines([rung]))
 
 
 def test_what_saved_nothing_is_not_told() -> None:

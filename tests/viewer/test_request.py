@@ -1,4 +1,4 @@
-"""Requests: cameras of browsers, parts of pictures, and what is made of nonsense."""
+"""Requests: cameras of browsers, parts of pictures, and invalid values."""
 
 import math
 from pathlib import Path

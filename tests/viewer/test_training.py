@@ -1,4 +1,4 @@
-"""The viewer beside training: what is learnt is the same to the last bit, and nothing is drawn for nobody."""
+"""The viewer beside training: the result has the same bits, and nothing is drawn without a client."""
 
 import dataclasses
 from pathlib import Path

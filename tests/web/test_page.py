@@ -1,4 +1,4 @@
-"""The web page of Gaussians: what is in the file."""
+"""The content of the web page of Gaussians."""
 
 import fnmatch
 import json

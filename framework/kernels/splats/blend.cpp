@@ -1,7 +1,7 @@
 // Blending the Gaussians of each tile from front to back, forward and backward. See ../splat_blend.py.
 //
 // A tile of TILE x TILE pixels consists of blocks of LANES pixels, 4 across: a vector holds a block. For each Gaussian
-// of the tile's list, the blocks that its box meets are evaluated, so most of what is computed is used.
+// of the tile's list, only the blocks that its box meets are evaluated.
 #include "splats/splat.h"
 
 #include <vector>
@@ -13,7 +13,7 @@ constexpr int COLUMNS = TILE / ACROSS, ROWS = TILE / DOWN, BLOCKS = COLUMNS * RO
 
 #if defined(__AVX512F__)
 // 2^x for x in [-126, 0], to 2 units in the last place: 2^(k / 16) of the nearest sixteenth from a table in a register,
-// times a polynomial of what is left.
+// times a polynomial of the remainder.
 inline Floats power_of_two(Floats x) {
     const __m512 table = _mm512_setr_ps(1.0f, 1.04427378f, 1.09050773f, 1.13878863f, 1.18920712f, 1.24185781f, 1.29683955f,
                                         1.35425555f, 1.41421356f, 1.47682615f, 1.54221083f, 1.61049033f, 1.68179283f,
@@ -78,7 +78,7 @@ typedef uint64_t Blocks;
 static_assert(COLUMNS * TILE == 64, "a tile's blocks have a bit each");
 constexpr Blocks FIRST_ROWS = ~Blocks(0) / ((Blocks(1) << DOWN) - 1);
 
-// Whose block `b` is that of bit b * DOWN: its column is b / ROWS, and its first row of pixels b % ROWS * DOWN.
+// Bit b * DOWN stands for block `b`: column b / ROWS, first row of pixels b % ROWS * DOWN.
 inline int first_of(Blocks blocks) { return __builtin_ctzll(blocks) / DOWN; }
 inline Blocks only(int b) { return Blocks(1) << (b * DOWN); }
 
@@ -91,7 +91,7 @@ struct Offsets {  // of a block's pixels from its first
     }
 };
 
-// The blocks in which a Gaussian reaches the centre of a pixel, and perhaps some next to them.
+// The blocks where a Gaussian reaches the centre of a pixel, and perhaps neighbouring ones.
 struct Reach {
     Floats rows[TILE / LANES];  // of the tile's pixels
     Reach() {
@@ -269,7 +269,7 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
         for (int b = 0; b < BLOCKS; b++) behind[b] *= last[b];
     } else
         for (int b = 0; b < BLOCKS; b++) behind[b] = splat(0);
-    // What is behind a Gaussian is all that is seen, less what is in front of it and itself.
+    // The light from behind a Gaussian is the whole image minus the Gaussian and everything in front of it.
     tile.read<CHANNELS>(image, shown), tile.read<CHANNELS>(image_grad, of_image);
     for (int c = 0; c < CHANNELS; c++)
         for (int b = 0; b < BLOCKS; b++) behind[b] += shown[c][b] * of_image[c][b];
@@ -296,7 +296,7 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
             }
             behind[b] -= weight * own;
             through[b] = after;
-            // The gradient of the exponent: alpha times that of alpha; none where alpha is at its bound.
+            // The gradient of the exponent: alpha times the gradient of alpha, 0 if alpha is clipped.
             const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
             const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
             const Floats dx = offset.x + block_x, dy = offset.y + block_y;

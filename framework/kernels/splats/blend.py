@@ -4,12 +4,12 @@
     T_i     = prod_{j < i} (1 - alpha_j)               transmittance in front of it
     image   = sum_i alpha_i T_i value_i + T background
 
-A pixel is done where its transmittance is below OPAQUE: no value can change by more than that share of its range.
+A pixel is finished when its transmittance is below OPAQUE: no value can change by more than this share of its range.
 
-The backward pass goes from front to back too. What is behind a Gaussian is what the whole image shows less what has
-been passed, so T need not be divided by 1 - alpha step by step. Each entry of a tile's list has sums of its own, which
-are added up by Gaussian in a fixed order: no two threads write to one place, and the same bits come out on any number
-of them.
+The backward pass also runs from front to back. The light from behind a Gaussian is the whole image minus everything up
+to this Gaussian, so T is not divided by 1 - alpha at each step. Each entry of a tile's list has its own sums, which are
+added by Gaussian in a fixed order: no two threads write to the same place, and the result has the same bits with any
+number of threads.
 
 Growth asks how much the pixels pull at a Gaussian, even where they pull it apart and their gradients cancel (AbsGS, Ye
 et al. 2024). So every form leaves, in two columns of the records' gradient that the image does not depend on, the sums
@@ -38,11 +38,11 @@ ABSOLUTE_X, ABSOLUTE_Y = Record.CUT, Record.REACH_X
 MAX_ALPHA = 0.999
 """No Gaussian is more opaque: the gradient divides by 1 - alpha."""
 OPAQUE = 1e-4
-"""Transmittance below which a pixel is done."""
+"""A pixel is finished below this transmittance."""
 MAX_PAIRS = 2**24
-"""Maximum number of pairs of a Gaussian and a pixel that the form in few operations holds at once."""
+"""Maximum number of pairs of a Gaussian and a pixel in memory, in the form with few operations."""
 CHANNELS = {"rgb": 3, "distance": 4, "normals": 7}
-"""Content of an image -> its channels: colours; then the sum of weight times distance; then that of the normals."""
+"""Content of an image -> number of channels: colours, then weighted distance, then weighted normals."""
 
 
 class Blended(NamedTuple):
@@ -54,8 +54,8 @@ class Blended(NamedTuple):
     transmittance: Tensor
     """(H, W) share of the background's light that arrives."""
     median: Tensor | None
-    """(H, W) distance from the camera at which transmittance falls to 1/2 or below, 0 where it never does; None if not
-    asked for."""
+    """(H, W) distance from the camera where transmittance falls to 1/2 or below, 0 if it never does; None if not
+    requested."""
 
 
 def blend(
@@ -69,8 +69,7 @@ def blend(
 ) -> Blended:
     """Blend the Gaussians on an image.
 
-    The gradient of the records is that of the image, but for the columns ABSOLUTE_X and ABSOLUTE_Y, which have sums of
-    absolute gradients.
+    Columns ABSOLUTE_X and ABSOLUTE_Y of the records' gradient hold sums of absolute gradients.
 
     Args:
         records: (N, RECORD) Gaussians on the image.
@@ -163,8 +162,7 @@ def _blend_together(
 ) -> Blended:
     """Compute `blend` for many tiles at once, those with lists of like lengths together.
 
-    The device is waited for once, for the lengths. If the tiles do not fit into memory at once, what is computed of
-    them is computed again in the backward pass.
+    Synchronises once, for the lengths. If not all tiles fit into memory, the backward pass computes them again.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     behind = torch.nn.functional.pad(background.to(records), (0, channels - 3))
@@ -209,7 +207,7 @@ def _blended_tiles(
 
 
 def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) -> int:
-    """Return the number of pairs of a Gaussian and a pixel into which it is blended, for measurements.
+    """Return the number of pairs of a pixel and a Gaussian blended into it, for measurements.
 
     Args:
         records: (N, RECORD) Gaussians on the image.

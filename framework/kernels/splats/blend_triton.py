@@ -1,8 +1,8 @@
 """Blending of Gaussians, forward and backward, in Triton. `nerfloom.kernels.splats.blend` has the equations.
 
-A program takes a tile, and evaluates some Gaussians of its list at all pixels together. Transmittances within such a
-batch are products along it. In the backward pass each entry of a tile's list has sums over the tile's pixels of its
-own, which are added up by Gaussian in a fixed order: nothing is added atomically, and the same bits come out each time.
+A program processes a tile, in batches of Gaussians at all pixels together. Transmittances within a batch are cumulative
+products. In the backward pass each entry of a tile's list has its own sums over the tile's pixels, which are added by
+Gaussian in a fixed order, without atomics, so that results are reproducible bit for bit.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
@@ -49,7 +49,7 @@ TILE, PIXELS = tl.constexpr(tiles.TILE), tl.constexpr(tiles.TILE**2)
 MAX_ALPHA, OPAQUE = tl.constexpr(blending.MAX_ALPHA), tl.constexpr(blending.OPAQUE)
 SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY = (tl.constexpr(k) for k in range(5))
 SUM_G, ABSOLUTE_X, ABSOLUTE_Y = tl.constexpr(5), tl.constexpr(6), tl.constexpr(7)
-"""Columns of the sums over an entry's pixels that are not those of the record."""
+"""Columns of the sums over an entry's pixels that differ from the record's."""
 
 
 @triton.jit
@@ -114,7 +114,7 @@ def _forward(
         if median_image is not None:
             crossed = (before > 0.5) & (after <= 0.5)
             median += tl.sum(tl.where(crossed, _column(record, listed, DISTANCE), 0.0), 1)
-        # What is not blended any more has a lower transmittance than what is left.
+        # Gaussians that are no longer blended have a lower transmittance.
         through = tl.min(tl.where(before >= OPAQUE, after, through[:, None]), 1)
         n += BATCH
     tl.store(used + tile, tl.minimum(n, end) - tl.load(offsets + tile))
@@ -165,7 +165,7 @@ def _backward(
     red = tl.load(of_image, mask=on, other=0.0)
     green = tl.load(of_image + 1, mask=on, other=0.0)
     blue = tl.load(of_image + 2, mask=on, other=0.0)
-    # What is behind a Gaussian is all that is seen, less what is in front of it and itself.
+    # The light from behind a Gaussian is the whole image minus the Gaussian and everything in front of it.
     behind = red * tl.load(image, mask=on, other=0.0) + green * tl.load(image + 1, mask=on, other=0.0)
     behind += blue * tl.load(image + 2, mask=on, other=0.0)
     if CHANNELS > 3:
@@ -190,7 +190,7 @@ def _backward(
         tl.store(part + GREEN, tl.sum(weight * green[:, None], 0), mask=listed)
         tl.store(part + BLUE, tl.sum(weight * blue[:, None], 0), mask=listed)
         rest = behind[:, None] - tl.cumsum(weight * own, 1)
-        # The gradient of the exponent: alpha times that of alpha; none where alpha is at its bound.
+        # The gradient of the exponent: alpha times the gradient of alpha, 0 if alpha is clipped.
         exponent = tl.where(raw < MAX_ALPHA, alpha * (before * own - rest / (1 - alpha)), 0.0)
         _put_shape(part, listed, record, exponent, dx, dy)
         behind -= tl.sum(weight * own, 1)

@@ -1,4 +1,4 @@
-// Projection of Gaussians that are packed to be drawn many times. See ../splat_packed.py.
+// Projection of packed Gaussians, which are drawn many times. See packed.py.
 #include "splats/project.h"
 
 namespace {
@@ -45,7 +45,7 @@ struct Sides {
     float n[4][3], length[4], per_reach[4];
     int count = 0;
     explicit Sides(const Camera& c) {
-        if (c.lens) return;  // a lens bends the sides; what lies behind the camera is still found
+        if (c.lens) return;  // a lens bends the sides; blocks behind the camera are still found
         // x / z of a centre and half the width of what is drawn around it: fx reach sqrt(1 + (x/z)^2) / z, where x / z
         // is bounded as in the Jacobian, and the root of what the blur adds, of a CUT of at most log(255).
         const float blur = std::sqrt(2 * std::log(1 / MIN_ALPHA) * c.blur);

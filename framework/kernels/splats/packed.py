@@ -1,8 +1,7 @@
 """Projection of Gaussians that do not change, packed to be drawn many times.
 
-A block of PACK Gaussians holds a parameter of theirs side by side, so that a kernel loads a vector where it gathers
-from rows otherwise, and coefficients of harmonics may take two bytes. A block whose ball is not on the image is not
-read.
+A block of PACK Gaussians stores each parameter contiguously, so that a kernel loads vectors instead of gathering from
+rows. Coefficients of harmonics may take two bytes. Blocks whose ball is not on the image are skipped.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ class PackedGaussians(NamedTuple):
     harmonics: Tensor
     """(B, 3, K, PACK) coefficients of the harmonics from degree 1, float32 or bfloat16."""
     balls: Tensor
-    """(B, 5) centre of a ball that holds a block's means, its radius, and the longest of the distances from their means
-    at which its Gaussians' alpha falls below MIN_ALPHA, scene units."""
+    """(B, 5) centre and radius of a ball that contains a block's means, and the maximum distance from a mean where
+    alpha is at least MIN_ALPHA, scene units."""
 
 
 def pack_gaussians(
@@ -49,7 +48,7 @@ def pack_gaussians(
         logits: (N,) opacities before the sigmoid.
         colors: (N, 3) coefficients of the harmonic of degree 0; 0 is grey.
         harmonics: (N, 3, K) coefficients of the degrees from 1; K is 0, 3, 8 or 15.
-        dtype: type in which harmonics are kept, float32 or bfloat16.
+        dtype: type of the stored harmonics, float32 or bfloat16.
     """
     count = len(means)
     blocks = -(-count // PACK)
@@ -81,15 +80,15 @@ def project_packed(packed: PackedGaussians, camera: SplatCamera, degree: int = 3
         degree: highest degree of the harmonics that is used, 0 to 3.
 
     Returns:
-        Records (B * PACK, RECORD) as those of `project_gaussians`, where what is not on the image has a
-        CUT of 0 and anything in the other columns.
+        Records (B * PACK, RECORD) as in `project_gaussians`. Gaussians outside the image have a CUT of 0 and undefined
+        values in the other columns.
     """
     basis = min(DEGREES[degree], packed.harmonics.shape[2])
     return PROJECT_PACKED((packed.values, packed.balls), packed, camera, basis)
 
 
 def packed_sort_keys(packed: PackedGaussians, camera: SplatCamera) -> Tensor | None:
-    """Return what `sort_keys` does of the Gaussians before they were packed, (B * PACK,).
+    """Return the keys (B * PACK,) of `sort_keys` for packed Gaussians.
 
     Args:
         packed: B blocks of Gaussians.

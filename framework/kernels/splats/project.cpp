@@ -57,8 +57,8 @@ EXPORT int splat_project(const float* means, const float* log_scales, const floa
     });
 }
 
-// From the gradient of the records, that of all parameters, and of the camera's pose (3, 4) by partial sums of chunks
-// (chunks, 12), which are given room for. Slots CUT and REACH_* of the gradient are not read.
+// Computes the gradients of all parameters and of the camera's pose (3, 4) from the gradient of the records. The pose
+// has partial sums of chunks, (chunks, 12), allocated by the caller. CUT and REACH_* are not read.
 EXPORT int splat_project_backward(const float* means, const float* log_scales, const float* rotations,
                                   const float* logits, const float* colors, const float* harmonic, int64_t count,
                                   int basis, int stride, const double* settings, const float* records,

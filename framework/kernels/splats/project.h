@@ -1,5 +1,6 @@
-// Projection of Gaussians to an image, LANES at a time, one in each lane. See ../splat_project.py for the reference and
-// equations. A source says what their parameters are: mean(from, i) and so on return one of LANES Gaussians in a row.
+// Projection of Gaussians to an image, LANES at a time, one in each lane. See project.py for the reference and
+// equations. A source provides the parameters: mean(from, i) and so on return parameter i of LANES consecutive
+// Gaussians.
 #pragma once
 
 #include "encodings/harmonics.h"
@@ -17,7 +18,7 @@ struct Camera {
     bool antialiased;
     enum Lens { NONE, OPENCV, FISHEYE } lens;
     float center[3];                    // of the camera, scene coordinates
-    float low_x, high_x, low_y, high_y; // x / z and y / z beyond which the Jacobian is taken at the bound
+    float low_x, high_x, low_y, high_y; // limits of x / z and y / z in the Jacobian
     double coefficients[LENS_SIZE];
 
     explicit Camera(const double* from) {
@@ -64,9 +65,8 @@ inline Floats logarithm(Floats x) {
     return (m + (m * square * p - 2.12194440e-4f * e - 0.5f * square)) + 0.693359375f * e;
 }
 
-// From (x, y) = (tan t cos f, tan t sin f) to (t cos f, t sin f), as a fisheye sees it: what both are multiplied by, and
-// the Jacobian. Both are those of a function of the radius, and so is a fisheye's Bent, so that their product is
-// symmetric too.
+// From (x, y) = (tan t cos f, tan t sin f) to (t cos f, t sin f), as in a fisheye: the common factor, and the Jacobian.
+// This mapping and a fisheye's Bent are functions of the radius, so the product of their Jacobians is symmetric.
 struct ToAngle {
     double scale = 1, xx = 1, xy = 0, yy = 1;
 
@@ -82,7 +82,7 @@ struct ToAngle {
 // All that both directions need, of LANES Gaussians.
 struct Projected {
     Floats p[3];           // the centre in the camera's frame
-    Floats s[3], q[4], norm;  // scales, the unit quaternion, and what it was divided by
+    Floats s[3], q[4], norm;  // scales, the unit quaternion, and its length before
     Floats rotation[3][3], v[3][3];  // v: the axes times the scales, in the camera's frame
     Floats plane_x, plane_y, inside_x, inside_y;  // x / z and y / z, as the Jacobian takes them; 1 where not bounded
     Floats bend[3];        // the lens's Jacobian: uu, uv, vv
@@ -199,8 +199,8 @@ inline Floats color_of(const Source& in, int64_t from, int channel, int basis, c
     return color;
 }
 
-// Writes the records of the Gaussians [from, from + LANES), those of invisible ones as zeros, but not beyond `end`.
-// Returns how many are not finite; a source that has none (FINITE) is not asked for colours that nobody sees.
+// Writes the records of the Gaussians [from, from + LANES), zeros for invisible ones, but not beyond `end`. Returns the
+// number that is not finite; a FINITE source is not asked for the colours of invisible Gaussians.
 template <typename Source>
 inline int project_lanes(const Source& in, const Camera& camera, int basis, int64_t from, int64_t end, float* records) {
     const Projected g(in, camera, from);
@@ -239,7 +239,7 @@ inline int project_lanes(const Source& in, const Camera& camera, int basis, int6
     for (int i = 0; i < 3; i++) out[NORMAL_X + i] = facing > 0 ? -normal[i] : normal[i];
     Ints finite = Ints{} - 1;
     for (int k = 0; k < RECORD; k++) finite &= out[k] - out[k] == 0;
-    // What overflows on the way is not visible either, but only what has such parameters is counted.
+    // Gaussians that overflow are invisible too, but only parameters that are not finite are counted.
     const Ints all = (given - given == 0) & (g.norm > 1e-12f), kept = visible & finite & all;
     std::memcpy(shown, &kept, sizeof shown);
     std::memcpy(sound, &all, sizeof sound);

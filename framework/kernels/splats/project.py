@@ -7,11 +7,11 @@ Gaussian of mean m, axes R and scales s is on the image
     T = J W R diag(s)                   J: the Jacobian of the image position at p
     covariance = T T^T + blur I         pixels^2
 
-`blur` makes up for a pixel's size: each Gaussian is at least that wide. Where it should not grow brighter by that,
-its opacity is multiplied by sqrt(det(T T^T) / det(covariance)) (Mip-Splatting, Yu et al. 2024, section 4.2).
+`blur` accounts for the size of a pixel: each Gaussian has at least this variance. With antialiasing, its opacity is
+multiplied by sqrt(det(T T^T) / det(covariance)) (Mip-Splatting, Yu et al. 2024, section 4.2).
 
 A lens bends the image: J is then of the bent position, and the lens's own Jacobian counts as constant in gradients.
-A fisheye shows what lies in front of the camera's plane, less than 90 degrees from its axis.
+A fisheye shows points less than 90 degrees from the camera's axis.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from nerfloom.kernels.triton_backend import later
 
 
 class Record(IntEnum):
-    """Columns of a record, which is what an image needs of a Gaussian; kernels/splats/splat.h has the same names.
+    """Columns of a record, a projected Gaussian; kernels/splats/splat.h has the same names.
 
     Centre X, Y in pixels. U_X, U_Y, V_Y make alpha at an offset (dx, dy) from the centre OPACITY * exp(-u^2 - v^2) with
     u = U_X dx + U_Y dy and v = V_Y dy. CUT is u^2 + v^2 where alpha falls below MIN_ALPHA; 0 or less if the Gaussian is
-    not visible. REACH_X and REACH_Y are half the width and height of what is within, pixels. DISTANCE is from the
-    camera, scene units. The normal is the shortest axis, turned towards the camera.
+    not visible. REACH_X and REACH_Y are half the width and height of this ellipse, pixels. DISTANCE is the distance
+    from the camera, scene units. The normal is the shortest axis, turned towards the camera.
     """
 
     X, Y, U_X, U_Y, V_Y, OPACITY, CUT, REACH_X = range(8)
@@ -52,8 +52,8 @@ BLUR = 0.3
 DC = 0.28209479177387814
 """The harmonic of degree 0."""
 MARGIN = 0.15
-"""Share of the image's size beyond its edge up to which J is that of the centre; farther out, where it would grow
-without bound, it is that of the nearest place within."""
+"""Margin around the image, as a share of its size. Outside of it, J is evaluated at the nearest point within, since J
+grows without bound."""
 DEGREES = {0: 0, 1: 3, 2: 8, 3: 15}
 """Degree of the harmonics -> their number beyond the first."""
 
@@ -71,7 +71,7 @@ class SplatCamera:
     height: int
     """Height of the image, pixels."""
     near: float = 0.01
-    """Smallest depth along the optical axis at which a centre is drawn, scene units."""
+    """Gaussians whose centre has a smaller depth along the optical axis are not drawn, scene units."""
     blur: float = BLUR
     """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
@@ -233,7 +233,8 @@ def _projected(
 
 
 def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the positions x, y (K,) on the image of points (K, 3), Jacobians (K, 2, 3), and what the lens shows."""
+    """Return image positions x, y (K,) of points (K, 3), Jacobians (K, 2, 3), and a mask of points that the lens
+    shows."""
     fx, fy, cx, cy = camera.intrinsics
     x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
     low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
@@ -259,8 +260,8 @@ def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor
 
 
 def _angles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points (K,) of the plane at depth 1, moved to the angle of which their radius is the tangent, and the
-    Jacobian (K, 2, 2) of that."""
+    """Return points (K,) of the plane at depth 1 with their radius replaced by its arctangent, and the Jacobian (K, 2,
+    2)."""
     squared = x * x + y * y
     far = squared > 1e-8
     safe = torch.where(far, squared, 1.0)

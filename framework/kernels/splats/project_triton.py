@@ -1,7 +1,7 @@
 """Projection of Gaussians to a pinhole camera's image, forward and backward, in Triton.
 
-`nerfloom.kernels.splats.project` has the reference and the equations. Each thread takes a Gaussian. The backward pass
-computes what the forward pass did again, and keeps nothing but the records.
+`nerfloom.kernels.splats.project` has the reference and the equations. Each thread processes a Gaussian. The backward
+pass repeats the forward pass; only the records are saved.
 """
 
 # Triton gives the kernels' arguments their types.
@@ -150,7 +150,7 @@ def _colors_back(
     record, colors_grad, coefficients, of_coefficients, n, here, shown, stride, grad, x, y, z, channel: tl.constexpr,
     BASIS: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradients of a channel's coefficients; return that of the direction."""
+    """Write the gradients of a channel's coefficients; return the gradient of the direction."""
     seen = shown & (tl.load(record + RED + channel, mask=shown, other=0.0) > 0)  # else it was cut off below 0
     own = tl.where(seen, tl.load(grad + RED + channel, mask=shown, other=0.0), 0.0)
     tl.store(colors_grad + n * 3 + channel, own * DC, mask=here)
@@ -171,7 +171,7 @@ def _colors_back(
 def _directions_back(
     record, of_colors, coefficients, of_coefficients, n, here, shown, stride, grad, x, y, z, length, BASIS: tl.constexpr
 ):
-    """Write the gradients of all colours; return those of the positions by the directions that they are seen from."""
+    """Write the gradients of all colours; return the gradients of the positions through the view directions."""
     x0, y0, z0 = _colors_back(
         record, of_colors, coefficients, of_coefficients, n, here, shown, stride, grad, x, y, z, 0, BASIS
     )

@@ -1,4 +1,4 @@
-"""Columns of a Gaussian on the image, for kernels: those of `nerfloom.kernels.splats.project.Record`."""
+"""Columns of a record for Triton kernels, equal to `nerfloom.kernels.splats.project.Record`."""
 
 import triton.language as tl
 

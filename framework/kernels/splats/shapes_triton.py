@@ -1,8 +1,8 @@
 """Functions for kernels, from Gaussians to ellipses on a pinhole camera's image and back.
 
 `nerfloom.kernels.splats.project` has the equations. T has the rows a and b, the covariance of an ellipse the entries a,
-b and c. A name that starts with `of_` is the gradient of what follows. All values are vectors, of a Gaussian in each
-lane, but for the camera's; `pose` and the like are pointers.
+b and c. A name that starts with `of_` is a gradient, of the variable named after it. All values are vectors, of a
+Gaussian in each lane, but for the camera's; `pose` and the like are pointers.
 """
 
 # Triton gives the kernels' arguments their types.
@@ -27,7 +27,7 @@ def three(values, n, here):
 
 @triton.jit
 def put_three(values, n, here, shown, x, y, z):
-    """Write rows of three, of zeros for what is not shown.
+    """Write rows of three values, zeros for invisible Gaussians.
 
     Its arguments are `values, n, here, shown, x, y, z`.
     """
@@ -192,7 +192,7 @@ def column_back(pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx,
 
 @triton.jit
 def rotation_back(w, x, y, z, norm, g00, g01, g02, g10, g11, g12, g20, g21, g22):
-    """Return the gradients of quaternions from those of the matrices (`_axes`).
+    """Return the gradients of quaternions from the gradients of the matrices (`_axes`).
 
     Its arguments are `w, x, y, z, norm, g00, g01, g02, g10, g11, g12, g20, g21, g22`.
     """

@@ -12,8 +12,8 @@ enum Record {
     X, Y,            // centre, pixels
     U_X, U_Y, V_Y,   // 1 / pixels
     OPACITY,
-    CUT,             // u^2 + v^2 from which alpha is below MIN_ALPHA; 0 or less of one that is not visible
-    REACH_X,         // half the width of what is within CUT, pixels
+    CUT,             // alpha is below MIN_ALPHA beyond this u^2 + v^2; at most 0 if invisible
+    REACH_X,         // half the width of the ellipse u^2 + v^2 = CUT, pixels
     RED, GREEN, BLUE,
     DISTANCE,        // of the centre from the camera
     NORMAL_X, NORMAL_Y, NORMAL_Z,

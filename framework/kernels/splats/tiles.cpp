@@ -1,4 +1,4 @@
-// Which Gaussians each tile of an image shows, from front to back. See ../splat_tiles.py.
+// Lists of the Gaussians of each tile, from front to back. See tiles.py.
 #include "splats/splat.h"
 
 #include <algorithm>
@@ -32,8 +32,8 @@ struct Span {
     }
 };
 
-// Calls `body` with each tile of which a Gaussian's ellipse meets the rectangle between the centres of its pixels. In a
-// row of tiles these lie side by side: from the leftmost point of the ellipse within the row to the rightmost.
+// Calls `body` with each tile whose rectangle of pixel centres meets a Gaussian's ellipse. In a row these tiles are
+// adjacent: from the leftmost to the rightmost point of the ellipse within the row.
 template <typename Body>
 void for_tiles(const float* g, const Grid& grid, const Body& body) {
     const Span span(g, grid);
@@ -59,9 +59,8 @@ void for_tiles(const float* g, const Grid& grid, const Body& body) {
 
 }  // namespace
 
-// The visible Gaussians by their keys, such as distances, smallest first, and those of the same key by index; `order`
-// has room for `count`, and keys are `stride` apart. A radix sort by the bits of a positive float. Returns how many
-// there are.
+// Sorts the visible Gaussians by key (such as distance), then by index: a radix sort by the bits of a positive float.
+// `order` has room for `count`, and keys are `stride` apart. Returns the number of visible Gaussians.
 EXPORT int splat_sort(const float* records, int64_t count, const float* keys, int64_t stride, int32_t* order,
                       int64_t* visible) {
     return guarded([&] {
@@ -120,7 +119,7 @@ EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, 
     return guarded([&] {
         const Grid grid(width, height);
         const int64_t tiles = int64_t(grid.columns) * grid.rows;
-        // The tiles of each Gaussian, in the order in which they lie in memory.
+        // The tiles of each Gaussian, in memory order.
         std::vector<std::vector<int32_t>> found(size_t((count + GRAIN - 1) / GRAIN));
         firsts[0] = 0;
         for_chunks(threads, int64_t(found.size()), [&](int64_t chunk, int) {

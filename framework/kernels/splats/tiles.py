@@ -1,7 +1,7 @@
 """Lists of the Gaussians that each tile of an image shows, from front to back.
 
-The Gaussians are sorted once (a radix sort of 32-bit keys), by distance or by keys that are given, and dealt to the
-tiles that they touch in that order, so that each tile's list is sorted too.
+The Gaussians are sorted once (a radix sort of 32-bit keys), by distance or by given keys, and then appended in this
+order to the list of each tile that they touch, so that these lists are sorted too.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ class TileLists(NamedTuple):
     ids: Tensor
     """(E,) int32 index of each entry's Gaussian. Behind the last tile's there may be some without a meaning."""
     slots: Tensor
-    """(E,) int32 place of each entry if all are sorted by Gaussian, and those of a Gaussian by tile; (0,) if lists are
-    not `for_gradients`."""
+    """(E,) int32 index of each entry in the order by Gaussian, then by tile; (0,) unless `for_gradients`."""
     firsts: Tensor
     """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
     needed: Tensor | None = None
@@ -45,9 +44,9 @@ def tile_lists(
     Args:
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
-        for_gradients: whether a gradient will be asked for; without one the lists may have no slots.
-        room: number of entries for which there is room, so that the device need not be waited for; Gaussians beyond it
-            are left out whole. None for room for all.
+        for_gradients: whether a backward pass follows; otherwise the lists may have no slots.
+        room: capacity in entries, which avoids a synchronisation; Gaussians beyond it are dropped whole. None for no
+            limit.
         keys: (N,) positive numbers that sort the visible Gaussians instead, smallest first.
 
     Raises:
@@ -69,7 +68,7 @@ def tile_lists_reference(
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
         for_gradients: makes no difference here.
-        room: number of entries for which there is room; the nearest Gaussians have it.
+        room: capacity in entries; the nearest Gaussians are kept.
         keys: (N,) numbers that sort Gaussians instead of their distances.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
@@ -97,8 +96,8 @@ def _keys(records: Tensor, keys: Tensor | None) -> Tensor:
 
 
 def _dealt(ids: Tensor, tiles: Tensor, num_tiles: int, num_gaussians: int) -> TileLists:
-    """Return the lists of entries (E,) of a Gaussian and a tile each, sorted by distance and then by tile; those of no
-    Gaussian and no tile, which have the number behind the last of each, come last."""
+    """Return the lists from entries (E,), pairs of a Gaussian and a tile by distance. Empty entries have the
+    indices `num_gaussians` and `num_tiles`, and come last."""
     by_tile = tiles.sort(stable=True).indices
     ids = ids.index_select(0, by_tile)
     slots = torch.empty_like(ids)

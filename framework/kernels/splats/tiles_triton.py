@@ -1,9 +1,8 @@
 """Lists of the Gaussians that each tile of an image shows, in Triton; the reference: `nerfloom.kernels.splats.tiles`.
 
-Each entry's key is its tile, above the bits of the distance (or of what else is sorted by), which rise with it as those
-of all positive floats do. So one stable sort puts the entries in order, those of the same distance by Gaussian. The
-host waits once, for the number of entries, unless it says for how many there is room; keys of what is left of it come
-last.
+Each entry's key is its tile, above the bits of the distance or of another sort key. The bits of positive floats
+increase with the value, so one stable sort orders all entries, with equal distances by Gaussian. The host synchronises
+once, for the number of entries, unless a capacity is given; keys of unused capacity come last.
 """
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
@@ -25,13 +24,13 @@ from nerfloom.kernels.triton_launch import blocks, launch
 BLOCK = 32
 """Gaussians that are taken together, by one warp."""
 LAST = 2**63 - 1
-"""Key behind those of all entries."""
+"""Key larger than the keys of all entries."""
 TILE = tl.constexpr(tiles.TILE)
 
 
 @triton.jit
 def _span(centre, reach, count):
-    """Return the first tile along an axis in which a Gaussian's box has a pixel's centre, and that after the last."""
+    """Return the range (first, end) of tiles along an axis where a Gaussian's box contains a pixel's centre."""
     low = tl.ceil((centre - reach - (TILE - 0.5)) / TILE)
     high = tl.floor((centre + reach - 0.5) / TILE) + 1
     most = count * 1.0

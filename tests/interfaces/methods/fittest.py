@@ -1,4 +1,4 @@
-"""Fittest: Gaussians of which those that images pull at most are copied, and the faintest are dropped."""
+"""Fittest: Gaussians with the largest image gradients are copied, and the faintest are dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Instant-NGP with as many samples on every ray, evenly through the box."""
+"""Instant-NGP with the same number of samples on every ray, evenly through the box."""
 
 from __future__ import annotations
 

@@ -1,11 +1,15 @@
-"""Time of a training step, in each compiled CPU kernel and in Python and torch."""
+"""Time of a training step, in each compiled CPU kernel or each GPU kernel, and in what is left."""
 
 from __future__ import annotations
 
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from nerfloom.base.console import say
 from nerfloom.base.device import wait_for
@@ -14,13 +18,15 @@ from nerfloom.kernels import native
 from nerfloom.training.machine import kernels, machine
 from nerfloom.training.run import Run
 
+SHOWN, NAME = 25, 90
+"""Number of GPU kernels that are printed, and length of their names."""
 MEASURED, FEWEST, LONGEST = 200, 8, 30.0
 """Number of steps over which times are averaged; fewer, but at least the second number, if they take longer than the
 third, seconds."""
 
 
 def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
-    """Train a method, measure up to `MEASURED` further steps, and print a line for each CPU kernel.
+    """Train a method, measure up to `MEASURED` further steps, and print a line for each kernel.
 
     Args:
         run: the run to train.
@@ -43,18 +49,42 @@ def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
         wait_for(trainer.device)
         step = (time.perf_counter() - start) / count * 1e3
         rays = (trainer.state.rays - rays) // count
-    spent_in = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}
-    native.spent, used = None, kernels(trainer.device)
-    spent_in["Python and torch"] = step - sum(spent_in.values())
+        spent_in, native.spent = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}, None
+        rest = "Python and torch"
+        if trainer.device.type == "cuda":
+            spent_in, rest = gpu_kernels(trainer.train_step, FEWEST), "the GPU waits"
+        repeated = 0 if trainer.graphs is None else trainer.graphs.repeated
+        used = kernels(trainer.device)
+    spent_in[rest] = step - sum(spent_in.values())
     parts = dict(sorted(spent_in.items(), key=lambda item: -item[1]))
-    for name, spent in parts.items():
+    for name, spent in list(parts.items())[:SHOWN]:
         say(f"{name:28s} {spent:6.2f} ms  {spent / step:6.1%}")
-    say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {used}")
+    say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {used}, {repeated} steps repeated as CUDA graphs")
     return {
         "machine": machine(trainer.device),
         "kernels": used,
         "steps": count,
+        "steps repeated as CUDA graphs": repeated,
         "rays per step": rays,
         "ms per step": round(step, 2),
         "ms": {name: round(spent, 3) for name, spent in parts.items()},
     }
+
+
+def gpu_kernels(train_step: Callable[[], object], steps: int) -> dict[str, float]:
+    """Return milliseconds per step in each GPU kernel, by name, including copies.
+
+    Args:
+        train_step: runs a training step.
+        steps: number of steps to average over. They run apart from the steps that are timed, since recording kernels
+            slows them.
+    """
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as recorded:
+        for _ in range(steps):
+            train_step()
+        torch.cuda.synchronize()
+    spent = Counter[str]()
+    for event in recorded.events():
+        if event.device_type == torch.autograd.DeviceType.CUDA:
+            spent[event.name[:NAME]] += event.self_device_time_total / 1e3 / steps
+    return dict(spent)

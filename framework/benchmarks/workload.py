@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+from nerfloom.base.device import choose_device
 from nerfloom.registry import load_dataparser, load_method
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
@@ -39,7 +40,7 @@ def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:
     """
     config = dataclasses.replace(run.config, vis="none", max_seconds=seconds)
     run = dataclasses.replace(run, config=config, folder=folder / "run")
-    train_set = load_split(run, "train")
+    train_set = load_split(run, "train").to(choose_device(run.config.machine))
     config, _ = load_method(run.method).decided(config, train_set.scene)
     run = dataclasses.replace(run, config=dataclasses.replace(config, max_seconds=None))
     create_folder(run)

@@ -149,7 +149,7 @@ def test_it_is_loaded_and_looked_at_in_python_and_in_the_viewer(file: Path) -> N
     while studio.work() is not None or studio._browsers[1].pieces:
         pass
     expected = found.render(request.camera()).rgb.clamp(0, 1)
-    np.testing.assert_allclose(pictures[-1] / 255, expected.numpy(), atol=0.01)
+    np.testing.assert_allclose(pictures[-1] / 255, expected.cpu().numpy(), atol=0.01)
 
 
 def test_a_camera_path_is_rendered(file: Path) -> None:

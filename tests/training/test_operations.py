@@ -14,7 +14,7 @@ from nerfloom.training.step import backward
 from tests.training.helpers import tiny_trainer
 
 BOUNDS = {
-    "instant-ngp": (590, 0.3),
+    "instant-ngp": (600, 0.3),
     "nerfacto": (970, 0),
     "kplanes": (1030, 0.3),
     "tensorf": (770, 0.3),

@@ -89,26 +89,6 @@ struct Gathered {
     }
 };
 
-// Adds the gradient of one level by positions to `out`; `grad`: the level's incoming gradient, rows `stride` wide.
-template <int F, bool DENSE>
-void add_position_gradient(const Level& level, const Floats (*xyz)[3], int64_t count, const float* table,
-                           const float* grad, int64_t stride, Floats (*out)[3]) {
-    Cell cells[2];  // this block's and the next one's, which is prefetched
-    alignas(64) float value[CORNERS][LANES] = {};
-    const float* entries = table + level.offset * F;
-    find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
-    for (int64_t n = 0, turn = 0; n < count; n += LANES, turn ^= 1) {
-        if (n + LANES < count) {
-            xyz++;
-            find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[turn ^ 1]);
-            grid::prefetch<F>(cells[turn ^ 1], entries);
-        }
-        for (int s = 0; s < block(n, count); s++)
-            weigh_corners<F>(cells[turn], s, entries, grad + (n + s) * stride, value);
-        add_slopes(cells[turn], value, *out++);
-    }
-}
-
 template <int F>
 void backward_positions(const float* positions, int64_t count, const float* table, const float* grad,
                         const int64_t* resolutions, const int64_t* offsets, int levels, float* out, int threads) {

@@ -165,6 +165,26 @@ inline void add_slopes(const Cell& cell, const float (*value)[LANES], Floats* ou
     }
 }
 
+// Adds the gradient of one level by positions to `out`; `grad`: the level's incoming gradient, rows `stride` wide.
+template <int F, bool DENSE>
+void add_position_gradient(const Level& level, const Floats (*xyz)[3], int64_t count, const float* table,
+                           const float* grad, int64_t stride, Floats (*out)[3]) {
+    Cell cells[2];  // this block's and the next one's, which is prefetched
+    alignas(64) float value[CORNERS][LANES] = {};
+    const float* entries = table + level.offset * F;
+    find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[0]);
+    for (int64_t n = 0, turn = 0; n < count; n += LANES, turn ^= 1) {
+        if (n + LANES < count) {
+            xyz++;
+            find_cell<DENSE>(level, (*xyz)[0], (*xyz)[1], (*xyz)[2], cells[turn ^ 1]);
+            prefetch<F>(cells[turn ^ 1], entries);
+        }
+        for (int s = 0; s < block(n, count); s++)
+            weigh_corners<F>(cells[turn], s, entries, grad + (n + s) * stride, value);
+        add_slopes(cells[turn], value, *out++);
+    }
+}
+
 // Fills `out` with the indices of those of `count` rows, `stride` wide, that have a gradient that is not zero (or is
 // NaN).
 inline void rows_with_gradient(const float* grads, int64_t count, int64_t stride, std::vector<int64_t>& out) {

@@ -34,10 +34,12 @@ class LookUp:
     """Computes the features."""
     backward_table: native.Function
     """Accumulates the gradient of the table over several look-ups."""
-    backward_points: native.Function
-    """Computes the gradient of the points."""
+    backward_points: native.Function | None
+    """Computes the gradient of the points; None if they have none."""
     adam: native.Function
     """Applies the gradient of the table by Adam, for several look-ups."""
+    results: int = 1
+    """Number of results for each feature, such as its value and a derivative."""
 
     def check(self, points: Tensor, table: Tensor, layout: HashGridLayout) -> None:
         """Check the arguments of a look-up.
@@ -113,7 +115,7 @@ class TableGradient:
     def __init__(self, look_up: LookUp, layout: HashGridLayout) -> None:
         self.look_up, self.layout = look_up, layout
         self.parts: Parts = []
-        """Points (N, ..., D) of each encoding, and gradient (N, L * F) of its result."""
+        """Points (N, ..., D) of each encoding, and gradient (N, L * F), for each of its results."""
         self._sum: Tensor | None = None
 
     @property
@@ -132,6 +134,7 @@ class TableGradient:
 
     def _arguments(self, features: int) -> tuple[Any, ...]:
         width, layout = self.layout.num_levels * features, (*self.layout.arrays, self.layout.num_levels)
+        width *= self.look_up.results
         ends = native.integers(tuple(accumulate(len(points) for points, _ in self.parts)))
         inner = zip(*(points.shape[1:-1] for points, _ in self.parts), strict=True)  # numbers J, of points that have it
         points = native.pointers([self.look_up.address(points) for points, _ in self.parts])
@@ -208,7 +211,7 @@ class _LookedUp(torch.autograd.Function):
             gradient = TableGradient(look_up, layout)
             gradient.parts.append((points, grad))
             gradient.add_to(grad_table)
-        if ctx.needs_input_grad[0]:
+        if ctx.needs_input_grad[0] and look_up.backward_points is not None:
             grad_points = torch.empty_like(points)
             look_up.backward_points(
                 points.data_ptr(), *points.shape[:-1], table.data_ptr(), incoming, features, *layout.arrays,

@@ -1,0 +1,72 @@
+"""Multiresolution hash encoding with its derivative along a direction, for losses on gradients of a field.
+
+A gradient n(x) of a scalar function of the encoding has a gradient of its own. With v the gradient of a loss by n, the
+product v . n is the derivative along v, so the loss's gradients by table and network are those of a derivative along a
+fixed direction. That needs first derivatives only.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.grids.hash_grid import hash_grid_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.hash_grid_lookup import LookUp
+
+_forward = native.Function("hash_grid_tangent_forward", "pqpippipi")
+_backward_table = native.Function("hash_grid_tangent_backward_table", "pppiippipi")
+_adam = native.Function("hash_grid_tangent_adam", "pppiippippppfddfi", "q")
+LOOK_UP = LookUp("hash_grid_tangent", "points", ("N", 6), _forward, _backward_table, None, _adam, results=2)
+"""The look-up of positions and directions."""
+
+
+def hash_grid_tangent_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    """Compute `hash_grid_tangent` in PyTorch, for any device and float type, with derivatives of any order.
+
+    `points`, `table`, `layout` and the result are as there.
+    """
+    encode = lambda positions: hash_grid_reference(positions, table, layout)  # noqa: E731
+    return torch.cat(torch.func.jvp(encode, (points[:, :3],), (points[:, 3:],)), dim=-1)
+
+
+def hash_grid_tangent(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    """Return the hash encoding of positions, and its derivative along a direction at each.
+
+    The result has no gradient in the compiled form.
+
+    Args:
+        points: (N, 6) positions, clamped to [0, 1], and directions of any length.
+        table: (E, F) entries of all levels, E = layout.num_entries.
+        layout: resolutions and offsets of the levels.
+
+    Returns:
+        (N, 2 * L * F): features level by level, followed by their derivatives along the directions.
+
+    Raises:
+        ValueError: if a shape does not fit the layout.
+    """
+    LOOK_UP.check(points, table, layout)
+    return HASH_GRID_TANGENT((points, table), points, table, layout)
+
+
+HASH_GRID_TANGENT = Operation("hash_grid_tangent", hash_grid_tangent_reference)
+
+
+def _fits(points: Tensor, table: Tensor, layout: HashGridLayout) -> bool:
+    return table.shape[1] in (1, 2, 4, 8)
+
+
+@HASH_GRID_TANGENT.implementation(CPP, order=0, differentiable=0, fits=_fits)
+def _compiled(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
+    points, table = points.contiguous(), table.contiguous()
+    features = table.shape[1]
+    out = points.new_empty(len(points), 2 * layout.num_levels * features)
+    entries = native.pointer(table, "the hash table", (layout.num_entries, features))
+    _forward(
+        LOOK_UP.address(points), len(points), entries, features, *layout.arrays, layout.num_levels, out.data_ptr(),
+        native.threads(),
+    )  # fmt: skip
+    return out

@@ -1,0 +1,1 @@
+"""Signed distances of surfaces: their networks with second derivatives, and their opacities."""

@@ -1,0 +1,131 @@
+"""Settings and model shared by methods that learn a signed distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Generic, TypeVar
+
+from torch import Tensor
+
+from nerfloom import Decision, RayModel, Rays, Rendered, Samples, Scene
+from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.opening import Opening
+from nerfloom.fields.base import Field
+from nerfloom.fields.surface import Sharpness, SurfaceField
+from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.losses.surfaces import Eikonal, Silhouette
+from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
+from nerfloom.renderable import parts
+from nerfloom.rendering.outputs import NORMALS
+from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.base import Sampler
+from nerfloom.samplers.choice import SamplingConfig, decide_sampler, decide_samples, make_sampler
+
+SAMPLES = 2**15
+"""Samples per training step with an occupancy grid."""
+
+
+@dataclass(frozen=True)
+class SurfaceConfig(
+    HashGridConfig,
+    SamplingConfig,
+    max_num_iterations=20_000,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
+    log2_table_size=17,
+    eval_num_rays_per_chunk=8_192,
+):
+    """Settings of a method that learns a signed distance."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "hidden_width": (1, 2**14),
+        "eikonal_loss_mult": AT_LEAST_0,
+        "silhouette_loss_mult": AT_LEAST_0,
+        "start_radius": (1e-3, 1),
+        "start_sharpness": (1e-3, 1e6),
+        "sharpness_learning_rate": AT_LEAST_0,
+        "open_levels_until": (0, 1),
+    }
+    """Allowed range of each numeric setting."""
+    hidden_width: int = 64
+    """Features per hidden layer of the two networks."""
+    eikonal_loss_mult: float = 0.01
+    """Weight of the term that keeps the distance's gradient at length 1."""
+    silhouette_loss_mult: float = 0.01
+    """Weight of the difference between opacity and the images' alpha."""
+    start_radius: float = 0.5
+    """Radius of the ball that training starts from, in halves of the box's shortest edge."""
+    start_sharpness: float = 20.0
+    """First inverse width of the surface, in halves of the box's shortest edge."""
+    sharpness_learning_rate: float = 1e-3
+    """Learning rate of a tenth of the logarithm of the inverse width."""
+    open_levels_until: float = 0.3
+    """Fraction of the budget during which levels of the hash grid open, from coarse to fine."""
+
+
+SurfaceConfigT = TypeVar("SurfaceConfigT", bound=SurfaceConfig)
+
+
+def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT, list[Decision]]:
+    """Fill in the settings that depend on the scene."""
+    config, made = decide_sampler(config, scene)
+    config, samples = decide_samples(config, SAMPLES)
+    return config, made + samples
+
+
+def field_parts(config: SurfaceConfig, scene: Scene) -> tuple[Sharpness, Tensor, HashGrid, float, int]:
+    """Return the arguments of a field's constructor."""
+    half = float((scene.box[1] - scene.box[0]).min()) / 2
+    sharpness = Sharpness(config.start_sharpness / half, config.sharpness_learning_rate)
+    return sharpness, scene.box, HashGrid.of(config, config.open_levels_until), config.start_radius, config.hidden_width
+
+
+class SurfaceRenderer(VolumeRenderer):
+    """Volume rendering with the normals of the distance."""
+
+    outputs = (NORMALS,)
+
+    def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
+        rendered = super().shade(rays, samples, field, background)
+        assert samples.features is not None
+        assert rendered.weights is not None
+        normals = safe_normalize(samples.features[:, :3].detach())
+        facing = ray_sum(rendered.weights.detach()[:, None] * normals, samples)
+        return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
+
+
+def renderer(config: SurfaceConfig, scene: Scene) -> SurfaceRenderer:
+    """Return the renderer."""
+    return SurfaceRenderer()
+
+
+class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
+    """A model that learns the distance to a surface, and its colour."""
+
+    losses = (COLOR_ERROR, SamplerLoss(), Silhouette(), Eikonal(), *KNOWN_DISTANCES)
+
+    def __init__(
+        self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: VolumeRenderer
+    ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
+        edges = scene.box[1] - scene.box[0]
+        self.surface.cell = float((edges / config.grid_resolution).norm())
+
+    @property
+    def surface(self) -> SurfaceField:
+        """The field."""
+        assert isinstance(self.field, SurfaceField)
+        return self.field
+
+    def before_step(self, step: int, progress: float) -> None:
+        for opening in parts(self, Opening):
+            opening.advance(progress)
+        self.sampler.update(step, self.surface.density_around)
+
+
+make_surface_sampler = make_sampler

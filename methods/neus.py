@@ -1,0 +1,60 @@
+"""NeuS: a signed distance on a hash grid, whose zero level set is the surface.
+
+Wang et al., "NeuS: Learning Neural Implicit Surfaces by Volume Rendering for Multi-view Reconstruction", NeurIPS 2021.
+The hash grid and the network with ReLU are those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in
+Neuralangelo (Li et al. 2023).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from nerfloom import Method, Scene
+from nerfloom.base.config import Range
+from nerfloom.fields.surface import NeuSField
+from nerfloom.methods._surfaces import (
+    SurfaceConfig,
+    SurfaceModel,
+    decide_surface,
+    field_parts,
+    make_surface_sampler,
+    renderer,
+)
+
+
+@dataclass(frozen=True)
+class NeuSConfig(SurfaceConfig):
+    """Settings of neus."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"anneal_slope_until": (0, 1)}
+    """Allowed range of each numeric setting."""
+    anneal_slope_until: float = 0.5
+    """Fraction of the budget over which the slope's annealing ends (`surface_opacity`)."""
+
+
+class NeuS(SurfaceModel[NeuSConfig], plain=True):
+    """A model with the opacity of NeuS, equation 13."""
+
+    def before_step(self, step: int, progress: float) -> None:
+        super().before_step(step, progress)
+        until = self.config.anneal_slope_until
+        assert isinstance(self.field, NeuSField)
+        self.field.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
+
+
+def make_field(config: NeuSConfig, scene: Scene) -> NeuSField:
+    """Return a field that starts as a ball."""
+    return NeuSField(*field_parts(config, scene))
+
+
+METHOD = Method(
+    NeuSConfig(),
+    paper="arXiv:2106.10689",
+    field=make_field,
+    sampler=make_surface_sampler,
+    renderer=renderer,
+    model=NeuS,
+    decide=decide_surface,
+)
+"""The method."""

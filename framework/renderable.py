@@ -140,6 +140,14 @@ class HasDensity(Protocol):
         """Return the density (N,) at `points`, in 1/length."""
 
 
+@runtime_checkable
+class HasSignedDistance(Protocol):
+    """A model of a surface, whose distance can be evaluated at any position."""
+
+    def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
+        """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3)."""
+
+
 def parts(whole: Renderable | nn.Module, kind: Callable[..., PartT]) -> list[PartT]:
     """Return the modules of a kind in a model, including the model itself.
 

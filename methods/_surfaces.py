@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
 
+import torch
 from torch import Tensor
 
-from nerfloom import Decision, RayModel, Rays, Rendered, Samples, Scene
+from nerfloom import Decision, Points, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.opening import Opening
@@ -121,6 +122,12 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
         """The field."""
         assert isinstance(self.field, SurfaceField)
         return self.field
+
+    @torch.no_grad()
+    def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
+        """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3)."""
+        shape = self.surface.shape(points.positions)
+        return shape.distances, shape.gradients
 
     def before_step(self, step: int, progress: float) -> None:
         for opening in parts(self, Opening):

@@ -46,7 +46,8 @@ class MeshFlags(ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class MarchingCubesFlags(MeshFlags):
-    """Write a mesh of the surface where the density of a field passes a level, with colours and normals."""
+    """Write a mesh of the surface of a field, with colours and normals: where its density passes a level, or where its
+    signed distance is zero."""
 
     isosurface_threshold: float | None = None
     """Density of the surface, per scene unit. Default: the density at which 1/32 of the scene's box is half opaque."""
@@ -66,7 +67,7 @@ class TsdfFlags(MeshFlags):
 
 
 def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> None:
-    """Write a mesh of a level of the density, in the frame of the input.
+    """Write a mesh of a level of the density, or of where a signed distance is zero, in the frame of the input.
 
     Args:
         flags: flags of the command.
@@ -79,21 +80,25 @@ def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> Non
     lattice, cleaning, texturing = _prepared(flags, loaded)
     from nerfloom.base.console import say
     from nerfloom.export.density import default_level
-    from nerfloom.export.meshing import density_mesh
-    from nerfloom.renderable import HasDensity
+    from nerfloom.export.meshing import density_mesh, distance_mesh
+    from nerfloom.renderable import HasDensity, HasSignedDistance
 
-    model, level = loaded.model, flags.isosurface_threshold
+    model, level, cameras = loaded.model, flags.isosurface_threshold, loaded.run.parse("train").cameras
+    start = time.monotonic()
+    if isinstance(model, HasSignedDistance):
+        if level is not None:
+            raise FlagError(f"--isosurface-threshold: the surface of {loaded.method} is where its distance is 0")
+        _write(distance_mesh(model, lattice, cameras, cleaning, texturing), loaded.placement, path, start)
+        return
     if not isinstance(model, HasDensity):
         raise ConfigError(f"ns-export marching-cubes: {loaded.method} has no density; 'ns-export tsdf' makes a mesh")
     if level is not None and not 0 < level < float("inf"):
         raise FlagError(f"--isosurface-threshold is {level:g}; it must be above zero")
     if not 0 <= flags.time <= 1:
         raise FlagError(f"--time is {flags.time:g}; it must be from 0 to 1")
-    start = time.monotonic()
     if level is None:
         level = default_level(model.scene.box)
         say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
-    cameras = loaded.run.parse("train").cameras
     mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning, texturing)
     _write(mesh, loaded.placement, path, start)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -14,7 +14,7 @@ from nerfloom.export.lattice import Lattice
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.march.occupancy import Occupancy
-from nerfloom.renderable import HasDensity, Renderable, parts
+from nerfloom.renderable import HasDensity, HasSignedDistance, Renderable, parts
 from nerfloom.samplers.base import SkipsCells
 
 BLOCK = 32
@@ -59,6 +59,8 @@ class DensityRange:
 class LatticeDensity:
     """The density of a model at lattice points: zero in cells that the renderer skips, and evaluated elsewhere.
 
+    Subclasses can evaluate something else.
+
     Args:
         model: the model in evaluation mode.
         lattice: the points.
@@ -69,10 +71,12 @@ class LatticeDensity:
         ConfigError: if the model has no density.
     """
 
+    _skipped = 0.0
+    """The value in skipped cells."""
+
     def __init__(self, model: Renderable, lattice: Lattice, level: float, time: float = 0.0) -> None:
-        if not isinstance(model, HasDensity):
-            raise ConfigError("this method has no density whose surface could be found; 'ns-export tsdf' makes a mesh")
-        self._model, self._density = model, model.density
+        self._value = self._function(model)
+        self._model = model
         self.lattice, self.level, self.time = lattice, level, time
         grids = parts(model, SkipsCells)
         self.grid = grids[0] if grids else None
@@ -87,16 +91,26 @@ class LatticeDensity:
         for block in blocks:
             points, _ = self.lattice.block_points(block, BLOCK)
             sigma = self.density(self.lattice.positions(points).float())
-            # By the opacity of a length that is half opaque at the level. Densities themselves, or their logarithms,
-            # are unbounded, and a vertex between 1 and 10^4 would always lie beside the former.
-            yield block, 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)  # NaN stays NaN
+            yield block, self.values_of(sigma)
+
+    def values_of(self, sigma: Tensor) -> Tensor:
+        """Return values (N,) in [-1, 1] of densities `sigma` (N,): 0 at the level, positive above it, NaN of NaN."""
+        # By the opacity of a length that is half opaque at the level. Densities themselves, or their logarithms, are
+        # unbounded, and a vertex between 1 and 10^4 would always lie beside the former.
+        return 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)
+
+    @staticmethod
+    def _function(model: Renderable) -> Callable[[Points], Tensor]:
+        if not isinstance(model, HasDensity):
+            raise ConfigError("this method has no density whose surface could be found; 'ns-export tsdf' makes a mesh")
+        return model.density
 
     def density(self, positions: Tensor) -> Tensor:
         """Return the density (N,) at `positions` (N, 3) in scene coordinates, on the CPU."""
         if self.grid is None:
             return self._evaluated(positions)
         kept = self._kept(positions).nonzero()[:, 0]
-        sigma = torch.zeros(len(positions))
+        sigma = torch.full((len(positions),), self._skipped)
         if len(kept):
             sigma[kept] = self._evaluated(positions[kept])
         return sigma
@@ -130,7 +144,7 @@ class LatticeDensity:
             torch.full((count,), self.time, device=device) if self._model.scene.moving else None,
             torch.full((count,), spacing / 2, device=device),
         )
-        return self._density(points.sized(spacing / 12**0.5)).float().cpu()
+        return self._value(points.sized(spacing / 12**0.5)).float().cpu()
 
     def _occupied_blocks(self) -> Iterator[Tensor]:
         """Yield the blocks that overlap an occupied cell of the grid, by sums over the cells of boxes.
@@ -166,8 +180,38 @@ class LatticeDensity:
             last = torch.tensor(self.lattice.cells)
             kept = ((points % COARSE == 0) | (points == last)).all(-1)
             sigma = self.density(self.lattice.positions(points[kept]).float())
-            if not bool((sigma < COARSE_SHARE * self.level).all()):
+            if self._may_hold(sigma):
                 yield block
+
+    def _may_hold(self, sigma: Tensor) -> bool:
+        """Return whether a block with these densities on a coarser lattice may hold a part of the surface."""
+        return not bool((sigma < COARSE_SHARE * self.level).all())
+
+
+class LatticeDistance(LatticeDensity):
+    """The signed distance of a model at lattice points; cells that the renderer skips are outside.
+
+    Args:
+        model: the model in evaluation mode, which has a signed distance.
+        lattice: the points.
+        time: time in [0, 1] of a scene that moves.
+    """
+
+    _skipped = math.inf
+
+    def __init__(self, model: Renderable, lattice: Lattice, time: float = 0.0) -> None:
+        super().__init__(model, lattice, 0.0, time)
+
+    @staticmethod
+    def _function(model: Renderable) -> Callable[[Points], Tensor]:
+        assert isinstance(model, HasSignedDistance)
+        return lambda points: model.signed_distance(points)[0]
+
+    def values_of(self, sigma: Tensor) -> Tensor:
+        return (-sigma / self.lattice.spacing).clamp(-1, 1)
+
+    def _may_hold(self, sigma: Tensor) -> bool:
+        return not bool((sigma > COARSE * 3**0.5 * self.lattice.spacing).all())
 
 
 def default_level(box: Tensor) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -19,12 +20,16 @@ from nerfloom.export.isosurface import isosurface
 from nerfloom.export.lattice import Lattice
 from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
 from nerfloom.export.texture import Texturing, painted
-from nerfloom.renderable import Renderable, RendersRays
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.renderable import HasSignedDistance, Renderable, RendersRays
 
 ColorFunction = Callable[[Tensor, Tensor], Tensor]
 """Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""
 COLOURED = 2**16
 """Number of vertices that are coloured at once."""
+NEWTON_STEPS, LEAST_SLOPE = 3, 0.1
+"""Number of Newton steps onto a surface, and the minimum length of a gradient that a step divides by."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +82,70 @@ def density_mesh(
         say(f"warning: the density is NaN at {seen.nan:,} of {seen.evaluated:,} positions; there the mesh has holes")
     if not len(found[1]):
         raise ConfigError(_without_surface(seen, level))
+    return _finished(found, lattice, cameras, cleaning, _colors(model, lattice, time), texturing)
+
+
+def distance_mesh(
+    model: Renderable,
+    lattice: Lattice,
+    cameras: Cameras,
+    cleaning: Cleaning,
+    texturing: Texturing | None = None,
+) -> Mesh:
+    """Return the surface where a model's signed distance is 0, in scene coordinates.
+
+    Vertices of marching cubes are moved onto the surface by Newton steps, and normals are the distance's gradients.
+
+    Args:
+        model: the model in evaluation mode, which has a signed distance.
+        lattice: where the distance is evaluated.
+        cameras: the training cameras.
+        cleaning: which parts are kept.
+        texturing: settings of the texture; None for none.
+
+    Raises:
+        ConfigError: if there is no surface.
+    """
+    field = density.LatticeDistance(model, lattice)
+    blocks = field.blocks()
+    found = isosurface(lattice, density.BLOCK, track(field.valued(blocks), "Looking for the surface", len(blocks)))
+    if not len(found[1]):
+        raise ConfigError(
+            "there is no surface: the signed distance does not change its sign in the box; train longer, or set "
+            "another box"
+        )
+    return _finished(
+        found, lattice, cameras, cleaning, _colors(model, lattice, 0.0), texturing, partial(_onto, model, lattice)
+    )
+
+
+def _onto(model: Renderable, lattice: Lattice, vertices: Tensor) -> tuple[Tensor, Tensor]:
+    """Return vertices (V, 3) moved onto the zero level set by Newton steps of at most a cell, and their normals."""
+    assert isinstance(model, HasSignedDistance)
+    moved, normals = vertices.clone(), torch.zeros_like(vertices, dtype=torch.float32)
+    for piece in range(0, len(vertices), COLOURED):
+        part = slice(piece, piece + COLOURED)
+        for step in range(NEWTON_STEPS + 1):
+            distances, gradients = model.signed_distance(Points(moved[part].float().to(model.device)))
+            distances, gradients = distances.double().cpu(), gradients.double().cpu()
+            if step == NEWTON_STEPS:
+                normals[part] = safe_normalize(gradients).float()
+                break
+            by = -distances[:, None] * gradients / gradients.square().sum(-1, keepdim=True).clamp(min=LEAST_SLOPE**2)
+            moved[part] += by.clamp(-lattice.spacing, lattice.spacing)
+    near = (moved - vertices).norm(dim=-1) <= lattice.spacing  # a step that went astray is not taken
+    return torch.where(near[:, None], moved, vertices), normals
+
+
+def _colors(model: Renderable, lattice: Lattice, time: float) -> ColorFunction:
+    """Return the function that colours vertices by what the model renders along their normals."""
 
     def colors(vertices: Tensor, normals: Tensor) -> Tensor:
         if not isinstance(model, RendersRays):
             return torch.full((len(vertices), 3), torch.nan)
         return seen_colors(model, vertices, normals, lattice.spacing, time)
 
-    return _finished(found, lattice, cameras, cleaning, colors, texturing)
+    return colors
 
 
 def fused_mesh(
@@ -145,8 +207,12 @@ def _finished(
     cleaning: Cleaning,
     colors: ColorFunction,
     texturing: Texturing | None,
+    onto: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
 ) -> Mesh:
-    """Return the cleaned mesh of a surface in lattice coordinates, with normals, colours and perhaps a texture."""
+    """Return the cleaned mesh of a surface in lattice coordinates, with normals, colours and perhaps a texture.
+
+    `onto` moves vertices onto the surface and returns their normals; None for normals of the faces.
+    """
     mesh = without_degenerate(Mesh(lattice.positions(found[0]), found[1]))
     eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
     mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
@@ -156,7 +222,11 @@ def _finished(
         say(f"{dropped:,} small or hidden pieces are left out (--num-components, --min-component-share)")
     if cleaning.target_num_faces is not None:
         mesh = simplified(mesh, cleaning.target_num_faces)
-    normals = vertex_normals(mesh)
+    if onto is None:
+        normals = vertex_normals(mesh)
+    else:
+        vertices, normals = onto(mesh.vertices)
+        mesh = replace(mesh, vertices=vertices)
     pieces = list(zip(mesh.vertices.split(COLOURED), normals.split(COLOURED), strict=True))
     seen = [colors(*piece) for piece in track(pieces, "Colouring the vertices", total=len(pieces))]
     of_vertices = spread_colors(torch.cat(seen), mesh.faces)

@@ -129,10 +129,12 @@ class SurfaceField(BoxField):
         return self.density_at(shape.distances), self._features(points.positions, shape)
 
     def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return a bound of the density (N,) within `cell` of each point, and features; inside, that of the surface."""
+        """Return a bound of the density (N,) within `cell` of each point, and features.
+
+        The inside counts as occupied: a surface that retreats during training must find its cells.
+        """
         shape = self.shape(points.positions)
-        distances = (shape.distances.abs() - self.cell).clamp(min=0)
-        return self.density_at(distances), self._features(points.positions, shape)
+        return self.density_at(shape.distances - self.cell), self._features(points.positions, shape)
 
 
 class Sharpness(nn.Module):

@@ -36,7 +36,7 @@ from nerfloom.training.trainer import STEPS_PER_LOG, Trainer
 
 METHODS = (
     "instant-ngp", "nerfacto", "kplanes", "tensorf", "gaussian-splatting", "vanilla-nerf", "dnerf", "mip-nerf",
-    "mip-nerf-360", "zip-nerf", "nerf-plus-plus",
+    "mip-nerf-360", "zip-nerf", "nerf-plus-plus", "neus", "volsdf",
 )  # fmt: skip
 """Methods counted by default."""
 SCENES: dict[str, Callable[[int], Dataset]] = {

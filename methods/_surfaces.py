@@ -8,21 +8,25 @@ from typing import ClassVar, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from nerfloom import Decision, Points, RayModel, Rays, Rendered, Samples, Scene
+from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.opening import Opening
 from nerfloom.fields.base import Field
+from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.losses.surfaces import Eikonal, Silhouette
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.renderable import parts
+from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
+from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
 from nerfloom.samplers.base import Sampler
-from nerfloom.samplers.choice import SamplingConfig, decide_sampler, decide_samples, make_sampler
+from nerfloom.samplers.choice import decide_samples
 
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
@@ -31,7 +35,7 @@ SAMPLES = 2**15
 @dataclass(frozen=True)
 class SurfaceConfig(
     HashGridConfig,
-    SamplingConfig,
+    BackgroundConfig,
     max_num_iterations=20_000,
     learning_rate=1e-2,
     lr_schedule="hold-exponential",
@@ -40,6 +44,7 @@ class SurfaceConfig(
     adam_eps=1e-15,
     log2_table_size=17,
     eval_num_rays_per_chunk=8_192,
+    thin_gradients=0.5,
 ):
     """Settings of a method that learns a signed distance."""
 
@@ -63,7 +68,7 @@ class SurfaceConfig(
     """Radius of the ball that training starts from, in halves of the box's shortest edge."""
     start_sharpness: float = 20.0
     """First inverse width of the surface, in halves of the box's shortest edge."""
-    sharpness_learning_rate: float = 1e-3
+    sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
     open_levels_until: float = 0.3
     """Fraction of the budget during which levels of the hash grid open, from coarse to fine."""
@@ -74,16 +79,21 @@ SurfaceConfigT = TypeVar("SurfaceConfigT", bound=SurfaceConfig)
 
 def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT, list[Decision]]:
     """Fill in the settings that depend on the scene."""
-    config, made = decide_sampler(config, scene)
+    if config.background_model == "contraction":
+        raise ConfigError("--background-model contraction: a signed distance is not contracted; take sphere or none")
+    config, made = decide_background(config, scene, "sphere")
+    if config.sampler != "occupancy":
+        raise ConfigError(f"--sampler {config.sampler}: surfaces are sampled with --sampler occupancy")
     config, samples = decide_samples(config, SAMPLES)
     return config, made + samples
 
 
 def field_parts(config: SurfaceConfig, scene: Scene) -> tuple[Sharpness, Tensor, HashGrid, float, int]:
     """Return the arguments of a field's constructor."""
-    half = float((scene.box[1] - scene.box[0]).min()) / 2
+    box = foreground(config, scene).box
+    half = float((box[1] - box[0]).min()) / 2
     sharpness = Sharpness(config.start_sharpness / half, config.sharpness_learning_rate)
-    return sharpness, scene.box, HashGrid.of(config, config.open_levels_until), config.start_radius, config.hidden_width
+    return sharpness, box, HashGrid.of(config, config.open_levels_until), config.start_radius, config.hidden_width
 
 
 class SurfaceRenderer(VolumeRenderer):
@@ -100,9 +110,19 @@ class SurfaceRenderer(VolumeRenderer):
         return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
 
 
-def renderer(config: SurfaceConfig, scene: Scene) -> SurfaceRenderer:
-    """Return the renderer."""
-    return SurfaceRenderer()
+def make_background(config: SurfaceConfig, scene: Scene) -> InvertedField:
+    """Return a field for the outside of the sphere.
+
+    Args:
+        config: the method's settings, decided.
+        scene: properties of the data; not used.
+    """
+    return InvertedField(HashGrid.of(config), config.hidden_width)
+
+
+def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
+    """Return the renderer, with a background if the scene has one."""
+    return background_renderer(config, scene, make_background, SurfaceRenderer(thin=config.thin_gradients))
 
 
 class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
@@ -111,10 +131,10 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
     losses = (COLOR_ERROR, SamplerLoss(), Silhouette(), Eikonal(), *KNOWN_DISTANCES)
 
     def __init__(
-        self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: VolumeRenderer
+        self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
         super().__init__(config, scene, field, sampler, renderer)
-        edges = scene.box[1] - scene.box[0]
+        edges = self.surface.box[1] - self.surface.box[0]
         self.surface.cell = float((edges / config.grid_resolution).norm())
 
     @property
@@ -133,6 +153,3 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
         for opening in parts(self, Opening):
             opening.advance(progress)
         self.sampler.update(step, self.surface.density_around)
-
-
-make_surface_sampler = make_sampler

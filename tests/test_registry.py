@@ -20,9 +20,11 @@ BUILT_IN = {
     "mip-nerf-360",
     "nerf-plus-plus",
     "nerfacto",
+    "neus",
     "pixel-nerf",
     "tensorf",
     "vanilla-nerf",
+    "volsdf",
     "zip-nerf",
 }
 

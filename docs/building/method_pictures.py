@@ -31,6 +31,8 @@ COMMANDS = {
     "mip-nerf-360": "mip-nerf-360 {}",
     "nerf-plus-plus": "nerf-plus-plus --encoding hash-grid {}",
     "nerfacto": "nerfacto {}",
+    "neus": "neus {}",
+    "volsdf": "volsdf {}",
     "pixel-nerf": "pixel-nerf {} procedural --num-scenes 200 --size 32",
     "gaussian-splatting": "gaussian-splatting {}",
     "tensorf": "tensorf {}",

@@ -5,7 +5,6 @@ from __future__ import annotations
 _NERFSTUDIO = "it is a method of nerfstudio (pip install nerfstudio, ns-train {name})"
 _PLUGIN = "it is a plugin of nerfstudio (pip install git+https://github.com/{repository}, ns-train {name})"
 _GAUSSIANS = "here it is called 'gaussian-splatting'"
-_SURFACES = "no method here learns surfaces yet"
 _LARGER = "here it is 'nerfacto' with larger settings:"
 
 ELSEWHERE: dict[str, str] = {
@@ -13,8 +12,7 @@ ELSEWHERE: dict[str, str] = {
     "splatfacto-big": f"{_GAUSSIANS}; --num-gaussians sets the maximum number of Gaussians",
     "3dgs": _GAUSSIANS,
     "gsplat": _GAUSSIANS,
-    "neus": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus')}",
-    "neus-facto": f"{_SURFACES}; {_NERFSTUDIO.format(name='neus-facto')}",
+    "neus-facto": "here 'neus' learns surfaces",
     "generfacto": _NERFSTUDIO.format(name="generfacto"),
     "in2n": _PLUGIN.format(repository="ayaanzhaque/instruct-nerf2nerf", name="in2n"),
     "instruct-nerf2nerf": _PLUGIN.format(repository="ayaanzhaque/instruct-nerf2nerf", name="in2n"),

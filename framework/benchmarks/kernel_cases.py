@@ -33,6 +33,7 @@ from nerfloom.kernels.march.waves import march
 from nerfloom.kernels.splats.blend import blend
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
+from nerfloom.kernels.surfaces.distance import distance_network
 
 Inputs = dict[str, Tensor]
 KINDS = ("random", "extreme", "empty")
@@ -166,6 +167,16 @@ def _at_points() -> Iterator[Family]:
         places = 1.2 * torch.rand(130, 3) - 0.1, faces, torch.rand(0, 3)
         usual, hard, none = ({"positions": positions, "table": table} for positions in places)
         yield kernel, run, "positions table", (usual, hard, none)
+
+    def with_gradient(positions: Tensor, table: Tensor, first: Tensor, second: Tensor) -> Sequence[Tensor]:
+        return (distance_network(positions, table, first, second, GRID),)
+
+    usual, hard, none = (
+        {"positions": positions, "table": torch.randn(GRID.num_entries, 2),
+         "first": torch.randn(16, 2 * GRID.num_levels), "second": torch.randn(4, 16)}
+        for positions in (1.2 * torch.rand(130, 3) - 0.1, faces, torch.rand(0, 3))
+    )  # fmt: skip
+    yield "distance_network", with_gradient, "table first second", (usual, hard, none)
     poles = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
     usual, hard, none = ({"directions": rows} for rows in (unit, poles, unit[:0]))
     yield "spherical_harmonics", lambda directions: (spherical_harmonics(directions, 4),), "", (usual, hard, none)

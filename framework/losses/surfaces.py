@@ -8,33 +8,36 @@ import torch
 from torch import Tensor
 
 from nerfloom.data.pixels.batch import PixelBatch
+from nerfloom.fields.surface import SurfaceField
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
 
-ANYWHERE = 8
-"""For every this many samples, the length of the gradient is also asked at one random place in the box."""
+EVERY, ANYWHERE = 4, 8
+"""The length of the gradient is asked at one in this many samples, so that others may be without a gradient and are
+skipped; and for one in this many samples at a random place in the box."""
 
 
 class Eikonal(LossTerm):
     """Squared difference of the distance's gradient from length 1: Gropp et al. 2020, equation 2.
 
-    It is asked at the samples, and at random places in the box.
+    It is asked at some of the samples, and at random places in the box.
     """
 
     def __init__(self) -> None:
         super().__init__("eikonal", "eikonal_loss_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        samples, model = shown.rendered.samples, shown.model
+        samples, field = shown.rendered.samples, shown.model.field
         if samples is None or samples.features is None or not len(samples):
             return None
-        low, high = model.scene.box
-        unit = torch.rand(max(len(samples) // ANYWHERE, 1), 3, device=low.device)
-        elsewhere = model.field.shape(torch.lerp(low, high, unit)).gradients  # type: ignore[union-attr,operator]
-        gradients = torch.cat([samples.features[:, :3], elsewhere])
+        assert isinstance(field, SurfaceField)
+        unit = torch.rand(max(len(samples) // ANYWHERE, 1), 3, device=field.box.device)
+        elsewhere = field.shape(torch.lerp(*field.box, unit)).gradients
+        first = int(torch.randint(EVERY, ()))
+        gradients = torch.cat([samples.features[first::EVERY, :3], elsewhere])
         return (gradients.norm(dim=-1) - 1).square().mean()
 
 

@@ -109,7 +109,7 @@ def shade(
         field: the field, which computes colours from features and directions.
         background: (R, 3) or (3,) colour in [0, 1] of the background.
         gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
-        thin: samples with densities are thinned below this fraction of the mean gradient; 0 for none.
+        thin: samples are thinned below this fraction of the mean gradient; 0 for none.
 
     Raises:
         ValueError: if the samples have no density or no features.
@@ -120,7 +120,7 @@ def shade(
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
     rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
-    if thin and samples.alpha is None:
+    if thin:
         stopping, rgb = thinned(stopping, rgb, thin)
     if gradient_factors is not None:
         stopping, rgb = scale_gradient(stopping, gradient_factors), scale_gradient(rgb, gradient_factors)

@@ -24,6 +24,7 @@ from nerfloom.kernels.encodings.frequency import FREQUENCY_ENCODING
 from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
 from nerfloom.kernels.grids.hash_grid import HASH_GRID, hash_grid
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
+from nerfloom.kernels.grids.hash_grid_tangent import HASH_GRID_TANGENT
 from nerfloom.kernels.grids.multisampled_grid import MULTISAMPLED_GRID
 from nerfloom.kernels.grids.multisamples import FRUSTUM_BALLS, UNIT_MULTISAMPLES
 from nerfloom.kernels.grids.plane_bands import BAND_VARIATION, PLANE_BANDS
@@ -46,6 +47,7 @@ from nerfloom.kernels.splats.blend import BLEND
 from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
 from nerfloom.kernels.splats.project import PROJECT, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TILES, tile_lists
+from nerfloom.kernels.surfaces.distance import DISTANCE_NETWORK
 from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
 from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
 from nerfloom.kernels.traced.trace import TRACE, GridDensity
@@ -146,6 +148,8 @@ def adam(parameters: int) -> Arguments:
 RATES = 0.01, (0.9, 0.99), 1e-15
 CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
+    HASH_GRID_TANGENT: lambda: (torch.rand(50, 6), rand(GRID.num_entries, 2), GRID),
+    DISTANCE_NETWORK: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), rand(8, 6) - 0.6, rand(3, 8), GRID, None),
     MULTISAMPLED_GRID: lambda: (rand(50, 1, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     FRUSTUM_BALLS: lambda: (frustums(), BOX, True),
@@ -310,6 +314,9 @@ def test_what_is_taken() -> None:
         (COMPOSITE, 1, "c++"),
         (COMPOSITE, 2, "reference"),
         (COMPOSITE, 6, "reference"),
+        (DISTANCE_NETWORK, 1, "c++"),
+        (HASH_GRID_TANGENT, 0, "reference"),
+        (HASH_GRID_TANGENT, 1, "reference"),
     ],
 )
 def test_no_gradient_is_dropped(operation: Operation[..., Any], followed: int, expected: str) -> None:

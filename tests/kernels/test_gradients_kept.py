@@ -46,6 +46,7 @@ from nerfloom.kernels.networks.mlp import density_mlp, density_mlp_reference, ml
 from nerfloom.kernels.splats.blend import blend, blend_reference
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists
+from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 
@@ -188,6 +189,17 @@ OPERATIONS = {
         lambda positions, table: hash_grid_reference(positions, table, GRID),
         lambda: {"positions": torch.rand(20, 3), "table": rand(GRID.num_entries, 2)},
         ("hash_grid_forward", "hash_grid_backward_table", "hash_grid_backward_positions"),
+    ),
+    "distance network": Operation(
+        lambda positions, table, first, second: distance_network(positions, table, first, second, GRID),
+        lambda positions, table, first, second: distance_network_reference(positions, table, first, second, GRID),
+        lambda: {
+            "positions": torch.rand(20, 3),
+            "table": rand(GRID.num_entries, 2),
+            "first": rand(8, 6) - 0.6,
+            "second": rand(3, 8) - 0.6,
+        },
+        ("distance_network_forward", "distance_network_backward", "hash_grid_tangent_backward_table"),
     ),
     "multisampled grid": Operation(
         lambda points, table: multisampled_grid(points, table, GRID),
@@ -351,7 +363,8 @@ WITHOUT_A_GRADIENT = {
     "traced_error", "traced_error_take",  # compared in test_traced_error.py
     "traced_colors",  # for pictures alone, and refused where a gradient is asked for
     "sort_by_ray", "gather_rows", "resample_intervals",  # documented to have none
-    "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "multisampled_grid_adam",  # of the optimiser
+    "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "hash_grid_tangent_adam", "multisampled_grid_adam",
+    "hash_grid_tangent_forward",  # of the optimiser; and refused where a gradient is asked for
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
     "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
     "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for

@@ -38,7 +38,7 @@ class _Thinned(torch.autograd.Function):
 
 
 def thinned(sigma: Tensor, rgb: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-    """Return density and colour of samples unchanged, with the gradients of most small ones set to zero.
+    """Return density (or opacity) and colour of samples unchanged, with most small gradients set to zero.
 
     The size of a sample's gradient is that of its log-density plus the sum over colour channels. A sample below the
     bound is kept with a probability proportional to its size, and its gradients are divided by that probability, so the

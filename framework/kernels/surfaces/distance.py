@@ -21,11 +21,12 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native, result_cache
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.grids.hash_grid import LOOK_UP, hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP as TANGENT
+from nerfloom.kernels.triton_backend import later
 
 
 def distance_network_reference(
@@ -103,6 +104,7 @@ def _fits(
 DISTANCE_NETWORK = Operation("distance_network", _reference)
 _forward = native.Function("distance_network_forward", "pqpippipipipi")
 _backward = native.Function("distance_network_backward", "ppqpippipipipppi")
+DISTANCE_NETWORK.implementation(TRITON, fits=_fits)(later("surfaces.distance_triton", "distance_network"))
 
 
 @DISTANCE_NETWORK.implementation(CPP, fits=_fits)

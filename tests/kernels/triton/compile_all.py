@@ -31,6 +31,7 @@ from nerfloom.kernels.march.fixed_slots import share_out
 from nerfloom.kernels.splats import blend_triton, project_triton, tiles_triton
 from nerfloom.kernels.splats.project import SplatCamera, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists_reference
+from nerfloom.kernels.surfaces import distance_triton
 from tests.kernels.test_march import occupancy, random_rays
 
 
@@ -75,6 +76,12 @@ def compile_all() -> None:
     grid = HashGridLayout.build(2, 4, 40, 8)
     for features in (1, 2):
         back(hash_grid_triton.hash_grid(learned(9, 3), learned(grid.num_entries, features), grid, None))
+        weights = learned(8, 2 * features), learned(3, 8)
+        back(
+            distance_triton.distance_network(
+                torch.rand(9, 3), learned(grid.num_entries, features), *weights, grid, None
+            )
+        )
     layout = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
     back(planes_triton.planes(learned(9, 3), learned(layout.num_entries, 6), layout, None))
     encodings_triton.spherical_harmonics(torch.rand(9, 3), 4)

@@ -88,12 +88,12 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     return config, made + samples
 
 
-def field_parts(config: SurfaceConfig, scene: Scene) -> tuple[Sharpness, Tensor, HashGrid, float, int]:
+def field_parts(config: SurfaceConfig, scene: Scene) -> tuple[Tensor, HashGrid, Sharpness, float, int]:
     """Return the arguments of a field's constructor."""
     box = foreground(config, scene).box
     half = float((box[1] - box[0]).min()) / 2
     sharpness = Sharpness(config.start_sharpness / half, config.sharpness_learning_rate)
-    return sharpness, box, HashGrid.of(config, config.open_levels_until), config.start_radius, config.hidden_width
+    return box, HashGrid.of(config, config.open_levels_until), sharpness, config.start_radius, config.hidden_width
 
 
 class SurfaceRenderer(VolumeRenderer):

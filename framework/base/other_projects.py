@@ -13,6 +13,8 @@ ELSEWHERE: dict[str, str] = {
     "3dgs": _GAUSSIANS,
     "gsplat": _GAUSSIANS,
     "neus-facto": "here 'neus' learns surfaces",
+    "monosdf": "here 'volsdf' learns surfaces, without the depth and normals of a network",
+    "neuralangelo": "here 'neus' learns surfaces on a hash grid, with levels that open from coarse to fine",
     "generfacto": _NERFSTUDIO.format(name="generfacto"),
     "in2n": _PLUGIN.format(repository="ayaanzhaque/instruct-nerf2nerf", name="in2n"),
     "instruct-nerf2nerf": _PLUGIN.format(repository="ayaanzhaque/instruct-nerf2nerf", name="in2n"),

@@ -46,8 +46,10 @@ class MeshFlags(ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class MarchingCubesFlags(MeshFlags):
-    """Write a mesh of the surface of a field, with colours and normals: where its density passes a level, or where its
-    signed distance is zero."""
+    """Write a mesh of the surface of a field, with colours and normals.
+
+    The surface is where the density passes a level, or where a signed distance is zero.
+    """
 
     isosurface_threshold: float | None = None
     """Density of the surface, per scene unit. Default: the density at which 1/32 of the scene's box is half opaque."""

@@ -34,7 +34,7 @@ PLACED = 6
 
 
 class Shape(NamedTuple):
-    """What a field knows of N positions."""
+    """Values of a field at N positions."""
 
     distances: Tensor
     """(N,) signed distance, scene units, negative inside."""
@@ -42,99 +42,6 @@ class Shape(NamedTuple):
     """(N, 3) gradient of the distance."""
     features: Tensor
     """(N, F) features of the network."""
-
-
-class SurfaceField(BoxField):
-    """A field of a signed distance, and a colour that depends on position, normal, direction and features.
-
-    The distance is that of a ball plus the output of a small network on a hash grid, in units of the box.
-
-    Args:
-        box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3.
-        radius: radius of the first ball, as a fraction of half of the box's shortest edge.
-        width: features of a hidden layer.
-        num_features: number of features for the colour.
-        appearance: the images' appearance vectors, an input of the colour network; None without.
-    """
-
-    centre: Tensor
-
-    def __init__(
-        self,
-        box: Tensor,
-        encoding: HashGrid,
-        radius: float = 0.5,
-        width: int = 64,
-        num_features: int = 15,
-        appearance: Appearance | None = None,
-    ) -> None:
-        super().__init__(box, encoding)
-        self.grid = encoding
-        if encoding.deferred is not None:  # gradients of this table are those of features and of their derivatives
-            encoding.deferred = TableGradient(LOOK_UP, encoding.layout)
-        self.size = float((box[1] - box[0]).min()) / 2
-        self.radius, self.num_features, self.appearance = radius * self.size, num_features, appearance
-        self.register_buffer("centre", box.mean(0), persistent=False)
-        self.first = nn.Parameter(torch.empty(width, encoding.num_features))
-        self.second = nn.Parameter(torch.empty(1 + num_features, width))
-        nn.init.kaiming_uniform_(self.first, nonlinearity="relu")
-        nn.init.kaiming_uniform_(self.second, nonlinearity="relu")
-        with torch.no_grad():
-            self.second[0] *= FIRST_WEIGHTS
-        inputs = PLACED + num_features + DIRECTION_LEVELS**2 + (0 if appearance is None else appearance.size)
-        self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
-        self.cell = 0.0
-        """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
-
-    def shape(self, positions: Tensor) -> Shape:
-        """Return distance, gradient and features at positions (N, 3), scene coordinates."""
-        found, first, grid = self.unit(positions), self.first, self.grid
-        layout, table, opening = grid.layout, grid.table, grid.opening
-        if opening is not None and not opening.complete:
-            layout = layout.first(opening.count)
-            open_features = layout.num_levels * table.shape[1]
-            factors = opening.completed(first.new_ones(1, open_features), grid.num_features)
-            table, first = table[: layout.num_entries], (first * factors)[:, :open_features]
-        if grid.deferred is not None:
-            grid.deferred.layout = layout
-        out = distance_network(found.float(), table, first, self.second, layout, grid.deferred)
-        values, slopes = out[:, :-3], out[:, -3:]
-        offsets = positions - self.centre
-        lengths = (offsets.square().sum(-1) + (ROUNDING * self.radius) ** 2).sqrt()
-        distances = lengths - self.radius + self.size * values[:, 0]
-        gradients = offsets / lengths[:, None] + self.size * self.scale * slopes
-        return Shape(distances, gradients, values[:, 1:])
-
-    def signed_distance(self, points: Points) -> Tensor:
-        return self.shape(points.positions).distances
-
-    def _features(self, positions: Tensor, shape: Shape) -> Tensor:
-        """Return the features for `color`: gradient, position and the network's."""
-        placed = (positions - self.centre) / self.size
-        return torch.cat([shape.gradients, placed, shape.features], dim=-1)
-
-    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        inputs = [safe_normalize(features[:, :3]), features[:, 3:], spherical_harmonics(directions, DIRECTION_LEVELS)]
-        if self.appearance is not None:
-            inputs.append(self.appearance(camera_indices, len(features)))
-        return self.color_head(*inputs).float()
-
-    @abstractmethod
-    def density_at(self, distances: Tensor) -> Tensor:
-        """Return the density (N,), 1/length, at signed distances (N,)."""
-
-    def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        shape = self.shape(points.positions)
-        return self.density_at(shape.distances), self._features(points.positions, shape)
-
-    def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return a bound of the density (N,) within `cell` of each point, and features.
-
-        The inside counts as occupied: a surface that retreats during training must find its cells.
-        """
-        shape = self.shape(points.positions)
-        return self.density_at(shape.distances - self.cell), self._features(points.positions, shape)
 
 
 class Sharpness(nn.Module):
@@ -157,25 +64,154 @@ class Sharpness(nn.Module):
         return torch.exp(self.SPEED * self.exponent)
 
 
+class SurfaceField(BoxField):
+    """A field of a signed distance, and a colour that depends on position, normal, direction and features.
+
+    The distance is that of a ball plus the output of a small network on a hash grid, in units of the box.
+
+    Args:
+        box: (2, 3) corners of the box, scene units.
+        encoding: encoding of positions in [0, 1]^3.
+        sharpness: the learnt inverse width of the surface.
+        radius: radius of the first ball, as a fraction of half of the box's shortest edge.
+        width: features of a hidden layer.
+        num_features: number of features for the colour.
+        appearance: the images' appearance vectors, an input of the colour network; None without.
+    """
+
+    centre: Tensor
+
+    def __init__(
+        self,
+        box: Tensor,
+        encoding: HashGrid,
+        sharpness: Sharpness,
+        radius: float = 0.5,
+        width: int = 64,
+        num_features: int = 15,
+        appearance: Appearance | None = None,
+    ) -> None:
+        super().__init__(box, encoding)
+        self.grid, self.sharpness = encoding, sharpness
+        if encoding.deferred is not None:  # gradients of this table are those of features and of their derivatives
+            encoding.deferred = TableGradient(LOOK_UP, encoding.layout)
+        self.size = float((box[1] - box[0]).min()) / 2
+        self.radius, self.num_features, self.appearance = radius * self.size, num_features, appearance
+        self.register_buffer("centre", box.mean(0), persistent=False)
+        self.first = nn.Parameter(torch.empty(width, encoding.num_features))
+        self.second = nn.Parameter(torch.empty(1 + num_features, width))
+        nn.init.kaiming_uniform_(self.first, nonlinearity="relu")
+        nn.init.kaiming_uniform_(self.second, nonlinearity="relu")
+        with torch.no_grad():
+            self.second[0].mul_(FIRST_WEIGHTS)
+        inputs = PLACED + num_features + DIRECTION_LEVELS**2 + (0 if appearance is None else appearance.size)
+        self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
+        self.cell = 0.0
+        """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
+
+    def shape(self, positions: Tensor) -> Shape:
+        """Return distance, gradient and features at positions.
+
+        Args:
+            positions: (N, 3) scene coordinates.
+        """
+        found, grid = self.unit(positions), self.grid
+        first: Tensor = self.first
+        layout, opening = grid.layout, grid.opening
+        table: Tensor = grid.table
+        if opening is not None and not opening.complete:
+            layout = layout.first(opening.count)
+            open_features = layout.num_levels * table.shape[1]
+            factors = opening.completed(first.new_ones(1, open_features), grid.num_features)
+            table, first = table[: layout.num_entries], (first * factors)[:, :open_features]
+        if grid.deferred is not None:
+            grid.deferred.layout = layout
+        out = distance_network(found, table, first, self.second, layout, grid.deferred)
+        values, slopes = out[:, :-3], out[:, -3:]
+        offsets = positions - self.centre
+        lengths = (offsets.square().sum(-1) + (ROUNDING * self.radius) ** 2).sqrt()
+        distances = lengths - self.radius + self.size * values[:, 0]
+        gradients = offsets / lengths[:, None] + self.size * self.scale * slopes
+        return Shape(distances, gradients, values[:, 1:])
+
+    def signed_distance(self, points: Points) -> Tensor:
+        """Return the distances (N,) from `points` to the nearest surface, scene units, negative inside."""
+        return self.shape(points.positions).distances
+
+    def _features(self, positions: Tensor, shape: Shape) -> Tensor:
+        """Return the features for `color`: gradient, position and the network's."""
+        placed = (positions - self.centre) / self.size
+        return torch.cat([shape.gradients, placed, shape.features], dim=-1)
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        inputs = [safe_normalize(features[:, :3]), features[:, 3:], spherical_harmonics(directions, DIRECTION_LEVELS)]
+        if self.appearance is not None:
+            inputs.append(self.appearance(camera_indices, len(features)))
+        return self.color_head(*inputs).float()
+
+    @abstractmethod
+    def density_at(self, distances: Tensor) -> Tensor:
+        """Return the density (N,), 1/length.
+
+        Args:
+            distances: (N,) signed distances, scene units.
+        """
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        shape = self.shape(points.positions)
+        return self.density_at(shape.distances), self._features(points.positions, shape)
+
+    def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
+        """Return a bound of the density (N,) within `cell` of each point, and features.
+
+        The inside counts as occupied: a surface that retreats during training must find its cells.
+
+        Args:
+            points: N points.
+        """
+        shape = self.shape(points.positions)
+        return self.density_at(shape.distances - self.cell), self._features(points.positions, shape)
+
+
 class NeuSField(SurfaceField):
     """A field whose intervals have the opacity of NeuS, equation 13.
 
     Args:
-        sharpness: the learnt inverse width of the surface.
-        rest: as in `SurfaceField`.
+        box, encoding, sharpness, radius, width, num_features, appearance: as in `SurfaceField`.
     """
 
-    def __init__(self, sharpness: Sharpness, *rest: object, **others: object) -> None:
-        super().__init__(*rest, **others)  # type: ignore[arg-type]
-        self.sharpness = sharpness
+    annealing: Tensor
+
+    def __init__(
+        self,
+        box: Tensor,
+        encoding: HashGrid,
+        sharpness: Sharpness,
+        radius: float = 0.5,
+        width: int = 64,
+        num_features: int = 15,
+        appearance: Appearance | None = None,
+    ) -> None:
+        super().__init__(box, encoding, sharpness, radius, width, num_features, appearance)
         self.register_buffer("annealing", torch.tensor(0.0))
         self._annealing = HostValue()
 
     def anneal(self, share: float) -> None:
-        """Set how far the slope's annealing has come, 0 to 1 (`surface_opacity`)."""
+        """Set how far the slope's annealing has come (`surface_opacity`).
+
+        Args:
+            share: fraction from 0 to 1 that float32 represents exactly.
+        """
         self._annealing.change(self.annealing, share)
 
     def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the opacity of intervals around points, and features.
+
+        Args:
+            points: N points, in the middle of their intervals.
+            directions: (N, 3) unit directions of their rays.
+            deltas: (N,) lengths of the intervals, scene units.
+        """
         shape = self.shape(points.positions)
         cosines = (shape.gradients * directions).sum(-1)
         share = self._annealing.of(self.annealing)
@@ -189,16 +225,7 @@ class NeuSField(SurfaceField):
 
 
 class VolSDFField(SurfaceField):
-    """A field with the density of VolSDF, equation 2.
-
-    Args:
-        sharpness: the learnt inverse 1 / beta of the width.
-        rest: as in `SurfaceField`.
-    """
-
-    def __init__(self, sharpness: Sharpness, *rest: object, **others: object) -> None:
-        super().__init__(*rest, **others)  # type: ignore[arg-type]
-        self.sharpness = sharpness
+    """A field with the density of VolSDF, equation 2; the inverse width is 1 / beta."""
 
     def density_at(self, distances: Tensor) -> Tensor:
         return laplace_density(distances, 1 / self.sharpness())

@@ -35,7 +35,8 @@ class Eikonal(LossTerm):
             return None
         assert isinstance(field, SurfaceField)
         unit = torch.rand(max(len(samples) // ANYWHERE, 1), 3, device=field.box.device)
-        elsewhere = field.shape(torch.lerp(*field.box, unit)).gradients
+        low, high = field.box
+        elsewhere = field.shape(torch.lerp(low, high, unit)).gradients
         first = int(torch.randint(EVERY, ()))
         gradients = torch.cat([samples.features[first::EVERY, :3], elsewhere])
         return (gradients.norm(dim=-1) - 1).square().mean()

@@ -145,7 +145,9 @@ def distance_network(
 ) -> Tensor:  # fmt: skip
     """Compute `nerfloom.kernels.surfaces.distance.distance_network`, for 1, 2, 4 or 8 features.
 
-    Autograd accumulates the gradient of the table: `deferred` is not used. The other arguments are as there.
+    Autograd accumulates the gradient of the table: `deferred` is not used.
+
+    `positions`, `table`, `first`, `second` and `layout` are as there.
     """
     with torch.autocast(positions.device.type, enabled=False):
         contiguous = positions.contiguous(), table.contiguous(), first.contiguous(), second.contiguous()

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.errors import shown
-from nerfloom.cameras.cameras import LARGEST_SIDE, check_pose
+from nerfloom.cameras.cameras import MAX_SIDE, check_pose
 from nerfloom.dataparsers.rotations import nearest_rotation
 
-LONGEST_NAME = 250
+MAX_NAME_LENGTH = 250
 """Maximum length of a file's or folder's name, bytes; most systems allow 255."""
-LONGEST_PATH = 3000
+MAX_PATH_LENGTH = 3000
 """Maximum length of a path, bytes; most systems allow 4096."""
 
 
@@ -131,8 +131,8 @@ def side(value: Any, name: str, where: str) -> int:
         DataError: if the value is not a number, or not a possible size of an image.
     """
     length = number(value, name, where, positive=True)
-    if not 1 <= length <= LARGEST_SIDE:
-        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be from 1 to {LARGEST_SIDE} pixels")
+    if not 1 <= length <= MAX_SIDE:
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be from 1 to {MAX_SIDE} pixels")
     return round(length)
 
 
@@ -180,6 +180,6 @@ def _fits(path: Path) -> bool:
     """Return whether the path may be passed to the system, whether the file exists or not."""
     try:
         longest = max(len(os.fsencode(part)) for part in path.parts)
-        return longest <= LONGEST_NAME and len(os.fsencode(path)) <= LONGEST_PATH
+        return longest <= MAX_NAME_LENGTH and len(os.fsencode(path)) <= MAX_PATH_LENGTH
     except UnicodeEncodeError:  # a lone surrogate
         return False

@@ -48,7 +48,8 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]]
-    """Kind of training batch: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
+    """Kind of training batch: pixels of all images (`PixelBatch`; its settings are of `RayConfig`), or one whole image
+    (`ViewBatch`)."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()

@@ -47,7 +47,7 @@ from nerfloom.samplers.proposal import LEARN_EVERY, half_edge
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""
 NETWORKS_FROM = 3600.0
-"""Training time on a GPU, in seconds, from which on the default is the paper's networks. After 45 s on a data-centre
+"""Minimum training time on a GPU for the paper's networks as the default, seconds. After 45 s on a data-centre
 GPU they reached 20.2 dB on a can, and hash grids 34.8 dB; longer runs were not measured."""
 PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 """Levels of the proposals' hash grids, cells per axis of the first level, and log2 of the entries per level."""

@@ -34,7 +34,7 @@ marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 51
 dB."""
 
 OPEN_UNTIL = 0.5
-"""Fraction of the budget in which frequencies open with few images, as in FreeNeRF's shorter Blender settings."""
+"""Fraction of the budget for opening frequencies with few images, as in FreeNeRF's shorter Blender settings."""
 
 
 @dataclass(frozen=True)

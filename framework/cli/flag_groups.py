@@ -26,7 +26,7 @@ from nerfloom.data.parsed_scene import DataParser
 from nerfloom.losses.few_images import FewImagesConfig
 from nerfloom.samplers.background import BackgroundConfig
 from nerfloom.samplers.choice import HierarchicalConfig, SamplingConfig
-from nerfloom.scene.motion import MotionConfig
+from nerfloom.samplers.motion import MotionConfig
 
 EVERYDAY = "everyday"
 """Title of the group that `--help` shows; `--help-all` shows all groups."""

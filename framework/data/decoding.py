@@ -20,7 +20,7 @@ from torch import Tensor
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import may_be_transparent, read_image, reduce_image
-from nerfloom.data.light import light_of
+from nerfloom.data.light_spread import light_of
 from nerfloom.data.masks import read_mask
 from nerfloom.data.pixels.cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
 from nerfloom.data.pixels.mapped import MappedPixels
@@ -47,7 +47,7 @@ class ImageFiles:
     sizes: tuple[tuple[int, int], ...]
     """M widths and heights after reduction, pixels."""
     factors: tuple[int, ...]
-    """M integer factors by which images are reduced."""
+    """M integer reduction factors of the images."""
 
 
 @dataclass(frozen=True)

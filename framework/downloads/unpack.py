@@ -18,7 +18,7 @@ MAX_FILES = 200_000
 MAX_EXPANSION = 20
 """Maximum number of unpacked bytes per byte of an archive. Images are compressed already; text may be a tenth."""
 ALLOWANCE = 1 << 20
-"""Number of bytes to which any archive may unpack, however small it is."""
+"""Minimum unpacked size that is allowed for any archive, bytes."""
 CHUNK = 1 << 20
 """Number of bytes written at a time."""
 UNSAFE = re.compile(r'[\x00-\x1f\x7f<>:"|?*\\]|[. ]$')

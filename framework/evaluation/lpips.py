@@ -25,7 +25,7 @@ from nerfloom.base.extras import install_command
 
 NETWORK = "alex"
 """Name of the network in the `lpips` package."""
-SMALLEST_OF_LPIPS = 31
+MIN_SIDE_OF_LPIPS = 31
 """Minimum width and height of an image, pixels; below, AlexNet's last layers have no position."""
 SHAPES = ((11, 11, 3, 64), (5, 5, 64, 192), (3, 3, 192, 384), (3, 3, 384, 256), (3, 3, 256, 256))
 """Shapes of AlexNet's convolutions: height, width, input and output channels."""

@@ -32,7 +32,7 @@ from nerfloom.export.web import (
 )
 from nerfloom.method import Method
 from nerfloom.renderable import Renderable, RendersRays
-from nerfloom.scene.folds import in_order
+from nerfloom.scene.folded_poses import in_order
 from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look

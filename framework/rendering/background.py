@@ -18,7 +18,6 @@ from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, volume_renderer
 from nerfloom.samplers.background import BackgroundConfig, foreground_sphere
 from nerfloom.samplers.base import Sampler
-from nerfloom.samplers.choice import HierarchicalConfig
 from nerfloom.samplers.hierarchical import HierarchicalSampler
 from nerfloom.samplers.uniform import LAST_INTERVAL, UniformSampler
 
@@ -132,7 +131,7 @@ def background_renderer(
     if config.background_model != "sphere":
         return renderer
     sampler: Sampler = UniformSampler(config.num_background_samples)
-    if isinstance(config, HierarchicalConfig) and str(config.sampler) == "hierarchical":
+    if str(config.sampler) == "hierarchical":
         coarse = make_field(config, scene)
         sampler = HierarchicalSampler(coarse, config.num_coarse_samples, config.num_fine_samples)
     field = make_field(config, scene)

@@ -45,7 +45,7 @@ def splat_camera(
         near: Gaussians at a smaller depth are not drawn, scene units.
         look: the settings of drawing.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
-        reduced: factor by which the image is smaller than the camera's.
+        reduced: ratio of the camera's image size to the drawn one's.
 
     Raises:
         ConfigError: for a camera model that is not among `DRAWN`.

@@ -20,7 +20,7 @@ from nerfloom.kernels.splats.project import BLUR
 
 Sort = Literal["distance", "depth"]
 """Sort key of Gaussians: distance from the camera, or depth along its optical axis."""
-LEAST_BLUR, MOST_BLUR = 1e-3, 10.0
+MIN_BLUR, MAX_BLUR = 1e-3, 10.0
 """Range of the blur. Without blur, a flat Gaussian seen edge-on has no area."""
 
 
@@ -111,4 +111,4 @@ def _blur(text: str) -> float | None:
         value = float(text)
     except ValueError:
         return None
-    return value if math.isfinite(value) and LEAST_BLUR <= value <= MOST_BLUR else None
+    return value if math.isfinite(value) and MIN_BLUR <= value <= MAX_BLUR else None

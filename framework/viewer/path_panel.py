@@ -19,7 +19,7 @@ from nerfloom.base.console import say
 from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.camera_panel import move_camera
-from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
+from nerfloom.viewer.keyframes import MAX_KEYFRAMES, Editor, listed, path_file
 from nerfloom.viewer.request import Request, number_in
 
 if TYPE_CHECKING:
@@ -86,12 +86,12 @@ class PathPanel:
 
     def _added(self, editor: Editor) -> Editor:
         keyframe = self._keyframe()
-        if keyframe is not None and len(editor.keyframes) == MOST_KEYFRAMES:
-            self._note.content = f"A path has at most {MOST_KEYFRAMES} cameras."
+        if keyframe is not None and len(editor.keyframes) == MAX_KEYFRAMES:
+            self._note.content = f"A path has at most {MAX_KEYFRAMES} cameras."
         return editor if keyframe is None else editor.added(keyframe)
 
     def _change(self, event: Any) -> None:
-        index = int(number_in(_or_zero(self._chosen.value), 0, MOST_KEYFRAMES, 0)) - 1
+        index = int(number_in(_or_zero(self._chosen.value), 0, MAX_KEYFRAMES, 0)) - 1
         if not 0 <= index < len(self._editor.keyframes):
             self._note.content = "Add a camera first."
             return

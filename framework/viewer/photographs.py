@@ -25,7 +25,7 @@ from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose
 
-MOST = 200
+MAX_SHOWN = 200
 """Maximum number of cameras shown."""
 THUMBNAIL = 96
 """Longer side of a thumbnail, pixels."""
@@ -44,7 +44,7 @@ class Photographs:
         self._run = run
         self._lock = threading.RLock()
         self._whole = lru_cache(maxsize=1)(self._read)
-        self._small = lru_cache(maxsize=4 * MOST)(self._thumbnail)
+        self._small = lru_cache(maxsize=4 * MAX_SHOWN)(self._thumbnail)
 
     @property
     def parsed(self) -> ParsedScene | None:
@@ -72,8 +72,8 @@ class Photographs:
         return self.cameras.ndc if isinstance(self.cameras, NdcCameras) else None
 
     def chosen(self) -> list[int]:
-        """Return the indices of the images whose cameras are shown, at most `MOST`, evenly spaced."""
-        return [] if self.cameras is None else spread(len(self.cameras), MOST)
+        """Return the indices of the images whose cameras are shown, at most `MAX_SHOWN`, evenly spaced."""
+        return [] if self.cameras is None else spread(len(self.cameras), MAX_SHOWN)
 
     def name(self, index: int) -> str:
         """Return the file name of image `index`."""

@@ -13,7 +13,7 @@ import torch
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.procedural import Procedural
-from nerfloom.dataparsers.procedural.many import REACH, random_parts, scene_numbers, write_scenes
+from nerfloom.dataparsers.procedural.random_scenes import REACH, random_parts, scene_numbers, write_scenes
 from nerfloom.dataparsers.procedural.scene import LIGHT, PARTS, inside, trace, trace_rows
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
 from nerfloom.evaluation.evaluator import views_to_judge

@@ -346,7 +346,7 @@ COLORS = torch.randint(256, (9, 4), generator=torch.Generator().manual_seed(0)).
 WITHOUT_A_GRADIENT = {
     "pack_occupancy", "refresh_occupancy", "march_begin", "march_wave", "march_advance",  # refused, as tested below
     "trace_rays", "trace_take",  # whose values the operations are given that have the gradient (test_trace.py)
-    "spaced_distances", "first_shared",  # of what has no gradient
+    "spaced_distances", "first_covisible",  # of what has no gradient
     "proposal_weights",  # likewise (test_proposals.py)
     "traced_error", "traced_error_take",  # compared in test_traced_error.py
     "traced_colors",  # for pictures alone, and refused where a gradient is asked for

@@ -22,7 +22,7 @@ from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.viewer.browser import Browser
-from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import called
 from tests.conftest import Refused
@@ -142,11 +142,11 @@ def test_it_is_loaded_and_looked_at_in_python_and_in_the_viewer(file: Path) -> N
     assert float(picture.median_depth[400, 400]) == pytest.approx(from_outside, abs=0.1)
     with pytest.raises(ConfigError, match="its photographs are unknown: give --data DIR"):
         found.views("test")
-    pictures, studio = list[np.ndarray](), Studio(found)
+    pictures, queue = list[np.ndarray](), RenderQueue(found)
     request = Request(Pose(tuple(camera.camera_to_worlds[0].flatten().tolist()), math.radians(50)), 80, 80)
-    studio.enter(1, Browser(lambda image, quality: pictures.append(image)))
-    studio.ask(1, lambda _: request)
-    while studio.work() is not None or studio._browsers[1].pieces:
+    queue.add(1, Browser(lambda image, quality: pictures.append(image)))
+    queue.ask(1, lambda _: request)
+    while queue.draw_next() is not None or queue._browsers[1].pieces:
         pass
     expected = found.render(request.camera()).rgb.clamp(0, 1)
     np.testing.assert_allclose(pictures[-1] / 255, expected.cpu().numpy(), atol=0.01)

@@ -21,7 +21,7 @@ from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussian_limit import colour_error, fitted_ply, fitted_spz, visibility
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
-from nerfloom.splats.ply import SURE, ply_size, property_names, write_ply
+from nerfloom.splats.ply import MAX_LOGIT, ply_size, property_names, write_ply
 from nerfloom.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits, write_spz
 from nerfloom.splats.transform import quaternion, quaternion_product, rotated_harmonics, transformed
 from tests.conftest import Refused
@@ -182,7 +182,7 @@ def test_what_cannot_be_rendered_is_left_out_and_counted(tmp_path: Path, capsys:
     read = gaussians_in(tmp_path / "a.ply")
     assert "4 of 9 Gaussians" in capsys.readouterr().err
     assert torch.equal(read.means, gaussians.means[4:])
-    assert read.logits[:2].tolist() == [SURE, -SURE]
+    assert read.logits[:2].tolist() == [MAX_LOGIT, -MAX_LOGIT]
     gaussians.means[:] = math.nan
     write_ply(tmp_path / "a.ply", gaussians)
     with pytest.raises(DataError, match="none of its 9 Gaussians is finite"):

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerfloom.data.light import QUANTILES, light_of
+from nerfloom.data.light_spread import QUANTILES, light_of
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.evaluation.images import to_uint8
 from nerfloom.fields.encoded import EncodedField

@@ -6,7 +6,7 @@ the covariance s_xy in it of an image x and its target y:
 
     S(p) = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_xx + s_yy + C2))
 
-The compiled form uses the sum u = x + y - 1 and the difference v = x - y, with which
+The compiled form uses the sum u = x + y - 1 and the difference v = x - y:
 
     S(p) = (1 - m_v^2 / (m_x^2 + m_y^2 + C1)) (1 - s_vv / ((s_uu + s_vv) / 2 + C2))
 

@@ -126,10 +126,10 @@ def fill(
 
     Args:
         rays: R rays, R > 0.
-        occupancy: the grid, of one box, or with time slices, for which rays need times.
+        occupancy: the grid, of one box, or with time slices; rays then need times.
         step: length of a step, scene units.
         num_steps: number of steps along the diagonal of the box.
-        shift: (R,) fraction of a step by which the first step starts before the box; None for 0.
+        shift: (R,) fraction of the first step that is before the box; None for 0.
         room: capacity for runs of 8 steps that are examined more closely (not in all forms), and number of slots.
     """
     tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
@@ -174,7 +174,7 @@ def fill_reference(
 
 
 def _places(mask: Tensor, capacity: int) -> Tensor:
-    """Return the first `capacity` positions (C,) int64 at which `mask` (N,) is True; 0 for missing ones."""
+    """Return the first `capacity` positions (C,) int64 where `mask` (N,) is True; 0 for missing ones."""
     ranks = torch.where(mask, mask.cumsum(0) - 1, capacity).clamp(max=capacity)  # the others go past the end
     places = ranks.new_zeros(capacity + 1).scatter_(0, ranks, torch.arange(len(mask), device=mask.device))
     return places[:capacity]
@@ -202,7 +202,7 @@ def reach(placed: Placed, sigma: Tensor, early_stop: float, num_steps: int) -> T
 def reach_reference(placed: Placed, sigma: Tensor, budget: float, num_steps: int) -> Tensor:
     """Compute `reach` in PyTorch, on any device.
 
-    `placed`, `sigma` and `num_steps` are as in `reach`; `budget` is the optical depth at which a ray ends.
+    `placed`, `sigma` and `num_steps` are as in `reach`; `budget` is the optical depth where a ray ends.
     """
     slots = placed.slots
     tau = optical_depth(sigma, placed.t_ends - placed.t_starts).nan_to_num(nan=0.0)  # a NaN sample hides nothing

@@ -1,4 +1,4 @@
-// The first position along a ray that enough images show. See ../first_shared.py for the reference.
+// The first position along a ray that enough images show. See ../first_covisible.py for the reference.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -48,7 +48,7 @@ float between(float a, float b, float share) {
 // `out` (rays): the distance of the first shared one of `steps` positions between the near end of each ray and `reach`
 // half edges of the box behind it, or its far end. The step before it is divided into `parts`, and the first shared
 // part counts. The near end if there is none.
-EXPORT int first_shared(const float* origins, const float* directions, const float* nears, const float* fars,
+EXPORT int first_covisible(const float* origins, const float* directions, const float* nears, const float* fars,
                         int64_t rays, const float* box, const uint8_t* unshared, int levels, int cells, int steps,
                         float reach, int parts, float* out, int threads) {
     return guarded([&] {

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.march.first_shared import CELLS, LEVELS, first_shared
+from nerfloom.kernels.march.first_covisible import CELLS, LEVELS, first_covisible
 from nerfloom.kernels.native import torch_on_one_thread
 
 BLOCK = 4
 """Cells along an edge of the cubes that are tested first."""
 
 
-class SharedSpace(nn.Module):
+class CovisibleSpace(nn.Module):
     """The cells of nested boxes that too few training images show; empty until `leave_out` is called.
 
     Args:
@@ -43,7 +43,7 @@ class SharedSpace(nn.Module):
 
         Args:
             cameras: M training cameras.
-            nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
+            nearest: (M,) distance of each camera that its image shows to be empty, scene units.
             least: minimum number of images, at least 1.
         """
         least = min(least, len(cameras))
@@ -57,11 +57,11 @@ class SharedSpace(nn.Module):
         Args:
             rays: R rays; R may be 0.
         """
-        return replace(rays, nears=first_shared(rays, self.box, self.unshared))
+        return replace(rays, nears=first_covisible(rays, self.box, self.unshared))
 
 
 @torch.no_grad()
-def share_cut_off(space: SharedSpace, rays: Rays, distances: Tensor) -> float:
+def share_cut_off(space: CovisibleSpace, rays: Rays, distances: Tensor) -> float:
     """Return the fraction of rays that would start behind their known point.
 
     Args:
@@ -81,7 +81,7 @@ def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, 
 
     Args:
         cameras: M cameras.
-        nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
+        nearest: (M,) distance of each camera that its image shows to be empty, scene units.
         box: (2, 3) minimum and maximum corner, scene units.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
         most: maximum count.

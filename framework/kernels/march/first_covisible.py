@@ -1,4 +1,4 @@
-"""The first position along a ray that enough images show, from the unshared cells (`scene/shared_space.py`)."""
+"""The first position along a ray that enough images show, from the unshared cells (`scene/covisible_space.py`)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ number of parts of the step before the first shared position, tested in turn."""
 
 
 @torch.no_grad()
-def first_shared_reference(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
-    """Compute `first_shared` of `rays`, `box` and `unshared` in PyTorch, on any device and for any float type."""
+def first_covisible_reference(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
+    """Compute `first_covisible` of `rays`, `box` and `unshared` in PyTorch, on any device and for any float type."""
     half = (box[1] - box[0]).amax() / 2
     ends = torch.minimum(rays.nears + REACH * half, rays.fars)
     steps = torch.linspace(0, 1, STEPS, device=ends.device, dtype=ends.dtype)
@@ -43,7 +43,7 @@ def _cells(positions: Tensor, box: Tensor) -> Tensor:
     return (((level.long() * CELLS + x) * CELLS + y) * CELLS + z).clamp(max=LEVELS * CELLS**3)
 
 
-def first_shared(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
+def first_covisible(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
     """Return the distance (R,) of the first shared position along each ray; its near end if there is none.
 
     Args:
@@ -53,19 +53,19 @@ def first_shared(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
             is False.
     """
     rays = rays.detached()
-    return FIRST_SHARED((rays.origins, rays.directions, rays.nears, rays.fars, box), rays, box, unshared)
+    return FIRST_COVISIBLE((rays.origins, rays.directions, rays.nears, rays.fars, box), rays, box, unshared)
 
 
-FIRST_SHARED = Operation("first_shared", first_shared_reference)
+FIRST_COVISIBLE = Operation("first_covisible", first_covisible_reference)
 
 
-@FIRST_SHARED.implementation(CPP)
+@FIRST_COVISIBLE.implementation(CPP)
 def _compiled(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
     count, out = len(rays), torch.empty_like(rays.nears)
     origins, directions, nears, fars = (
         each.contiguous() for each in (rays.origins, rays.directions, rays.nears, rays.fars)
     )
-    _first_shared(
+    _first_covisible(
         native.pointer(origins, "origins", (count, 3)), native.pointer(directions, "directions", (count, 3)),
         native.pointer(nears, "near ends", (count,)), native.pointer(fars, "far ends", (count,)), count,
         native.pointer(box, "the box", (2, 3)),
@@ -75,4 +75,4 @@ def _compiled(rays: Rays, box: Tensor, unshared: Tensor) -> Tensor:
     return out
 
 
-_first_shared = native.Function("first_shared", "ppppqppiiifipi")
+_first_covisible = native.Function("first_covisible", "ppppqppiiifipi")

@@ -28,10 +28,10 @@ UNSEEN = {"val": 4, "test": 8}
 """Number of held-out scenes of each split."""
 JUDGED_EVERY = 4
 """Distance between evaluated views of a held-out scene."""
-FEWEST, MOST = 2, 5
+MIN_SOLIDS, MAX_SOLIDS = 2, 5
 """Number of solids in a scene."""
 REACH = 1.35
-"""Distance from the origin within which all solids lie, scene units."""
+"""Maximum distance of solids from the origin, scene units."""
 
 
 def random_parts(seed: int, scene: int) -> Parts:
@@ -42,7 +42,7 @@ def random_parts(seed: int, scene: int) -> Parts:
         scene: index of the scene.
     """
     random = np.random.default_rng([seed, scene])
-    return {f"solid {index}": _random_part(random) for index in range(random.integers(FEWEST, MOST + 1))}
+    return {f"solid {index}": _random_part(random) for index in range(random.integers(MIN_SOLIDS, MAX_SOLIDS + 1))}
 
 
 def _random_part(random: np.random.Generator) -> Part:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -20,26 +19,6 @@ MAX_NAME_LENGTH = 250
 """Maximum length of a file's or folder's name, bytes; most systems allow 255."""
 MAX_PATH_LENGTH = 3000
 """Maximum length of a path, bytes; most systems allow 4096."""
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Args:
-        file: the file.
-
-    Raises:
-        DataError: if the file is missing, is not JSON or does not hold an object.
-    """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"cannot read {file}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{file} must contain a JSON object: names and values in braces")
-    return content
 
 
 def read_pose(frame: Any, where: str, dtype: torch.dtype = torch.float32) -> Tensor:

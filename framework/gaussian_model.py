@@ -29,7 +29,7 @@ from nerfloom.splats.start import from_points, scene_size
 from nerfloom.splats.strategy import Strategy
 from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, usual_columns
 
-WITHOUT_IMAGES = 1_000
+MAX_NEW_GAUSSIANS = 1_000
 """Maximum number of Gaussians in a new model."""
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
@@ -64,7 +64,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         most = most_octaves(scene.image_pixels or scene.image_size**2)
         self.sizes = ImageSizes(config.reduced_until, most, config.paced)
         self.steps_per_move, self._first = config.steps_per_move, 0
-        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
+        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, MAX_NEW_GAUSSIANS), 3))
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
     @property

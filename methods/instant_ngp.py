@@ -42,7 +42,7 @@ THIN = 0.5
 """Samples below this fraction of the mean gradient are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
 steps without thinning, and 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
 
-SPARSE_FROM = 17
+MIN_SPARSE_TABLE = 17
 """Minimum log2 of the table size for sparse updates. On Lego, three runs of 45 s with 2^16 entries were 0.06,
 0.23 and 0.25 dB better with dense updates, which move rarely used entries further. After 300 s with 2^18 entries,
 sparse updates were 0.21 dB better."""
@@ -184,7 +184,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
     )
     config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution below
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
-    pays = config.log2_table_size >= SPARSE_FROM
+    pays = config.log2_table_size >= MIN_SPARSE_TABLE
     config, more = fill(
         config,
         Choice(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, nearest, shown
+from nerfloom.base.json_files import read_json
 from nerfloom.cameras.cameras import Cameras, check_pose
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.lenses import panorama
@@ -184,7 +185,7 @@ def read_camera_path(file: Path) -> CameraPath:
     Raises:
         DataError: if the file cannot be read, has another format, or holds invalid cameras.
     """
-    content = _object(_json(file), str(file))
+    content = _object(read_json(file), str(file))
     width, height = (_side(content, f"render_{name}", file) for name in ("width", "height"))
     if width * height > MAX_IMAGE:
         raise DataError(f"{file}: images of {width}x{height} pixels are too large; the limit is {MAX_IMAGE} pixels")
@@ -225,7 +226,7 @@ def read_transforms(file: Path) -> Placement:
     Raises:
         DataError: if the file cannot be read or holds no similarity.
     """
-    return read_placement(_json(file), str(file))
+    return read_placement(read_json(file), str(file))
 
 
 def read_placement(content: Any, where: str) -> Placement:
@@ -244,15 +245,6 @@ def read_placement(content: Any, where: str) -> Placement:
     if not 1 / MAX_COORDINATE < scale < MAX_COORDINATE:
         raise DataError(f"{where}: 'scale' is {scale:g}, which is out of range")
     return Placement(transform, scale)
-
-
-def _json(file: Path) -> Any:
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"cannot read {file}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not JSON: {error}") from error
 
 
 def _object(value: Any, where: str) -> dict[str, Any]:

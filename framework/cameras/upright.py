@@ -11,7 +11,7 @@ MIN_CLARITY_RATIO = 2.0
 """Minimum ratio of clarity of the plane of the column axes to that of the row axes."""
 MIN_WIDTH = 0.25
 """Minimum spread of the camera positions along their second principal direction, relative to the first."""
-LOOKING_DOWN = 0.1
+MIN_DOWNWARD = 0.1
 """Minimum mean sine of the downward angle; below it, the viewing direction does not tell up from down."""
 
 
@@ -42,7 +42,7 @@ def sideways_up(poses: Tensor) -> Tensor | None:
     if in_sideways < MIN_TURN or in_sideways < MIN_CLARITY_RATIO * in_upright or not around:
         return None
     down = float(ahead.mean(0) @ normal)
-    towards = down if abs(down) > LOOKING_DOWN else float(right.mean(0) @ normal)
+    towards = down if abs(down) > MIN_DOWNWARD else float(right.mean(0) @ normal)
     return -normal if towards > 0 else normal
 
 

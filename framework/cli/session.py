@@ -35,7 +35,7 @@ from nerfloom.training.signals import Stopped, handled, signal_of
 from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 
-PICTURES = 4
+MAX_PICTURES = 4
 """Maximum number of held-out views whose pictures are written at the end."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
@@ -184,7 +184,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         max_images=run.config.max_eval_images,
         seconds=evaluation_seconds(run.config, trainer.state),
         pictures=run.folder / "pictures",
-        max_pictures=PICTURES,
+        max_pictures=MAX_PICTURES,
         lpips_weights=run.config.lpips_weights,
     )
     say(f"test: {evaluation.line()}")  # before files are written, which may fail on a full disk

@@ -14,7 +14,7 @@ import numpy as np
 from nerfloom.evaluation.images import error_map
 from nerfloom.evaluation.view_files import WORST
 
-VIEWS = 3
+MAX_VIEWS = 3
 """Maximum number of views shown."""
 CROP_SHARE = 4
 """Ratio of the image's shorter side to the side of a crop."""
@@ -58,7 +58,7 @@ class View:
     strips: tuple[Strip, ...]
 
 
-def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]:
+def views(folders: Sequence[tuple[str, Path]], count: int = MAX_VIEWS) -> list[View]:
     """Return views that all contenders have rendered, evenly spaced.
 
     Args:

@@ -40,7 +40,7 @@ from nerfloom.splats.transform import transformed
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
 
-VIEWS = 5
+MAX_VIEWS = 5
 """Maximum number of views for comparing a page with the model."""
 
 
@@ -163,7 +163,7 @@ def closeness(
     """
     background = model.background
     judged = (views_to_judge(dataset) if dataset else []) or list(range(len(cameras)))
-    chosen = [judged[rank] for rank in spread(len(judged), VIEWS)]
+    chosen = [judged[rank] for rank in spread(len(judged), MAX_VIEWS)]
     as_seen = cameras.model in DRAWN
     cameras = cameras if as_seen else pinhole(cameras)
     own: list[float] = []

@@ -53,7 +53,7 @@ TIMED_RAYS = 8192
 """Number of rays for measuring speed."""
 BETWEEN = 4
 """Every Nth picture is from between two cameras."""
-PASSES = 4
+MAX_PASSES = 4
 """Maximum number of rounds of drawing rays, since some rays hit no surface."""
 OPACITY, SIZE = 0.5, 0.7
 """Initial opacity of Gaussians, and their standard deviation in mean distances to neighbours."""
@@ -180,7 +180,7 @@ def fit_gaussians(
 def _surfaces(model: RendersRays, dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
     """Return up to `count` points (K, 3) on surfaces and their colours (K, 3), on the model's device."""
     positions, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    for _ in track(range(PASSES), "Looking for surfaces", total=PASSES):
+    for _ in track(range(MAX_PASSES), "Looking for surfaces", total=MAX_PASSES):
         if (left := count - sum(map(len, positions))) > 0:
             found = joined(surface_points(model, dataset, 2 * left, None))
             positions.append(found.positions[:left])

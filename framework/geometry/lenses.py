@@ -45,7 +45,7 @@ RADII = 4096
 """Number of radii where the Jacobian is tested to find the reach."""
 MIN_DENOMINATOR = 1e-2
 """Minimum of D within the reach; where D approaches 0, positions go to infinity."""
-ITERATIONS = 60
+MAX_ITERATIONS = 60
 """Maximum number of Newton iterations. Four are usual; near the reach, where the Jacobian vanishes, more are needed."""
 MIN_AREA = 1e-3
 """Minimum determinant of the Jacobian for a pixel's cone; at the reach it is 0, and the cone's width infinite."""
@@ -186,7 +186,7 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
     step_x, step_y = u * start, v * start
     possible = distance <= lenses.bounds[:, 1]
     tolerance = (1e-9 if u.dtype == torch.float64 else 1e-6) ** 2 * (1 + distance.square())
-    for _ in range(lenses.iterations or ITERATIONS):
+    for _ in range(lenses.iterations or MAX_ITERATIONS):
         at_x, at_y = x + step_x, y + step_y
         bent_u, bent_v, (uu, uv, vv) = distort(at_x, at_y, lenses.coefficients)
         off_u, off_v = bent_u - u, bent_v - v
@@ -214,10 +214,10 @@ def iterations_needed(u: Tensor, v: Tensor, lenses: Distortion) -> int:
         lenses: the R lenses, one for each point.
     """
     found = undistort(u, v, lenses)[2]
-    for count in range(1, ITERATIONS):
+    for count in range(1, MAX_ITERATIONS):
         if bool((undistort(u, v, replace(lenses, iterations=count))[2] | ~found).all()):
             return count + 1
-    return ITERATIONS
+    return MAX_ITERATIONS
 
 
 def unproject(model: str, x: Tensor, y: Tensor, lenses: Distortion | None) -> LensRays:

@@ -12,7 +12,7 @@ from nerfloom.processing import colmap, contrast, database, features, mapping, m
 from nerfloom.processing.images import PreparedImage, prepare_all, write_masks
 from nerfloom.processing.job import Job
 from nerfloom.processing.output import FINISHED, ready
-from nerfloom.processing.parallax import NO_PARALLAX, PAIRS, WITHOUT, share_that_turned
+from nerfloom.processing.parallax import MAX_PAIRS, NO_PARALLAX, WITHOUT, share_that_turned
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.summary import Summary, lines
 
@@ -45,7 +45,7 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     with job.timed("matching"):
         pairs = matching.choose_pairs(rule, names, job)
     matching.match(job, pairs, len(names), matching.RULES[rule])
-    turned = share_that_turned(database.matches(job.database, PAIRS))
+    turned = share_that_turned(database.matches(job.database, MAX_PAIRS))
     if turned >= WITHOUT:
         say(f"warning: {NO_PARALLAX}")
     sizes = mapping.reconstruct(job, names, rule, turned)

@@ -27,7 +27,7 @@ MAX_DEAD_OPACITY = 0.005
 """Gaussians at or below this opacity are dropped."""
 CHILDREN, SHRUNK = 2, 1.6
 """Number of Gaussians that replace a split one, and the divisor of its standard deviations."""
-RESET = 0.01
+MAX_RESET_OPACITY = 0.01
 """Maximum opacity after a reset. Gaussians that no image needs stay transparent and are dropped."""
 
 
@@ -113,7 +113,7 @@ class DensityControl(Strategy):
         if step % self.steps_per_reset != self.steps_per_reset - 1:
             return {}
         self.gradients.take(len(gaussians))
-        return {"logits": gaussians.logits.clamp(max=math.log(RESET / (1 - RESET)))}
+        return {"logits": gaussians.logits.clamp(max=math.log(MAX_RESET_OPACITY / (1 - MAX_RESET_OPACITY)))}
 
     def grow(self, gaussians: Gaussians, most: int, extent: float) -> Change | None:
         return grown(gaussians, self.gradients.take(len(gaussians)), most, extent)

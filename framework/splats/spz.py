@@ -60,7 +60,7 @@ STEPS = 16
 """Minimum number of position steps per standard deviation of a typical Gaussian, if the range allows it."""
 SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 """Factors of harmonics of degrees 1 to 3 when y and z change sign."""
-RATIO = 1032
+MAX_RATIO = 1032
 """Maximum ratio of sizes before and after compression by gzip."""
 FLAT = 3.0
 """Logarithm of the ratio of the largest to the smallest size that is not reported as clipped; smaller sizes are
@@ -69,7 +69,7 @@ ANTIALIASED = 1
 """Bit of the header's flags."""
 FCOMMENT, COMMENT_START, MAX_COMMENT_LENGTH = 16, 10, 1000
 """In the gzip header: the flags with only a comment, the offset of the comment, and its maximum length, bytes."""
-SURPLUS = 1 << 24
+MAX_SURPLUS = 1 << 24
 """Maximum number of bytes after the last array, for extensions of the format."""
 
 
@@ -297,7 +297,7 @@ def _unpacked(file: Path) -> tuple[int, int, int, int, int, np.ndarray]:
             version, count, degree, fraction, flags = _checked_header(file, start)
             needed = count * sum(_sizes(version, (degree + 1) ** 2 - 1))
             size = file.stat().st_size
-            if needed > RATIO * size:
+            if needed > MAX_RATIO * size:
                 raise DataError(f"{file} is truncated: {count:,} Gaussians have more than its {size:,} bytes")
             content = stream.read(needed)
             if len(content) < needed:
@@ -305,7 +305,7 @@ def _unpacked(file: Path) -> tuple[int, int, int, int, int, np.ndarray]:
             surplus = 0
             while more := stream.read(1 << 16):  # to its end, where the checksum is
                 surplus += len(more)
-                if surplus > SURPLUS:
+                if surplus > MAX_SURPLUS:
                     raise DataError(f"{file} has too much behind its {count:,} Gaussians; export it again")
     except (gzip.BadGzipFile, zlib.error) as error:
         raise DataError(f"{file} is damaged, or not an SPZ file: copy or export it again") from error

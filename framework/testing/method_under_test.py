@@ -31,7 +31,7 @@ from nerfloom.training.optim import Adam, make_optimizer, set_learning_rate
 from nerfloom.training.preparation import show_images
 from nerfloom.training.step import backward, forward
 
-RAYS = 256
+MAX_PIXELS = 256
 """Maximum number of pixels in a step."""
 STEPS = 60
 """Number of training steps of the model shared by several checks."""
@@ -82,7 +82,7 @@ class Learner:
             rays_per_pixel: rays through each pixel, if the batch is of pixels.
         """
         seed_step(SEED, self.done)
-        count = min(self.model.config.num_rays_per_batch, RAYS) if self.model.batches == "pixels" else 0
+        count = min(self.model.config.num_rays_per_batch, MAX_PIXELS) if self.model.batches == "pixels" else 0
         return self.source.draw(Request(self.done, count, rays_per_pixel))
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:

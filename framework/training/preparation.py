@@ -196,10 +196,7 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
 def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> None:
     """Empty the cells of nested boxes that no training image shows, or only in front of everything it shows.
 
-    Args:
-        config: the run's settings.
-        model: the model, whose samplers hold the grids.
-        dataset: the training images.
+    `config`, `model` and `dataset` are as in `skip_empty`.
     """
     nested = [sampler for sampler in parts(model, SkipsCells) if sampler.levels > 1]
     if not nested or not config.seen_cells:
@@ -214,14 +211,7 @@ def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> Non
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
     """Empty the cells of the occupancy grids that are outside the images' silhouettes.
 
-    Args:
-        config: the run's settings.
-        model: the model, whose samplers hold the grids.
-        dataset: the training images.
-        fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
-
-    Returns:
-        The data set, without pixels whose rays meet emptied cells only.
+    `config`, `model`, `dataset`, `fresh` and the result are as in `skip_empty`.
     """
     samplers = parts(model, SkipsCells)
     if not samplers or not config.silhouette_cells or _no_hull(dataset) is not None:

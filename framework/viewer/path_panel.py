@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 LINE = "/camera_path"
 """Name of the path in the scene."""
-PREVIEW_FPS = 20.0
+MAX_PREVIEW_FPS = 20.0
 """Maximum number of cameras per second in a preview."""
 NOTHING = "-"
 """Entry in the list of cameras while it is empty."""
@@ -155,7 +155,7 @@ class PathPanel:
                 index = min(int(passed * path.fps), len(path) - 1)
                 move_camera(self._client, path.poses[index], math.radians(float(path.fovs[index])))
                 self._client.flush()
-                time.sleep(1 / min(PREVIEW_FPS, path.fps))
+                time.sleep(1 / min(MAX_PREVIEW_FPS, path.fps))
         finally:
             self._playing, self._preview.label = False, "Preview"
 

@@ -29,7 +29,7 @@ MAX_SHOWN = 200
 """Maximum number of cameras shown."""
 THUMBNAIL = 96
 """Longer side of a thumbnail, pixels."""
-SAME_PLACE, SAME_WAY = 1e-3, 0.02
+MAX_SHIFT, MAX_ANGLE = 1e-3, 0.02
 """Maximum distance, relative to the spread of the cameras, and angle in radians between a view and its photograph."""
 
 
@@ -123,7 +123,7 @@ class Photographs:
         distances = (given[:, :, 3] - here[:, 3]).norm(dim=-1)
         size = float((given[:, :, 3] - given[:, :, 3].mean(0)).norm(dim=-1).max()) or 1.0
         ahead = (given[:, :, 2] * here[:, 2]).sum(-1)
-        close = (distances <= SAME_PLACE * size) & (ahead >= math.cos(SAME_WAY))
+        close = (distances <= MAX_SHIFT * size) & (ahead >= math.cos(MAX_ANGLE))
         return int(torch.where(close, distances, torch.inf).argmin()) if bool(close.any()) else None
 
     def truth(self, view: View, rgb: Tensor, background: Tensor) -> Tensor | None:

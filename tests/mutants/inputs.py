@@ -306,7 +306,7 @@ MUTANTS = {
             "downloads/test_unpack.py::test_paths_that_lead_elsewhere_are_refused"),
         Mutant("archive-with-links", "_files", "A not in (0, stat.S_IFREG, stat.S_IFDIR)", "A in (stat.S_IFIFO,)",
             "links in an archive are taken for files", "downloads/test_unpack.py::test_links_and_devices_are_refused"),
-        Mutant("archive-without-end", "_check_sizes", "A > MAX_EXPANSION * size + ALLOWANCE", "A < 0",
+        Mutant("archive-without-end", "_check_sizes", "A > MAX_EXPANSION * size + MIN_ALLOWANCE", "A < 0",
             "a small archive fills the disk",
             "downloads/test_unpack.py::test_a_bomb_is_refused"),
     ],

@@ -124,7 +124,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         """
         for name, rows in as_rows(self.columns, gaussians, self.extent).items():
             self.columns[name].values.data = rows.contiguous()
-        self._redrawn = None
+        self._prepared = None
 
     # -- training ---------------------------------------------------------------------------------------------
 
@@ -145,7 +145,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
             self.steps_per_move = steps_per_move(pace.step + steps, self._first, config.num_gaussians, per_doubling)
 
     def before_step(self, step: int, progress: float) -> None:
-        self._redrawn = None
+        self._prepared = None
 
     def on_image(self, gaussians: Gaussians, camera: SplatCamera, degree: int) -> Projected:
         """Project Gaussians to a training image and show them to the strategy.

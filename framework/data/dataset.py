@@ -27,7 +27,7 @@ from nerfloom.data.motion_bound import MotionBound
 from nerfloom.data.names_on_disk import nearest_on_disk
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
 from nerfloom.data.sparse_depth import SparseDepth, sparse_depth

@@ -23,7 +23,7 @@ from nerfloom.data.image_files import may_be_transparent, read_image, reduce_ima
 from nerfloom.data.light_spread import light_of
 from nerfloom.data.masks import read_mask
 from nerfloom.data.pixels.cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.pixels.store import MemoryStore, PixelStore, drop_fourth, move
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError, NerfloomError
-from nerfloom.processing.estimate import about
+from nerfloom.base.meter import time_text
 
 Report = Callable[[int], None]
 """Function that the child calls with the number of finished units; with 0 at the beginning, after imports."""
@@ -117,7 +117,7 @@ def _estimated(numbers: Iterator[int | None], title: str, total: int, unit: str)
             if count >= MIN_FINISHED and seconds > MIN_SECONDS:
                 said = True
                 if seconds / count * total > MIN_REPORTED_SECONDS:
-                    say(f"{title}: {about(seconds / count * total)} for {total:,} {unit}")
+                    say(f"{title}: about {time_text(seconds / count * total)} for {total:,} {unit}")
 
 
 def _units(numbers: Iterator[int | None], total: int) -> Iterator[int]:

@@ -19,8 +19,8 @@ from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.drawing import DRAWN, draw_view, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
+from nerfloom.splats.prepared_gaussians import PreparedGaussians
 from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
-from nerfloom.splats.redrawn import Redrawn
 
 
 class DrawsGaussians(Renderable):
@@ -29,7 +29,7 @@ class DrawsGaussians(Renderable):
     cameras: ClassVar[tuple[str, ...] | None] = DRAWN
     rasteriser: ClassVar[Rasteriser] = RASTERISER
     """The rasteriser."""
-    _redrawn: Redrawn | None = None
+    _prepared: PreparedGaussians | None = None
     """The Gaussians of the last picture; set to None where they change."""
 
     @abstractmethod
@@ -81,9 +81,9 @@ class DrawsGaussians(Renderable):
         return replace(picture, rgb=self.lit(picture.rgb, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        if self._redrawn is None or self._redrawn.time != view.time:
-            self._redrawn = Redrawn(self.gaussians(view.time), self.rasteriser, view.time)
-        return self.lit(self._redrawn.colors(self.camera(view.camera), view.stride, background), None)
+        if self._prepared is None or self._prepared.time != view.time:
+            self._prepared = PreparedGaussians(self.gaussians(view.time), self.rasteriser, view.time)
+        return self.lit(self._prepared.colors(self.camera(view.camera), view.stride, background), None)
 
 
 class DrawnGaussians(DrawsGaussians):

@@ -10,7 +10,7 @@ from itertools import count, cycle
 import numpy as np
 
 from nerfloom.cli.train import main
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 
 INJECTED = "injected"
 DAY = 86_400.0

@@ -23,7 +23,7 @@ from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
 from nerfloom.data.pixels.cache import PixelMemory, pack, unpack
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap

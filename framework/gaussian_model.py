@@ -47,6 +47,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
+    resizes: ClassVar[bool] = True
     extent: Tensor
     """Size () of the scene, scene units. Centres are stored relative to it, so that their learning rate suits any
     scene."""

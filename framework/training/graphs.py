@@ -333,7 +333,7 @@ def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple
         return StepKind(varies="several processes exchange their gradients")
     if source.varies is not None:
         return StepKind(varies=source.varies)
-    if type(model).after_step is not Model.after_step:
+    if model.resizes:
         return StepKind(varies="the number of parameters changes")
     own = model.step_kind(step)
     return StepKind((*batch, *own.of), own.varies)

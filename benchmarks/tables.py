@@ -157,7 +157,6 @@ def kept(row: Row, file: Path) -> Result | None:
     """Return the result of a row, or None if it is not there.
 
     Args:
-        row: the row.
         file: the table's results.
 
     Raises:
@@ -207,7 +206,6 @@ def result_of(row: Row, root: Path) -> Result:
     """Return the result of a finished row, without paths of the machine.
 
     Args:
-        row: the row.
         root: folder of the folders of all data.
     """
     measured, evaluation = measure(row.job, row.conditions), read_json(row.job.evaluation)

@@ -34,7 +34,6 @@ def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
 
     Args:
         config: the method's settings.
-        scene: properties of the scene.
     """
     return config, []
 
@@ -81,7 +80,6 @@ class Method:
 
         Args:
             config: the method's settings.
-            scene: properties of the scene.
 
         Returns:
             The settings and the decisions.
@@ -109,7 +107,6 @@ class Method:
 
         Args:
             config: the settings; open ones are decided first.
-            scene: properties of the scene.
 
         Raises:
             ConfigError: if the settings do not fit the scene or each other, if the model does not fit into memory, or

@@ -70,7 +70,6 @@ def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
     """Return the sampler from `sampler_choice`, or proposals if pose refinement is selected.
 
     Args:
-        config: the method's settings.
         contracted: whether the field covers space outside the box.
     """
     choice = sampler_choice(config, contracted)
@@ -84,7 +83,6 @@ def refinement_choice(config: RefinedConfig, scene: Scene) -> Choice:
 
     Args:
         config: the method's settings; the sampler is chosen.
-        scene: properties of the data.
     """
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
     reason = POSE_REASONS[scene.poses]
@@ -100,7 +98,6 @@ def decide_capture(
 
     Args:
         config: the method's settings; open ones are filled in.
-        scene: properties of the data.
         own: the method's own choices.
         proposals: intervals of each proposal without a time limit.
 

@@ -97,7 +97,6 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
     """A model of Gaussians drawn as whole images.
 
     Args:
-        config: the settings, decided.
         scene: facts about the data.
     """
 

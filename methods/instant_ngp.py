@@ -217,7 +217,6 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
     """Return a field of the same size for the outside of the sphere.
 
     Args:
-        config: the method's settings, decided.
         scene: properties of the data; not used.
     """
     grid = HashGrid.of(config, config.open_levels_until)

@@ -84,8 +84,6 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
     """A model of many scenes: the encoder takes images of a scene, and the field looks up their features.
 
     Args:
-        config: the method's settings, decided.
-        scene: properties of the data.
         field: the conditioned network.
         sampler: chooses the positions along each ray.
         renderer: turns samples into colours and depths.

@@ -119,8 +119,6 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
 
     Args:
-        config: the method's settings, decided.
-        scene: properties of the data.
         field: the `TensorField`.
         sampler: chooses the samples along rays.
         renderer: turns samples into colours and depths.

@@ -90,7 +90,6 @@ def make_background(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
     """Return the network for the outside of the sphere, at points of the inverted sphere.
 
     Args:
-        config: the method's settings, decided.
         scene: properties of the data; not used.
     """
     return _network(config, dims=4)

@@ -97,7 +97,6 @@ def measured_kernels(device: torch.device, samples: int, repeats: int, seconds: 
     """Measure every kernel on a device and print a table; errors come first, because they matter most.
 
     Args:
-        device: the device.
         samples: number of samples in a batch.
         repeats: number of runs for medians.
         seconds: time after which no further kernel is timed.
@@ -190,7 +189,6 @@ def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) 
     """Time training steps of nerfacto and instant-ngp, unchanged and repeated as CUDA graphs.
 
     Args:
-        device: the device.
         before: untimed steps at the beginning, which compile kernels and capture steps.
         steps: number of timed steps.
         settings: settings of the methods other than their defaults.

@@ -29,7 +29,6 @@ def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
     """Train a method, measure up to `MAX_STEPS` further steps, and print a line for each kernel.
 
     Args:
-        run: the run to train.
         steps: training steps before the measurement; the occupancy grid finds empty space in them.
         max_seconds: time budget, seconds, for the method's choice of settings.
 

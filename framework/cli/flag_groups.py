@@ -61,7 +61,6 @@ def grouped_flags(
 
     Args:
         method: the method's name.
-        config: the method's settings.
         data_format: the data format's name.
         parser: the data format with its settings.
         everyday: whether the help shows only the everyday flags.

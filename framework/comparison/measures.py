@@ -87,7 +87,6 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
     """Return the measurements of a job; None if it is not finished or its images are not finite.
 
     Args:
-        job: the job.
         conditions: the conditions of the comparison.
     """
     summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)

@@ -135,7 +135,6 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
     """Return the conditions shared by all runs, as sentences.
 
     Args:
-        conditions: the conditions.
         repeats: number of seeds for each contender.
         runs: measurements of all finished runs.
     """

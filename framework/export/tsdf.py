@@ -73,7 +73,6 @@ def stride_for(cameras: Cameras, lattice: Lattice, most_pixels: int = MAX_PIXELS
 
     Args:
         cameras: the cameras to be rendered.
-        lattice: the lattice.
         most_pixels: maximum number of pixels of all views together.
     """
     middle = lattice.positions(torch.tensor([lattice.cells]) / 2)

@@ -59,7 +59,6 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
 
     Args:
         config: the method's settings; open ones are filled in.
-        scene: properties of the scene.
         open_until: fraction of the budget for opening the levels of the method's encoding if there are few images.
 
     Returns:
@@ -88,7 +87,6 @@ def unseen_weight(config: FewImagesConfig, step: int) -> float:
     """Return the weight of unseen views in a step; it falls linearly at first, as in RegNeRF.
 
     Args:
-        config: the settings, decided.
         step: number of training steps done.
     """
     share = min(step / UNSEEN_STEPS, 1.0)

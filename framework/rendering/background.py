@@ -122,7 +122,6 @@ def background_renderer(
     of samples. Otherwise it is sampled uniformly in 1/r.
 
     Args:
-        config: the settings, decided.
         scene: properties of the whole scene, not of its foreground.
         make_field: creates a field for the outside, from settings and scene.
         renderer: renders the inside; if None, that of `volume_renderer`.

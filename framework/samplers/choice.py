@@ -120,7 +120,6 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
     """Return the sampler that `--sampler auto` selects.
 
     Args:
-        config: the method's settings.
         unbounded: whether the scene may extend beyond the box.
     """
     reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
@@ -215,8 +214,6 @@ def make_sampler(
     """Return the sampler that the settings select.
 
     Args:
-        config: the settings, decided.
-        scene: properties of the scene.
         make_coarse: creates the coarse field of `--sampler hierarchical`; it returns None if the field is its own
             coarse field. None if the method has no coarse level.
         proposals: density fields of `--sampler proposal`. If None, they are hash grids, or planes in space and time for

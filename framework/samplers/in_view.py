@@ -20,7 +20,6 @@ def pixels_in_view(sampler: Sampler, view: View) -> Tensor | None:
     """Return the pixels of a view whose rays may meet an occupied cell, with a margin around them.
 
     Args:
-        sampler: the sampler.
         view: the view, on the sampler's device.
 
     Returns:

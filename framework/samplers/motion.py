@@ -51,7 +51,6 @@ def slices_choice(scene: Scene, sampler: str) -> Choice:
     """Return the number of time slices of the occupancy grid that suits the scene.
 
     Args:
-        scene: properties of the scene.
         sampler: the chosen sampler.
     """
     shown = scene.moving and scene.has_alpha and not scene.unbounded and sampler == "occupancy"

@@ -144,9 +144,9 @@ def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> 
     """
     alive = (torch.sigmoid(gaussians.logits) > MAX_DEAD_OPACITY) & gaussians.finite()
     wanting = alive & (gradients > GRADIENT)
-    room = max(most - int(alive.sum()), 0)
-    if int(wanting.sum()) > room:
-        chosen = torch.where(wanting, gradients, -1).topk(room).indices
+    left = max(most - int(alive.sum()), 0)
+    if int(wanting.sum()) > left:
+        chosen = torch.where(wanting, gradients, -1).topk(left).indices
         wanting = torch.zeros_like(wanting).index_fill_(0, chosen, True) & wanting
     large = gaussians.log_scales.exp().amax(-1) > MAX_CLONED_SIZE * extent
     split, cloned = wanting & large, wanting & ~large

@@ -48,11 +48,7 @@ ELSEWHERE = Look(sort="depth")
 
 
 def comments(look: Look) -> list[str]:
-    """Return the comments of a file that state the settings of drawing.
-
-    Args:
-        look: the settings.
-    """
+    """Return the comments of a file that state the settings of drawing."""
     blur = [] if look.blur == BLUR else [f"SplatBlur: {look.blur:g}"]
     return [f"SplatRenderMode: {'mip' if look.antialiased else 'default'}", *blur, f"SplatSort: {look.sort}"]
 

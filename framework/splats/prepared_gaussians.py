@@ -20,7 +20,6 @@ class PreparedGaussians:
 
     Args:
         gaussians: the Gaussians; they must not change.
-        rasteriser: the rasteriser.
         time: time of the scene; None for a still scene.
     """
 

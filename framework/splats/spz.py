@@ -39,7 +39,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
@@ -71,23 +70,6 @@ FCOMMENT, COMMENT_START, MAX_COMMENT_LENGTH = 16, 10, 1000
 """In the gzip header: the flags with only a comment, the offset of the comment, and its maximum length, bytes."""
 MAX_SURPLUS = 1 << 24
 """Maximum number of bytes after the last array, for extensions of the format."""
-
-
-def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> None:
-    """Write Gaussians to an SPZ file of version 2.
-
-    Args:
-        file: path of the file.
-        gaussians: N Gaussians on the CPU.
-        bits: as in `encoded`.
-        look: the settings of drawing.
-
-    Raises:
-        ConfigError: if the format cannot hold them.
-        OSError: if the file cannot be written.
-    """
-    content = encoded(gaussians, bits, look)
-    write_atomically(file, lambda stream: stream.write(content))
 
 
 def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> bytes:

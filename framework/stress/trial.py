@@ -96,7 +96,6 @@ def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Tri
     """Train and evaluate a run under a condition; errors become part of the result.
 
     Args:
-        condition: the condition.
         run: the method and its settings; its folder is not used.
         views: the plain images.
         budget: length of the run.
@@ -131,7 +130,6 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     """Return the settings of a short run, with small steps and no files but the last checkpoint.
 
     Args:
-        config: the run's settings.
         budget: length of the run.
         method: the method; it fills in the number of samples per step and the learning rate if they are open.
         scene: properties of the plain images.

@@ -60,7 +60,6 @@ def check_method(method: Method, name: str = "the method", config: TrainConfig |
     On the CPU it takes seconds for small models, so give a config with few layers, levels or cells.
 
     Args:
-        method: the method.
         name: the method's name in messages.
         config: settings for the check; the method's defaults if None.
 
@@ -90,7 +89,6 @@ def assert_method(method: Method, name: str = "the method", config: TrainConfig 
     """Check a method in a test.
 
     Args:
-        method: the method.
         name: the method's name in messages.
         config: settings for the check; the method's defaults if None.
 

@@ -48,8 +48,6 @@ class Learner:
     """A model in training on one scene, with the trainer's steps.
 
     Args:
-        method: the method.
-        config: the method's settings.
         dataset: images of the scene.
         seed: random seed of the initial parameters.
     """
@@ -194,7 +192,6 @@ class MethodUnderTest:
     """A method under test, with its settings and scenes.
 
     Args:
-        method: the method.
         name: the method's name in messages.
         config: the method's settings; its defaults if None.
     """

@@ -324,7 +324,6 @@ def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple
     """Return the kind of a whole training step, including the draw of its batch.
 
     Args:
-        model: the model to train.
         source: source of the batches.
         step: number of training steps done.
         batch: the requested sizes of the batch.

@@ -42,7 +42,6 @@ def decided(method: Method, config: Any, dataset: Dataset) -> tuple[Dataset, Tra
     A method that learns motion and samples with an occupancy grid gets the smallest box that the silhouettes allow.
 
     Args:
-        method: the method.
         config: the run's settings.
         dataset: the training images.
 
@@ -102,8 +101,6 @@ def profile_of(
 
     Args:
         method: the method's name.
-        config: the run's settings.
-        model: the model to train.
         dataset: the training images.
         decided: decisions of the method.
     """
@@ -160,7 +157,6 @@ def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None)
     """Give the images to a model that renders from images: the training set, and source images of held-out scenes.
 
     Args:
-        model: any model.
         train_set: the training images.
         eval_set: the held-out images; None if there are none.
     """
@@ -174,7 +170,6 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
     """Empty the cells of the occupancy grids that silhouettes exclude or that no training image shows.
 
     Args:
-        config: the run's settings.
         model: the model, whose samplers hold the grids.
         dataset: the training images.
         fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.

@@ -40,7 +40,6 @@ def starts_checked(
     before it.
 
     Args:
-        config: the run's settings.
         settings: the same settings after the method's decisions.
         made: the method's decisions.
         dataset: the training images.

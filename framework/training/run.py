@@ -122,7 +122,6 @@ def run_folder(method: str, config: TrainConfig) -> Path:
 
     Args:
         method: the method's name.
-        config: the run's settings.
     """
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
     timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
@@ -230,7 +229,6 @@ def write_transforms(run: Run, dataset: Dataset) -> None:
     """Write dataparser_transforms.json in nerfstudio's format.
 
     Args:
-        run: the run.
         dataset: its data set, with the transform from the input's frame to the scene's.
     """
     content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}

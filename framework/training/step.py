@@ -39,7 +39,6 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
     Several processes take the step together, each with its own batch; all use the mean gradient.
 
     Args:
-        model: the model to train.
         optimizer: the optimiser of all its parameters.
         batch: pixels or views, as the model's loss takes them.
         step: number of training steps done.
@@ -83,7 +82,6 @@ def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16:
     """Return the loss of a model on a batch, in training mode.
 
     Args:
-        model: the model to train.
         batch: pixels or views, as the model's loss takes them.
         step: number of training steps done.
         progress: fraction of the budget spent, 0 to 1.

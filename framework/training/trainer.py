@@ -58,7 +58,6 @@ class Trainer:
     Each of several processes has a trainer. Only the first process evaluates and writes.
 
     Args:
-        method: the method.
         config: its settings; open ones are decided from the data.
         train_set: training images, on the device.
         eval_set: images of the periodic evaluation; None for no evaluation.

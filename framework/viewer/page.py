@@ -77,12 +77,12 @@ class Page:
 
     def refresh(self) -> None:
         """Update the run's step, PSNR and learning curve."""
-        subject = self._queue.loaded
-        content = heading(subject)
+        loaded = self._queue.loaded
+        content = heading(loaded)
         if content != self._heading.content:
             self._heading.content = content
-        if subject.is_run:
-            self.show_curve(*curve(subject.folder))
+        if loaded.is_run:
+            self.show_curve(*curve(loaded.folder))
 
     def show_curve(self, seconds: list[float], psnr: list[float]) -> None:
         """Show a learning curve.

@@ -38,7 +38,7 @@ class PathPanel:
 
     Args:
         client: the browser.
-        subject: function that returns the model and its run.
+        loaded: function that returns the model and its run.
         request: function that returns the browser's request; None if its camera is invalid.
         renders: processes that render paths, at most one at a time; None if rendering is not allowed.
     """
@@ -46,11 +46,11 @@ class PathPanel:
     def __init__(
         self,
         client: viser.ClientHandle,
-        subject: Callable[[], Loaded],
+        loaded: Callable[[], Loaded],
         request: Callable[[], Request | None],
         renders: list[subprocess.Popen[bytes]] | None,
     ) -> None:
-        self._client, self._subject, self._request, self._renders = client, subject, request, renders
+        self._client, self._loaded, self._request, self._renders = client, loaded, request, renders
         self._editor = Editor()
         self._playing = False
         gui = client.gui
@@ -124,7 +124,7 @@ class PathPanel:
 
     def _path(self) -> CameraPath | None:
         width, height = (round(number_in(one.value, 16, 8192, 720)) for one in (self._width, self._height))
-        return self._editor.path(width, height, self._subject().placement)
+        return self._editor.path(width, height, self._loaded().placement)
 
     def _show(self, path: CameraPath | None) -> None:
         """Draw the path as a line in the scene."""
@@ -163,7 +163,7 @@ class PathPanel:
 
     def _save(self) -> Path | None:
         """Write the path beside the run or file, and return its file; None if that was not possible."""
-        path, folder = self._path(), self._subject().folder
+        path, folder = self._path(), self._loaded().folder
         if path is None:
             self._note.content = "A path needs two cameras."
             return None
@@ -173,7 +173,7 @@ class PathPanel:
         except OSError as error:
             self._note.content = f"Cannot write {file.name}: {error.strerror or error}"
             return None
-        words = map(shlex.quote, (str(self._subject().origin), "--camera-path-filename", str(file)))
+        words = map(shlex.quote, (str(self._loaded().origin), "--camera-path-filename", str(file)))
         command = f"ns-render camera-path {' '.join(words)}"
         say(f"viewer: saved {file}; render it with: {command} --output-path {video_suffix(file.stem)}")
         self._note.content = f"Saved {file.name}, {len(path)} frames."
@@ -190,7 +190,7 @@ class PathPanel:
             return
         output = file.with_name(video_suffix(file.stem))
         words = ["--camera-path-filename", file, "--output-path", output]
-        command = python_command("nerfloom.cli.render", "camera-path", self._subject().origin, *words)
+        command = python_command("nerfloom.cli.render", "camera-path", self._loaded().origin, *words)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         self._renders[:] = [process]
         self._note.content = f"Rendering {output.name} ..."

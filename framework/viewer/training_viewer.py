@@ -120,7 +120,6 @@ def in_training(run: Run, trainer: Trainer) -> Loaded:
     """Return a run in training, at its present step, as something to look at.
 
     Args:
-        run: the run.
         trainer: its trainer.
     """
     placement, checkpoints = trainer.train_set.placement, run.folder / FOLDER
@@ -132,7 +131,6 @@ def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     """Serve a run in training to browsers, within a `with` block.
 
     Args:
-        run: the run.
         trainer: the run's trainer.
 
     Yields:

@@ -18,7 +18,7 @@ from nerfloom.fields.base import Field
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.compositing.density import composite, composite_reference, distortion, distortion_by_pairs
+from nerfloom.kernels.compositing.density import composite, composite_reference, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
@@ -48,6 +48,7 @@ from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project
 from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
+from tests.kernels.distortion_by_pairs import distortion_by_pairs
 
 pytestmark = needs_kernels
 GRID = HashGridLayout.build(3, 4, 20, 8)

@@ -153,12 +153,12 @@ class CompiledMarch(March):
         self.spent = torch.zeros(count)
 
     def wave(self, limit: int) -> Wave | None:
-        living, room = len(self.alive), len(self.alive) * limit
+        living, capacity = len(self.alive), len(self.alive) * limit
         if living == 0:
             return None
         self.counts, self.limit = torch.empty(living, dtype=torch.int32), limit
-        starts, ends, positions = torch.empty(room), torch.empty(room), torch.empty(room, 3)
-        owners = torch.empty(room, dtype=torch.int64)
+        starts, ends, positions = torch.empty(capacity), torch.empty(capacity), torch.empty(capacity, 3)
+        owners = torch.empty(capacity, dtype=torch.int64)
         count = _wave(
             self.origins.data_ptr(), self.directions.data_ptr(), self.enter.data_ptr(), self.leave.data_ptr(),
             self.first.data_ptr(), None if self.slices is None else self.slices.data_ptr(), self.next.data_ptr(),

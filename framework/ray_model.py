@@ -60,7 +60,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         self.poses: PoseRefinement | None = None
         """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
-        self.shared_space = CovisibleSpace(scene.box) if starts else None
+        self.covisible_space = CovisibleSpace(scene.box) if starts else None
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         """Render R rays.
@@ -70,7 +70,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
         rays = rays if self.poses is None else self.poses(rays)
-        rays = rays if self.shared_space is None else self.shared_space(rays)
+        rays = rays if self.covisible_space is None else self.covisible_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
         return self.renderer.render(rays, samples, self.field, background)
 
@@ -149,7 +149,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             The rendered values of R rays.
         """
         known = None
-        if self._renders_plainly and self.shared_space is None:
+        if self._renders_plainly and self.covisible_space is None:
             known = traced_rays(rays, background, self.sampler, self.field, self.renderer)
         return self.render(rays, background) if known is None else known
 

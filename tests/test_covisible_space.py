@@ -38,7 +38,7 @@ def fan(*slopes: float, near: float = 0.05, far: float = 100.0) -> Rays:
 
 def shared(cameras: Cameras, least: int, nearest: float = 0.0) -> CovisibleSpace:
     found = CovisibleSpace(BOX)
-    found.leave_out(cameras, torch.full((len(cameras),), nearest), least)
+    found.exclude(cameras, torch.full((len(cameras),), nearest), least)
     return found
 
 
@@ -104,7 +104,7 @@ def test_cells_are_counted_whose_points_are_all_seen() -> None:
 def test_starts_are_those_of_float64() -> None:
     found, rays = shared(row(0.0, 0.5), 2), fan(-0.5, -0.2, 0.0, 0.3, 0.8)
     exact = Rays(*(each.double() for each in (rays.origins, rays.directions, rays.nears, rays.fars)))
-    expected = first_covisible_reference(exact, found.box.double(), found.unshared)
+    expected = first_covisible_reference(exact, found.box.double(), found.excluded)
     torch.testing.assert_close(found(rays).nears.double(), expected, rtol=1e-5, atol=1e-6)
     assert bool((expected > exact.nears).all())
 
@@ -112,13 +112,13 @@ def test_starts_are_those_of_float64() -> None:
 def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) -> None:
     trainer = small(tmp_path, rays_shared_by=2)
     trainer.prepare()
-    space, dataset = trainer.model.shared_space, trainer.train_set
+    space, dataset = trainer.model.covisible_space, trainer.train_set
     assert isinstance(space, CovisibleSpace)
     expected = CovisibleSpace(dataset.scene.box)
-    expected.leave_out(dataset.cameras, torch.full_like(dataset.cameras.fx, dataset.scene.near), 2)
-    assert torch.equal(space.unshared, expected.unshared)
-    assert 0 < int(space.unshared.sum()) < len(space.unshared)
-    assert "shared_space.unshared" in trainer.model.state_dict()  # which checkpoints keep
+    expected.exclude(dataset.cameras, torch.full_like(dataset.cameras.fx, dataset.scene.near), 2)
+    assert torch.equal(space.excluded, expected.excluded)
+    assert 0 < int(space.excluded.sum()) < len(space.excluded)
+    assert "covisible_space.excluded" in trainer.model.state_dict()  # which checkpoints keep
     assert [d.choice for d in trainer.profile.decisions if d.option == "rays start"] == [
         "where at least 2 photographs look"
     ]
@@ -191,7 +191,7 @@ def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:
     """
     cameras, space = around(1.0, -40, 40), CovisibleSpace(BOX / 4)
     cameras = dataclasses.replace(cameras, fx=4 * cameras.fx, fy=4 * cameras.fy)
-    space.leave_out(cameras, torch.zeros(2), 2)
+    space.exclude(cameras, torch.zeros(2), 2)
     late = share_late(space, cameras, 0.01, 100.0)
     rays = cameras.pixel_rays(torch.arange(int(cameras.offsets[-1])), 0.01, 100.0)
 
@@ -220,7 +220,7 @@ def test_in_real_captures_rays_start_late_where_the_cameras_go_around_something(
     path, name = find_data(real_data / capture, None)
     parsed = load_dataparser(name)().parse(path, "train")
     space = CovisibleSpace(parsed.box)
-    space.leave_out(parsed.cameras, torch.full_like(parsed.cameras.fx, parsed.near), 2)
+    space.exclude(parsed.cameras, torch.full_like(parsed.cameras.fx, parsed.near), 2)
     late = share_late(space, parsed.cameras, parsed.near, parsed.far)
     assert late is not None
     print(f"{capture}: {100 * late:.2f} % start late")
@@ -256,5 +256,5 @@ def test_rays_start_at_the_near_end_where_one_says_so_and_in_nested_boxes(
 ) -> None:
     trainer = small(tmp_path, **settings)
     trainer.prepare()
-    assert trainer.model.shared_space is None
+    assert trainer.model.covisible_space is None
     assert not [d for d in trainer.profile.decisions if d.option == "rays start"]

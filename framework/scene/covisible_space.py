@@ -23,22 +23,22 @@ BLOCK = 4
 
 
 class CovisibleSpace(nn.Module):
-    """The cells of nested boxes that too few training images show; empty until `leave_out` is called.
+    """Space that enough training images show, by cells of nested boxes; all of space until `exclude` is called.
 
     Args:
         box: (2, 3) corners of the smallest box, scene units.
     """
 
     box: Tensor
-    unshared: Tensor
+    excluded: Tensor
     """(L n^3 + 1,) bool, box by box; the last entry stands for all space beyond the boxes and is False."""
 
     def __init__(self, box: Tensor) -> None:
         super().__init__()
         self.register_buffer("box", box.clone(memory_format=torch.contiguous_format))
-        self.register_buffer("unshared", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
+        self.register_buffer("excluded", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
 
-    def leave_out(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
+    def exclude(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
         """Exclude cells that fewer than `least` images show, or fewer than all if there are fewer images.
 
         Args:
@@ -49,7 +49,7 @@ class CovisibleSpace(nn.Module):
         least = min(least, len(cameras))
         with torch_on_one_thread():  # the operations are small
             seen = [times_seen(cameras, nearest, box, CELLS, least) for box in nested_boxes(self.box, LEVELS)]
-        self.unshared[:-1] = torch.cat(seen) < least
+        self.excluded[:-1] = torch.cat(seen) < least
 
     def forward(self, rays: Rays) -> Rays:
         """Return rays that start where they first meet space that enough images show; unchanged if they never do.
@@ -57,7 +57,7 @@ class CovisibleSpace(nn.Module):
         Args:
             rays: R rays; R may be 0.
         """
-        return replace(rays, nears=first_covisible(rays, self.box, self.unshared))
+        return replace(rays, nears=first_covisible(rays, self.box, self.excluded))
 
 
 @torch.no_grad()

@@ -116,7 +116,7 @@ def profile_of(
         outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
-    if isinstance(model, RayModel) and model.shared_space is not None:
+    if isinstance(model, RayModel) and model.covisible_space is not None:
         where = f"where at least {config.rays_shared_by} photographs look"
         reason = "what one shows could be at any distance (else: --rays-shared-by 0)"
         decisions.append(Decision("rays start", where, reason))
@@ -183,8 +183,8 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
             sampler.expect_motion(dataset.motion_bound.in_a_slice(sampler.slices))
     if fresh:
         skip_unseen(config, model, dataset)
-        if isinstance(model, RayModel) and model.shared_space is not None:
-            model.shared_space.leave_out(dataset.cameras, nearest_shown(dataset), config.rays_shared_by)
+        if isinstance(model, RayModel) and model.covisible_space is not None:
+            model.covisible_space.exclude(dataset.cameras, nearest_shown(dataset), config.rays_shared_by)
     return dataset
 
 

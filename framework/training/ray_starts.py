@@ -95,7 +95,7 @@ def _why_not(dataset: Dataset, least: int) -> str | None:
     if known is None and (scene.moving or scene.num_scenes > 1):
         return NOTHING_TO_TEST
     space = CovisibleSpace(scene.box).to(dataset.device)
-    space.leave_out(cameras, nearest_shown(dataset), least)
+    space.exclude(cameras, nearest_shown(dataset), least)
     if known is not None:
         some = known[evenly_spaced(len(known), TESTED_RAYS).to(known.pixels.device)]
         cut = share_cut_off(space, cameras.pixel_rays(some.pixels, scene.near, scene.far), some.distances)

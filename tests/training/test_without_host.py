@@ -58,7 +58,7 @@ def test_a_step_neither_asks_the_device_nor_brings_it_tensors(
     trainer = Trainer(here.method, here.config, here.train_set.to(NOWHERE))
     assert trainer.device == NOWHERE
     assert trainer.steps_per_read > 20
-    monkeypatch.setattr(CovisibleSpace, "leave_out", lambda *cells: None)  # before the first step it may wait
+    monkeypatch.setattr(CovisibleSpace, "exclude", lambda *cells: None)  # before the first step it may wait
     for part in trainer.model.modules():  # reads it once, after loading
         if isinstance(part, TensoRF):
             part._growths.change(part.growths, 0.0)

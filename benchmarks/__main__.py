@@ -26,10 +26,9 @@ from benchmarks.flags import (
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, shown
 from nerfloom.base.extras import install_command
-from nerfloom.cli.bench_results import write_results
-from nerfloom.cli.common import check_weights, chosen_kind, make_room, run_command
-from nerfloom.cli.flags import read_flags
-from nerfloom.training.run_path import check_data, trained_run
+from nerfloom.cli.bench_results import run_benchmark, write_results
+from nerfloom.cli.common import check_weights, make_room, run_command
+from nerfloom.training.run_path import trained_run
 
 USAGE = """\
 usage: python -m benchmarks WHAT [flags]
@@ -59,13 +58,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
-        return
-    name, (flags, run), rest = chosen
-    settings = read_flags(flags, f"python -m benchmarks {name}", rest)
-    if getattr(settings, "data", None) is not None:
-        check_data(settings.data)
-    run(settings)
+    run_benchmark("python -m benchmarks", arguments, KINDS, USAGE)
 
 
 def _quadrature(flags: QuadratureFlags) -> None:

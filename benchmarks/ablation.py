@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from itertools import pairwise, product
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 from benchmarks.children import output_of
 from nerfloom.base.child import python_command
 from nerfloom.base.console import say
+from nerfloom.base.errors import NerfloomError
 from nerfloom.kernels import native
 from nerfloom.training.machine import machine
 
@@ -40,7 +42,15 @@ CURVE_POINTS = 9
 """Number of evaluations of those views during a run."""
 
 
-def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, Any]:
+def measure(
+    data: Path,
+    seconds: float,
+    seeds: int,
+    target: float,
+    variants: Mapping[str, Sequence[str]] = VARIANTS,
+    method: str = "instant-ngp",
+    kind: str = "variant",
+) -> dict[str, Any]:
     """Train every variant with every seed, and print a line for each run and each variant.
 
     Args:
@@ -48,16 +58,28 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
         seconds: seconds of training of each run.
         seeds: number of runs of each variant.
         target: the time to reach this PSNR is reported, dB.
+        variants: flags of ns-train for each variant.
+        method: name of the method.
+        kind: what the variants are called in the results. If the method refuses the flag of this name, since the data
+            does not support it, the variant's row has the error message instead of results.
 
     Returns:
         The machine, the arguments and a row for each variant, as plain data.
     """
-    runs: dict[str, list[tuple[float | None, float]]] = {name: [] for name in VARIANTS}
-    for seed in range(seeds):
-        for name, switches in VARIANTS.items():
-            runs[name].append(train(data, seconds, seed, target, switches))
+    runs: dict[str, list[tuple[float | None, float]]] = {name: [] for name in variants}
+    refused: dict[str, str] = {}
+    for seed, (name, switches) in product(range(seeds), variants.items()):
+        if name in refused:
+            continue
+        try:
+            runs[name].append(train(data, seconds, seed, target, switches, method))
             say(f"seed {seed}  {name}: {runs[name][-1]}")
-    rows = [summary(name, results) for name, results in runs.items()]
+        except NerfloomError as error:
+            if f"error: --{kind}" not in str(error):  # other errors are failures, not properties of the data
+                raise
+            refused[name] = str(error)
+            say(f"{name}: {error}")
+    rows = [{kind: n, **({"refused": refused[n]} if n in refused else summary(found))} for n, found in runs.items()]
     for row in rows:
         say(str(row))
     arguments = {"seconds": seconds, "seeds": seeds, "target, dB": target}
@@ -65,7 +87,7 @@ def measure(data: Path, seconds: float, seeds: int, target: float) -> dict[str, 
 
 
 def train(
-    data: Path, seconds: float, seed: int, target: float, switches: list[str], method: str = "instant-ngp"
+    data: Path, seconds: float, seed: int, target: float, switches: Sequence[str], method: str = "instant-ngp"
 ) -> tuple[float | None, float]:
     """Train one variant, and evaluate it on all test views.
 
@@ -109,16 +131,14 @@ def crossing(curve: list[tuple[float, float]], target: float) -> float | None:
     return None
 
 
-def summary(name: str, found: list[tuple[float | None, float]]) -> dict[str, Any]:
+def summary(found: list[tuple[float | None, float]]) -> dict[str, Any]:
     """Average a variant's runs over seeds.
 
     Args:
-        name: the variant's name.
         found: seconds to the target and final PSNR of each run, as from `train`.
     """
     times, psnrs = [t for t, _ in found if t is not None], [p for _, p in found]
     return {
-        "variant": name,
         "seconds to the target": round(fmean(times), 1) if len(times) == len(found) else None,
         "test PSNR, dB": round(fmean(psnrs), 3),
         "standard deviation of a run, dB": round(stdev(psnrs), 3) if len(psnrs) > 1 else None,

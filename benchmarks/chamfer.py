@@ -90,7 +90,6 @@ def mesh_sample(mesh: Mesh, count: int) -> tuple[Tensor, Tensor]:
     """Return points (count, 3) float64 evenly on a mesh, the same in every run, and the face (count,) of each.
 
     Args:
-        mesh: the mesh.
         count: number of points.
     """
     import trimesh
@@ -107,7 +106,6 @@ def distances_to_mesh(points: Tensor, mesh: Mesh) -> Tensor:
 
     Args:
         points: (N, 3) positions.
-        mesh: the mesh.
     """
     import trimesh
     from scipy.spatial import cKDTree

@@ -146,7 +146,7 @@ class Solids(ClosedForm):
         return sigma, color
 
     def truth(self, rays: Rays, background: Tensor) -> Light:
-        """Sum over the intervals between surfaces, each of which is in one medium."""
+        """Sum over the intervals between surfaces, each in one medium."""
         origins, directions, nears, fars = _double(rays)
         crossings = [t for medium in self.media for t in medium.shape.crossing(origins, directions)]
         ends = torch.stack([nears, fars, *crossings], dim=-1)

@@ -60,15 +60,23 @@ def plans(
     contenders = tuple(map(Contender.of, methods or all_methods()))
     root = None if data is None else str(data.resolve())
     return [
-        Plan(contenders, _conditions(root, seconds, views), seeds, folder.resolve() / f"{seconds:g}s")
+        Plan(contenders, conditions(root, (), seconds, views), seeds, folder.resolve() / f"{seconds:g}s")
         for seconds in sorted(set(budgets))
     ]
 
 
-def _conditions(data: str | None, seconds: float, views: int) -> Conditions:
+def conditions(data: str | None, flags: tuple[str, ...], seconds: float, views: int | None) -> Conditions:
+    """Return the conditions of runs on all cores, without a learning curve.
+
+    Args:
+        data: folder of the data set; the embedded scene if None.
+        flags: flags of its format.
+        seconds: seconds of training.
+        views: maximum number of held-out views to evaluate; None for all.
+    """
     return Conditions(
         data=data,
-        data_flags=(),
+        data_flags=flags,
         max_seconds=seconds,
         max_num_iterations=None,
         target_psnr=None,

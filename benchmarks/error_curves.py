@@ -11,7 +11,7 @@ from typing import NamedTuple
 from nerfloom.base.console import say
 from nerfloom.comparison import plots
 
-LEAST_ERROR = 1e-12
+MIN_ERROR = 1e-12
 """Replaces an error of 0, which has no logarithm."""
 
 
@@ -43,7 +43,7 @@ def evaluations_needed(evaluations: Sequence[float], errors: Sequence[float], ta
         return evaluations[0]
     for (few, above), (more, below) in pairwise(zip(evaluations, errors, strict=True)):
         if below <= target < above:
-            share = math.log(above / target) / math.log(above / max(below, LEAST_ERROR))
+            share = math.log(above / target) / math.log(above / max(below, MIN_ERROR))
             return float(few ** (1 - share) * more**share)
     return None
 
@@ -73,7 +73,7 @@ def _draw_scene(scene: str, by_sampler: dict[str, Curve], path: Path) -> Path:
     figure = Figure(figsize=(7, 5), layout="constrained")
     axes = figure.subplots()
     for index, (name, curve) in enumerate(by_sampler.items()):
-        errors, color = [max(error, LEAST_ERROR) for error in curve.errors], f"C{index}"
+        errors, color = [max(error, MIN_ERROR) for error in curve.errors], f"C{index}"
         axes.errorbar(curve.evaluations, errors, curve.half_widths, marker="o", markersize=3, color=color, label=name)
         if curve.in_all != curve.evaluations:
             axes.plot(curve.in_all, errors, "--", linewidth=1, color=color)

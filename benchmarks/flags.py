@@ -62,23 +62,17 @@ class AblationFlags:
     target: float = 30.0
     """The time to reach this PSNR of the validation views is reported, dB."""
     output_dir: Path = RESULTS
-    """Folder of ablation-DATA.json."""
+    """Folder of the results: ablation-DATA.json or starts-DATA.json."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StartsFlags:
+class StartsFlags(AblationFlags):
     """Train gaussian-splatting from each kind of start in turn; report the time to a PSNR and the final PSNR."""
 
-    data: Path
-    """Folder of the data set."""
     seconds: float = 60.0
     """Seconds of training of each run."""
     seeds: int = 1
     """Number of runs from each start."""
-    target: float = 30.0
-    """The time to reach this PSNR of the validation views is reported, dB."""
-    output_dir: Path = RESULTS
-    """Folder of starts-DATA.json."""
 
 
 @dataclass(frozen=True)

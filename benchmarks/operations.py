@@ -84,7 +84,7 @@ CPU_ONLY = "framework/kernels/argument_checks.py"
 PACKAGES = Path(__file__).parents[1]
 OURS = tuple(str(PACKAGES / name) for name in ("framework", "methods"))
 """Folders of the code whose places are named."""
-TOLD = 5
+MAX_REPORTED = 5
 """Number of places with the most waits to report."""
 
 
@@ -105,7 +105,7 @@ class Counted:
         Args:
             method: name of the method.
         """
-        places = {place: round(count / self.steps, 2) for place, count in self.waits.most_common(TOLD)}
+        places = {place: round(count / self.steps, 2) for place, count in self.waits.most_common(MAX_REPORTED)}
         return {
             "method": method,
             "operations": round(self.operations / self.steps),

@@ -20,7 +20,6 @@ def columns(table: Table, found: Sequence[Result]) -> list[Column]:
     """Return the columns of a table that some result has a value for.
 
     Args:
-        table: the table.
         found: all results.
     """
     sizes = sorted({size for result in found for size in result["results"].get("by_size", {})}, key=len)
@@ -71,7 +70,6 @@ def markdown(table: Table, results: Path, wanted: re.Pattern[str]) -> str:
     empty.
 
     Args:
-        table: the table.
         results: the file of its results.
         wanted: parts of the names of the rows to show.
     """
@@ -124,7 +122,6 @@ def estimate(row: Row, done: Sequence[tuple[Row, Result]]) -> float:
     """Return the estimated seconds of a row: loading, training and evaluation, as in finished rows.
 
     Args:
-        row: the row.
         done: finished rows. Those with the same method and data are used, otherwise any with the same data.
     """
     near = [(other, found) for other, found in done if other.data == row.data]

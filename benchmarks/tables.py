@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from benchmarks.curves import conditions
 from nerfloom.base.config import from_plain, read_yaml
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, shown
@@ -144,27 +145,18 @@ def _texts(value: Any, where: str) -> dict[str, str]:
 
 
 def _conditions(place: str, root: Path, seconds: float, views: int | None) -> Conditions:
-    """Return the conditions of a row: all cores, and no learning curve."""
+    """Return the conditions of a row."""
     words = split_words(place, "data")
     folder = words[0] if words and not words[0].startswith("--") else None
-    return Conditions(
-        data=None if folder is None else str(root / folder),
-        data_flags=words if folder is None else words[1:],
-        max_seconds=seconds,
-        max_num_iterations=None,
-        target_psnr=None,
-        num_threads=None,
-        device_type="auto",
-        curve_images=0,
-        max_eval_images=views,
-    )
+    if folder is None:
+        return conditions(None, words, seconds, views)
+    return conditions(str(root / folder), words[1:], seconds, views)
 
 
 def kept(row: Row, file: Path) -> Result | None:
     """Return the result of a row, or None if it is not there.
 
     Args:
-        row: the row.
         file: the table's results.
 
     Raises:
@@ -214,7 +206,6 @@ def result_of(row: Row, root: Path) -> Result:
     """Return the result of a finished row, without paths of the machine.
 
     Args:
-        row: the row.
         root: folder of the folders of all data.
     """
     measured, evaluation = measure(row.job, row.conditions), read_json(row.job.evaluation)

@@ -18,7 +18,7 @@ import numpy as np
 
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import FINE_QUALITY, Browser
-from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Pose, Request
 
 WARM_UP = 12
@@ -60,7 +60,7 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
         count: number of pictures of the moving camera.
     """
     trained = load_trained(run, device_type="cpu")
-    studio = Studio(trained)
+    queue = RenderQueue(trained)
     shown: list[tuple[float, int]] = []
 
     def show(image: np.ndarray, quality: int) -> None:
@@ -68,20 +68,20 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
         shown.append((time.perf_counter(), quality))
 
     browser = Browser(show)
-    studio.enter(0, browser)
+    queue.add(0, browser)
     begun = time.perf_counter()
-    studio.ask(0, _always(_request(trained.model.scene, 0, width, height)))
-    studio.work()
+    queue.ask(0, _always(_request(trained.model.scene, 0, width, height)))
+    queue.draw_next()
     first = shown[-1][0] - begun
     seconds = []
     for index in range(WARM_UP + count):
         begun = time.perf_counter()
-        studio.ask(0, _always(_request(trained.model.scene, index + 1, width, height)))
-        studio.work()
+        queue.ask(0, _always(_request(trained.model.scene, index + 1, width, height)))
+        queue.draw_next()
         seconds.append(shown[-1][0] - begun)
     moving = seconds[WARM_UP:]
     while browser.pieces:
-        if studio.work() is None:
+        if queue.draw_next() is None:
             threading.Event().wait(0.005)
     assert shown[-1][1] == FINE_QUALITY
     return Times(

@@ -25,7 +25,7 @@ from nerfloom.dataparsers.renders import Renders, read_renders
 
 TRANSFORMS = "transforms_train.json"
 """File that identifies the format."""
-MOST_SCALES = 8
+MAX_SCALES = 8
 """Maximum number of sizes of an image; at the eighth, a pixel is the mean of 16,384 pixels."""
 DISTANCE, NEAR, FAR = 4.0311, 2.0, 6.0
 """Distance of NeRF-Synthetic's cameras from the origin, and its near and far, in the input's units."""
@@ -47,15 +47,15 @@ class Blender(DataParser):
     """Half the side of the cube around the origin that holds the scene, in the input's units. Default: 1.5 for
     NeRF-Synthetic; for other data, a cube from silhouettes or from what the cameras look at."""
     near: float | None = None
-    """Distance from a camera at which the scene starts, in the input's units. Default: 2 for NeRF-Synthetic, otherwise
+    """Distance from a camera where the scene starts, in the input's units. Default: 2 for NeRF-Synthetic, otherwise
     from cameras and cube."""
     far: float | None = None
-    """Distance from a camera at which the scene ends, in the input's units. Default: 6 for NeRF-Synthetic, otherwise
+    """Distance from a camera where the scene ends, in the input's units. Default: 6 for NeRF-Synthetic, otherwise
     from cameras and cube."""
     placement: Path | None = None
     """dataparser_transforms.json of a run whose placement to use instead of one from silhouettes and cameras."""
     multiscale: int = 1
-    """Number of sizes at which each image is used: 1, 1/2, 1/4, ... The loss is weighted by the area of pixels. 4 is
+    """Number of sizes of each image in use: 1, 1/2, 1/4, ... The loss is weighted by the area of pixels. 4 is
     Mip-NeRF's multiscale protocol."""
 
     @classmethod
@@ -93,8 +93,8 @@ class Blender(DataParser):
     def _check_flags(self) -> None:
         if self.downscale_factor < 1:
             raise DataError(f"--downscale-factor is {self.downscale_factor}; it must be an integer of at least 1")
-        if not 1 <= self.multiscale <= MOST_SCALES:
-            raise DataError(f"--multiscale is {self.multiscale}; it must be from 1 to {MOST_SCALES}")
+        if not 1 <= self.multiscale <= MAX_SCALES:
+            raise DataError(f"--multiscale is {self.multiscale}; it must be from 1 to {MAX_SCALES}")
         for name in ("scale_factor", "half_size"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

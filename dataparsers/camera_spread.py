@@ -1,11 +1,11 @@
-"""Check for cameras at a single position, from which no distance can be estimated."""
+"""Check for cameras at a single position, which show no distances."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-SMALL = 0.01
+MIN_PARALLAX = 0.01
 """There is no parallax if cameras are closer to their centre than this fraction of the distance of points."""
 ROUNDING = 1e-10
 """Camera distances below this fraction of the largest coordinate are rounding: 0.5 mm at 5,000 km."""

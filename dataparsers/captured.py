@@ -21,9 +21,9 @@ from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.dataparsers.sparse_points import sparse_points
 from nerfloom.geometry.lenses import LENSES
 
-LARGEST_SIDE = 1600
+MAX_SIDE = 1600
 """Images with a longer side above this, pixels, are reduced by default."""
-EXTREME = 1e9
+MAX_MAGNITUDE = 1e9
 """Maximum of focal lengths, principal points (pixels) and boxes (scene units), beyond which float32 may overflow; focal
 lengths must also exceed its inverse."""
 ASPECT_TOLERANCE = 0.03
@@ -142,7 +142,7 @@ def _check_flags(flags: Captured) -> None:
 
 
 def _choose_files(images: PosedImages, factor: int | None) -> tuple[PosedImages, int]:
-    """Return the images with the files to read, and the factor by which to reduce them when loading."""
+    """Return the images with the files to read, and their reduction factor when loading."""
     folder, paths = images.folder, images.paths
     root = _shared_folder(folder, paths)
     steps = sorted({*REDUCED, factor or 1})
@@ -153,7 +153,7 @@ def _choose_files(images: PosedImages, factor: int | None) -> tuple[PosedImages,
         factor = available[0]
         files = [_reduced(path, root, factor) for path in paths]
         side = max(image_size([path for path in files if path.is_file()])) * factor
-        while side > LARGEST_SIDE * factor:
+        while side > MAX_SIDE * factor:
             factor *= 2
     fitting = [step for step in available if factor % step == 0]
     if not fitting:
@@ -218,7 +218,7 @@ def checked_box(box: Tensor, source: str) -> Tensor:
     Raises:
         DataError: if the box is empty or too large.
     """
-    if not bool((box.abs() < EXTREME).all()) or not bool((box[0] < box[1]).all()):
+    if not bool((box.abs() < MAX_MAGNITUDE).all()) or not bool((box[0] < box[1]).all()):
         raise DataError(f"{source} give a box that is empty or too large")
     return box
 
@@ -284,7 +284,7 @@ def _check_range(images: PosedImages, intrinsics: Tensor) -> None:
         images: the images.
         intrinsics: (M, 4) fx, fy, cx, cy in pixels of the image files.
     """
-    usable = (intrinsics[:, :2] > 1 / EXTREME).all(-1) & (intrinsics.abs() < EXTREME).all(-1)
+    usable = (intrinsics[:, :2] > 1 / MAX_MAGNITUDE).all(-1) & (intrinsics.abs() < MAX_MAGNITUDE).all(-1)
     if not bool(usable.all()):
         first = int(usable.int().argmin())
         values = ", ".join(f"{value:.3g}" for value in intrinsics[first].tolist())

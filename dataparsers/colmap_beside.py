@@ -1,4 +1,4 @@
-"""The COLMAP model from which a transforms.json beside it was made: it tells which images see which points."""
+"""The COLMAP model that a transforms.json beside it was made from: it tells which images see which points."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from nerfloom.dataparsers.colmap import tracks_of
 from nerfloom.dataparsers.colmap_lens import lenses_of
 from nerfloom.dataparsers.colmap_model import choose_model, find_models, read_model
 
-LARGEST_ANGLE = 0.2
+MAX_ANGLE = 0.2
 """Maximum angle between an image's rotations in the model and in the file, degrees: about two pixels of a phone's image
 at 800 pixels."""
-LARGEST_SHIFT = 0.002
+MAX_SHIFT = 0.002
 """Maximum distance between its positions, relative to the largest distance of a camera from the cameras' mean."""
-FEWEST_ALIKE = 0.5
+MIN_ALIKE = 0.5
 """Minimum fraction of common images with the same pose; with fewer, the file was not made from the model."""
 
 
@@ -63,7 +63,7 @@ def tracks_beside(
     ]
     ours, theirs = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).unbind(-1)
     alike = _same_poses(poses[ours].double(), _moved(model.poses[theirs], applied.double(), scale))
-    if int(alike.sum()) < max(FEWEST_ALIKE * len(pairs), 1):
+    if int(alike.sum()) < max(MIN_ALIKE * len(pairs), 1):
         say(
             f"{path}: only {int(alike.sum())} of {len(poses)} images have their pose from transforms.json, so it "
             "is another reconstruction; continuing without the distances of its points"
@@ -83,7 +83,7 @@ def names_in_model(file_path: str, source_path: object) -> list[str]:
 
     Args:
         file_path: the frame's image, such as 'images/a/1.jpg', where a model has 'a/1.jpg'.
-        source_path: the file from which the image was made; ignored if it is not text.
+        source_path: the file that the image was made from; ignored if it is not text.
     """
     parts = spelled(file_path).split("/")
     endings = ["/".join(parts[start:]) for start in range(len(parts))]
@@ -98,9 +98,9 @@ def _moved(poses: Tensor, applied: Tensor, scale: float) -> Tensor:
 
 
 def _same_poses(ours: Tensor, theirs: Tensor) -> Tensor:
-    """Return which of M poses agree within `LARGEST_ANGLE` and `LARGEST_SHIFT`, (M,) bool."""
+    """Return which of M poses agree within `MAX_ANGLE` and `MAX_SHIFT`, (M,) bool."""
     centers = ours[:, :3, 3]
     spread = (centers - centers.mean(0)).norm(dim=-1).max() if len(ours) else 0.0
     apart = (ours[:, :3, :3] - theirs[:, :3, :3]).flatten(1).norm(dim=-1) / 8**0.5  # the sine of half the angle
     turned = torch.rad2deg(2 * torch.asin(apart.clamp(max=1)))
-    return (turned <= LARGEST_ANGLE) & ((centers - theirs[:, :3, 3]).norm(dim=-1) <= LARGEST_SHIFT * spread)
+    return (turned <= MAX_ANGLE) & ((centers - theirs[:, :3, 3]).norm(dim=-1) <= MAX_SHIFT * spread)

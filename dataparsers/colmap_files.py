@@ -13,7 +13,7 @@ from pathlib import Path
 
 from nerfloom import DataError
 
-LONGEST_NAME = 4096
+MAX_NAME_LENGTH = 4096
 """Maximum length of an image's name, bytes; no system opens longer paths."""
 PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
 """Number of a camera model -> number of its parameters."""
@@ -52,7 +52,7 @@ def image_names(folder: Path) -> list[str]:
             offset = 8
             while len(names) < count:
                 start = offset + NAME
-                names.append(data[start : data.find(b"\0", start, start + LONGEST_NAME)].decode("utf-8", "replace"))
+                names.append(data[start : data.find(b"\0", start, start + MAX_NAME_LENGTH)].decode("utf-8", "replace"))
                 offset = _image(data, offset)
     except (OSError, ValueError, struct.error, OverflowError):  # DataError is a ValueError
         pass
@@ -60,7 +60,7 @@ def image_names(folder: Path) -> list[str]:
 
 
 def text_names(file: Path) -> dict[int, str]:
-    """Return image number -> name in a text model, including spaces, at which pycolmap cuts names off.
+    """Return image number -> name in a text model, including spaces, where pycolmap cuts names off.
 
     Args:
         file: images.txt, with two lines for each image: number, pose, camera and name; and the keypoints.
@@ -128,7 +128,7 @@ def _camera(data: mmap.mmap, offset: int) -> int:
 def _image(data: mmap.mmap, offset: int) -> int:
     """Return the end of an image: number u32, pose, camera u32, zero-terminated name, u64 keypoints of 24 bytes."""
     start = offset + NAME
-    end = data.find(b"\0", start, start + LONGEST_NAME)
+    end = data.find(b"\0", start, start + MAX_NAME_LENGTH)
     if end < 0:
         raise struct.error
     (keypoints,) = struct.unpack_from("<Q", data, end + 1)

@@ -24,12 +24,12 @@ from nerfloom.dataparsers.reading import file_name
 from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 
 LOCATIONS = ("sparse", "colmap/sparse", ".")
-"""Folders searched for reconstructions, at any depth up to `DEEPEST`; the data folder itself comes last."""
-DEEPEST = 4
+"""Folders searched for reconstructions, at any depth up to `MAX_DEPTH`; the data folder itself comes last."""
+MAX_DEPTH = 4
 """Maximum number of levels below these folders, such as sparse/0/models/1."""
 FILES = ("cameras", "images", "points3D")
 """Files of a reconstruction, without suffix."""
-LEAST_ERROR = 0.5
+MIN_ERROR = 0.5
 """Minimum reprojection error assumed for a point, pixels; also used if no error was computed."""
 
 
@@ -60,7 +60,7 @@ class SparseModel:
     points: Tensor
     """(K, 3) float64 sparse points, all that are finite."""
     errors: Tensor
-    """(K,) float64 mean reprojection error of each point, pixels, at least `LEAST_ERROR`."""
+    """(K,) float64 mean reprojection error of each point, pixels, at least `MIN_ERROR`."""
     lengths: Tensor
     """(K,) int64 length of each point's track, including sightings in images without a pose."""
     sightings: Tensor
@@ -76,7 +76,7 @@ def find_models(path: Path, locations: Sequence[str] = LOCATIONS) -> list[Path]:
     """
     models: list[Path] = []
     for location in locations:
-        levels = 0 if location == "." else DEEPEST
+        levels = 0 if location == "." else MAX_DEPTH
         models += [folder for folder in _folders(path / location, levels) if _is_model(folder)]
     return list(dict.fromkeys(models))
 
@@ -212,7 +212,7 @@ def _points(model: Any, numbers: Sequence[int]) -> tuple[Tensor, Tensor, Tensor,
         images = {rows[number] for number in (sighting.image_id for sighting in point.track.elements) if number in rows}
         sightings += [(image, len(positions)) for image in sorted(images)]
         positions.append(point.xyz)
-        errors.append(max(float(point.error), LEAST_ERROR))  # the error is -1 if it was not computed
+        errors.append(max(float(point.error), MIN_ERROR))  # the error is -1 if it was not computed
         lengths.append(point.track.length())
     points = torch.from_numpy(np.stack(positions)) if positions else torch.zeros(0, 3, dtype=torch.float64)
     seen = torch.tensor(sightings, dtype=torch.int64).view(-1, 2)

@@ -29,7 +29,7 @@ CAMERA_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     "ORTHOPHOTO": ("orthographic", ()),
 }
 """`camera_model` -> projection, and the file's name of each coefficient of `LENSES`; '' if it has none."""
-SMALLEST_ANGLE = 1e-6
+MIN_ANGLE = 1e-6
 """Minimum angle of view, radians; for smaller angles the focal length exceeds float32."""
 SAME_FOCAL = 0.01
 """Relative difference between a focal length and the one from an angle of view that counts as rounding."""
@@ -164,7 +164,7 @@ def _focal_of_angle(source: dict[str, Any], axis: str, length: int, label: str) 
     """Return the focal length in pixels for the angle of view along an axis of `length` pixels."""
     name = f"camera_angle_{axis}"
     angle = number(source[name], name, label, positive=True)
-    if not SMALLEST_ANGLE < angle < math.pi:
+    if not MIN_ANGLE < angle < math.pi:
         raise DataError(f"{label}: '{name}' is {angle}; it must be an angle between 0 and pi radians")
     return 0.5 * length / math.tan(0.5 * angle)
 

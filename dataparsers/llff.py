@@ -28,7 +28,7 @@ BOUNDS = f"the depth bounds of {POSES}"
 """Subject of error messages about the depth bounds."""
 NEAR_SHARE = 0.9
 """Near distance as a fraction of the smallest depth bound. The bound is a percentile of depths; a few are smaller."""
-FORWARD = 0.7
+MIN_FORWARD_COSINE = 0.7
 """Minimum cosine between a viewing direction and the mean direction in a forward-facing scene (45 degrees)."""
 
 
@@ -148,7 +148,7 @@ def faces_forward(poses: Tensor) -> bool:
     """Return whether the cameras with `poses` (M, 3, 4) all look in about the same direction."""
     back = poses[:, :, 2]
     mean = back.mean(0)
-    return bool(((back @ mean) >= FORWARD * mean.norm()).all()) and bool(mean.norm() > 0)
+    return bool(((back @ mean) >= MIN_FORWARD_COSINE * mean.norm()).all()) and bool(mean.norm() > 0)
 
 
 def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.base.console import say
 from nerfloom.base.errors import shown
 from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import nearest_on_disk, on_disk, spelled
@@ -26,7 +27,7 @@ from nerfloom.dataparsers.colmap_beside import names_in_model, tracks_beside
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import file_name, number, read_json, read_pose, read_times, rigid
+from nerfloom.dataparsers.reading import file_name, number, read_pose, read_times, rigid
 
 TRANSFORMS = "transforms.json"
 """File that identifies the format."""
@@ -61,7 +62,7 @@ class Nerfstudio(Captured):
         if not 0 < self.depth_unit_scale_factor < math.inf:
             raise DataError(f"--depth-unit-scale-factor is {self.depth_unit_scale_factor}; it must be above zero")
         file = path if path.suffix == ".json" else path / TRANSFORMS
-        content = read_json(file)
+        content = read_object(file)
         images = _posed_images(file, content, split)
         if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
             say("depths in EXR files are read as millimetres; use --depth-unit-scale-factor 1 if they are in metres")

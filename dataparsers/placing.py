@@ -11,7 +11,7 @@ from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement, enlargement, place
-from nerfloom.dataparsers.camera_spread import SMALL, camera_spread, warning
+from nerfloom.dataparsers.camera_spread import MIN_PARALLAX, camera_spread, warning
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.geometry.local_origin import local_origin, rounding
 
@@ -49,7 +49,7 @@ def _placement(flags: Captured, images: PosedImages, split: Split, applied: Appl
     # A device measures gravity, and its images are upright.
     orientation = "up" if flags.orientation_method == "auto" and flags.poses == "device" else flags.orientation_method
     spread = camera_spread(images.poses, images.points if images.tracks is None else images.tracks.points)
-    if spread is not None and spread < SMALL and split == "train" and images.model != "orthographic":
+    if spread is not None and spread < MIN_PARALLAX and split == "train" and images.model != "orthographic":
         say(warning(spread))
     scaled = flags.auto_scale_poses and spread != 0  # distances of cameras in one position are rounding errors
     placement = place(images.poses, orientation, flags.center_method, scaled)

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from nerfloom import DataError, ParsedScene
+from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import on_disk
@@ -15,7 +16,7 @@ from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.captured import captured_scene, has_transforms, image_sizes, sizes_of
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import number, read_json, rigid, side_or_none
+from nerfloom.dataparsers.reading import number, rigid, side_or_none
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and images in `keyframes`; those refined by Polycam come first."""
@@ -60,7 +61,7 @@ def _posed_images(folder: Path, cameras: str, images: str, split: Split) -> Pose
     paths = on_disk(folder, [f"{images}/{stem}" for stem in stems], quiet=split != "train")
     poses, intrinsics, stated = [], [], []
     for file in files:
-        content = read_json(file)
+        content = read_object(file)
         rows = [[number(content.get(f"t_{r}{c}"), f"t_{r}{c}", str(file)) for c in range(4)] for r in range(3)]
         poses.append(Z_UP.double() @ rigid(rows, str(file), str(file)))
         focal = [number(content.get(key), key, str(file), positive=True) for key in ("fx", "fy")]

@@ -18,7 +18,7 @@ class Captured(DataParser):
     """Flags of every format of posed images. Subclasses define `recognizes` and `parse`."""
 
     downscale_factor: int | None = None
-    """Integer factor by which images are reduced; images that are reduced already are read from folders such as
+    """Integer reduction factor of images; images that are reduced already are read from folders such as
     images_2. By default, the smallest power of two that reduces the longer side to at most 1600 pixels."""
     scale_factor: float = 1.0
     """Factor of camera positions, after automatic scaling."""
@@ -37,10 +37,10 @@ class Captured(DataParser):
     eval_interval: int = 8
     """Interval of held-out images, by sorted name, which are both val and test split; 0 holds out none."""
     near: float | None = None
-    """Distance from a camera at which the scene starts, scene units. If not given: half the distance of the nearest
+    """Distance from a camera where the scene starts, scene units. If not given: half the distance of the nearest
     visible sparse points, or 0.05 without sparse points."""
     far: float = 1000.0
-    """Distance from a camera at which the scene ends, scene units."""
+    """Distance from a camera where the scene ends, scene units."""
     poses: PoseSource = "photographs"
     """Source of the poses: exact, estimated from the images (photographs), or tracked by the device; methods may refine
     them accordingly."""
@@ -55,7 +55,7 @@ class PosedImages:
     paths: tuple[Path, ...]
     """M image files at full size; they may be missing if images reduced in advance exist."""
     names: tuple[str, ...]
-    """M names by which images are sorted and held out."""
+    """M names that sort the images and decide which are held out."""
     poses: Tensor
     """(M, 3 or 4, 4) camera-to-world, OpenGL axes, in the input's frame and units; checked with `check_pose`."""
     intrinsics: Tensor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -13,33 +12,13 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.errors import shown
-from nerfloom.cameras.cameras import LARGEST_SIDE, check_pose
+from nerfloom.cameras.cameras import MAX_SIDE, check_pose
 from nerfloom.dataparsers.rotations import nearest_rotation
 
-LONGEST_NAME = 250
+MAX_NAME_LENGTH = 250
 """Maximum length of a file's or folder's name, bytes; most systems allow 255."""
-LONGEST_PATH = 3000
+MAX_PATH_LENGTH = 3000
 """Maximum length of a path, bytes; most systems allow 4096."""
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Args:
-        file: the file.
-
-    Raises:
-        DataError: if the file is missing, is not JSON or does not hold an object.
-    """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"cannot read {file}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{file} must contain a JSON object: names and values in braces")
-    return content
 
 
 def read_pose(frame: Any, where: str, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -131,8 +110,8 @@ def side(value: Any, name: str, where: str) -> int:
         DataError: if the value is not a number, or not a possible size of an image.
     """
     length = number(value, name, where, positive=True)
-    if not 1 <= length <= LARGEST_SIDE:
-        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be from 1 to {LARGEST_SIDE} pixels")
+    if not 1 <= length <= MAX_SIDE:
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be from 1 to {MAX_SIDE} pixels")
     return round(length)
 
 
@@ -180,6 +159,6 @@ def _fits(path: Path) -> bool:
     """Return whether the path may be passed to the system, whether the file exists or not."""
     try:
         longest = max(len(os.fsencode(part)) for part in path.parts)
-        return longest <= LONGEST_NAME and len(os.fsencode(path)) <= LONGEST_PATH
+        return longest <= MAX_NAME_LENGTH and len(os.fsencode(path)) <= MAX_PATH_LENGTH
     except UnicodeEncodeError:  # a lone surrogate
         return False

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
+from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import existing_files
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.captured import captured_scene, has_transforms
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import numbers, read_json, side
+from nerfloom.dataparsers.reading import numbers, side
 from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 
 METADATA = "metadata.json"
@@ -45,7 +46,7 @@ class Record3D(Captured):
             raise DataError(f"--max-images is {self.max_images}; it must be an integer of at least 0")
         folder = _folder(path)
         file = folder / METADATA
-        content = read_json(file)
+        content = read_object(file)
         poses = _poses(content, file)
         paths = on_disk(folder, [f"rgb/{index}" for index in range(len(poses))], quiet=split != "train")
         keep = _evenly_spaced(existing_files(paths, split), self.max_images)

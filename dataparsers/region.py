@@ -13,15 +13,15 @@ from torch import Tensor
 
 from nerfloom import Cameras, DataError
 from nerfloom.base.evenly_spaced import evenly_spaced
-from nerfloom.cameras.poses import MOST_LOOK, NEAR, Placement, looked_at, place
+from nerfloom.cameras.poses import MIN_SHARE_LOOKING, NEAR, Placement, looked_at, place
 from nerfloom.data.image_files import may_be_transparent, read_image
 from nerfloom.scene.enclosing_box import enclosing_box, is_larger
 
 HALF_SIZE = 1.5
-"""Half the side of a scene's box, scene units: that of NeRF-Synthetic, for which methods' settings were tuned."""
+"""Half the side of a scene's box, scene units: that of NeRF-Synthetic, which methods' settings were tuned on."""
 SHOWN = 1.034
 """Half the side of NeRF-Synthetic's box, relative to half the width of the plane through the origin in its images."""
-MOST_IMAGES = 32
+MAX_IMAGES = 32
 """Maximum number of images whose silhouettes are used."""
 SLACK = 0.8
 """Rays start at this fraction of the smallest distance between a camera and the matter. They end at the largest such
@@ -42,9 +42,9 @@ class Region:
     half: float
     """Half the side of the cube."""
     near: float
-    """Distance from a camera at which the scene starts."""
+    """Distance from a camera where the scene starts."""
     far: float
-    """Distance from a camera at which the scene ends."""
+    """Distance from a camera where the scene ends."""
     unbounded: bool
     """Whether there may be visible content outside the cube."""
     reason: str
@@ -79,7 +79,7 @@ def find_region(
         moving: whether images show different times.
         cube: centre (3,) float64 and edge of instant-ngp's cube; None if the file has none.
     """
-    few = evenly_spaced(len(images), MOST_IMAGES)
+    few = evenly_spaced(len(images), MAX_IMAGES)
     opaque = _opaque([images[index] for index in few.tolist()])
     seen = _where_cameras_look(cameras, every=opaque is not None)
     ends, box, reason = False, None, LOOKED_AT
@@ -155,7 +155,7 @@ def _where_cameras_look(cameras: Cameras, every: bool) -> tuple[Tensor, float] |
         every: True for the largest size in any image, False for the median size.
 
     Returns:
-        Point and half the side of a cube; None if fewer than `MOST_LOOK` of the images show a common point.
+        Point and half the side of a cube; None if fewer than `MIN_SHARE_LOOKING` of the images show a common point.
     """
     point = None if cameras.model == "equirectangular" else looked_at(cameras.camera_to_worlds)
     if point is None:
@@ -163,7 +163,7 @@ def _where_cameras_look(cameras: Cameras, every: bool) -> tuple[Tensor, float] |
     where = torch.arange(len(cameras))
     columns, rows, ahead = cameras.project(point.to(cameras.fx).expand(len(cameras), 3), where)
     inside = (columns > -0.5) & (columns < cameras.widths - 0.5) & (rows > -0.5) & (rows < cameras.heights - 0.5)
-    if float((inside & ahead).double().mean()) < MOST_LOOK:
+    if float((inside & ahead).double().mean()) < MIN_SHARE_LOOKING:
         return None
     across = torch.maximum(cameras.cx, cameras.widths - cameras.cx) / cameras.fx
     down = torch.maximum(cameras.cy, cameras.heights - cameras.cy) / cameras.fy

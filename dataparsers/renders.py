@@ -12,13 +12,14 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.console import say
+from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import existing_files
 from nerfloom.data.image_files import image_size
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.posed_images import PosedImages
-from nerfloom.dataparsers.reading import file_name, read_json, read_pose, read_times
+from nerfloom.dataparsers.reading import file_name, read_pose, read_times
 
 OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
 """Entries that describe a lens beyond its angle of view."""
@@ -48,7 +49,7 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
         DataError: if the file is missing or invalid, or none of its images exists.
     """
     file = folder / f"transforms_{split}.json"
-    content = read_json(file)
+    content = read_object(file)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{file} lists no frames")

@@ -13,10 +13,10 @@ from torch import Tensor
 from nerfloom import DataError
 from nerfloom.kernels.math import cross_matrix
 
-LARGEST_ROUNDING = 0.02
+MAX_ROUNDING = 0.02
 """Maximum deviation of R R^T from the identity, and of a quaternion's length from 1, that counts as rounding: that of
 numbers with two decimals."""
-EXACT = 1e-12
+EXACT_TOLERANCE = 1e-12
 """A matrix with a smaller deviation is left unchanged."""
 
 
@@ -29,7 +29,7 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
         matrix: (3, 3) float64.
     """
     deviation = float((matrix @ matrix.T - torch.eye(3, dtype=matrix.dtype)).abs().max())
-    if not EXACT < deviation <= LARGEST_ROUNDING:  # NaN is unchanged too
+    if not EXACT_TOLERANCE < deviation <= MAX_ROUNDING:  # NaN is unchanged too
         return matrix
     left, _, right = torch.linalg.svd(matrix)
     return left @ right
@@ -47,7 +47,7 @@ def unit_quaternions(quaternions: Tensor, labels: Sequence[str]) -> Tensor:
     """
     norms = quaternions.norm(dim=-1)
     deviation = (norms - 1).abs().nan_to_num(torch.inf)
-    if bool((deviation > LARGEST_ROUNDING).any()):
+    if bool((deviation > MAX_ROUNDING).any()):
         index = int(deviation.argmax())
         raise DataError(f"{labels[index]} has a quaternion of length {norms[index]:.3g}; a rotation's is 1")
     return quaternions / norms[:, None]

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfloom.base.console import say
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.tracks import DOUBTS, LARGEST_DEVIATION, Sightings, Tracks
+from nerfloom.data.tracks import DOUBTS, MAX_DEVIATION, Sightings, Tracks
 from nerfloom.dataparsers.posed_images import PosedImages
 
 
@@ -38,7 +38,7 @@ def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, k
         images: M images.
         placement: placement of the scene.
         cameras: M cameras in the scene's frame.
-        known: the training images, from which alone a method may learn; None for all images, without a report.
+        known: the training images, if a method may learn from these alone; None for all images, without a report.
     """
     points, sound, sightings, notes = None, None, None, []
     if images.tracks is not None and len(images.tracks.points):
@@ -79,7 +79,7 @@ def _on_distances(tracks: Tracks, centers: Tensor, chosen: Tensor) -> str:
     distant[tracks.seen[tracks.known_distances(centers)]] = True
     doubts = tracks.doubts[chosen & ~distant]
     lacking = {doubt: int((doubts == number).sum()) for number, doubt in enumerate(DOUBTS) if number}
-    lacking[f"uncertain by more than {LARGEST_DEVIATION:.0%}"] = int((doubts == 0).sum())
+    lacking[f"uncertain by more than {MAX_DEVIATION:.0%}"] = int((doubts == 0).sum())
     return _note(int(distant.sum()), None, "at known distances", lacking)
 
 

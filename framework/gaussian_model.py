@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import ClassVar, Generic, Literal
 
 import torch
@@ -12,29 +11,25 @@ from torch import Tensor
 from nerfloom.base.device import HostValue
 from nerfloom.base.optimised import RowChange
 from nerfloom.base.pace import Pace
-from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.model import Model
-from nerfloom.rendering.outputs import NORMALS, Output
-from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.density_control import DensityControl
-from nerfloom.splats.drawing import DRAWN, draw_view, smallest_depth, splat_camera
+from nerfloom.splats.drawing import smallest_depth
+from nerfloom.splats.drawn import DrawsGaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
 from nerfloom.splats.mcmc import Mcmc, shaken
-from nerfloom.splats.rasteriser import RASTERISER, Projected, Rasteriser
-from nerfloom.splats.redrawn import Redrawn
+from nerfloom.splats.rasteriser import Projected
 from nerfloom.splats.resolution import ImageSizes, most_octaves
 from nerfloom.splats.settings import SplattingConfig, SplattingConfigT
 from nerfloom.splats.start import from_points, scene_size
 from nerfloom.splats.strategy import Strategy
 from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, usual_columns
 
-WITHOUT_IMAGES = 1_000
+MAX_NEW_GAUSSIANS = 1_000
 """Maximum number of Gaussians in a new model."""
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
@@ -43,7 +38,7 @@ STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
 """Strategies by their name in the setting `strategy`."""
 
 
-class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
+class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingConfigT]):
     """A model of Gaussians that are drawn onto whole images.
 
     A method implements `start` and `loss`. It may override the colours of images (`lit`), their cameras (`camera`), the
@@ -52,9 +47,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"
-    cameras: ClassVar[tuple[str, ...] | None] = DRAWN
-    rasteriser: ClassVar[Rasteriser] = RASTERISER
-    """The rasteriser."""
+    resizes: ClassVar[bool] = True
     extent: Tensor
     """Size () of the scene, scene units. Centres are stored relative to it, so that their learning rate suits any
     scene."""
@@ -68,12 +61,11 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         self.register_buffer("extent", torch.tensor(scene_size(scene)))
         self.strategy, self.capacity = self.make_strategy(), Capacity()
         self.near = smallest_depth(scene)
-        self._redrawn: Redrawn | None = None
         self._extent = HostValue()
         most = most_octaves(scene.image_pixels or scene.image_size**2)
         self.sizes = ImageSizes(config.reduced_until, most, config.paced)
         self.steps_per_move, self._first = config.steps_per_move, 0
-        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, WITHOUT_IMAGES), 3))
+        anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, MAX_NEW_GAUSSIANS), 3))
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
     @property
@@ -120,15 +112,9 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         return self.at_time(self.at_rest(), time)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
-        """Return the Gaussians at a time, without gradient.
-
-        Args:
-            time: in [0, 1]; None for a still scene.
-        """
         return self.learnt_gaussians(time).map(Tensor.detach)
 
     def look(self) -> Look:
-        """Return the settings of drawing."""
         return self.config.look()
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
@@ -139,7 +125,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
         """
         for name, rows in as_rows(self.columns, gaussians, self.extent).items():
             self.columns[name].values.data = rows.contiguous()
-        self._redrawn = None
+        self._prepared = None
 
     # -- training ---------------------------------------------------------------------------------------------
 
@@ -160,7 +146,7 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
             self.steps_per_move = steps_per_move(pace.step + steps, self._first, config.num_gaussians, per_doubling)
 
     def before_step(self, step: int, progress: float) -> None:
-        self._redrawn = None
+        self._prepared = None
 
     def on_image(self, gaussians: Gaussians, camera: SplatCamera, degree: int) -> Projected:
         """Project Gaussians to a training image and show them to the strategy.
@@ -203,46 +189,3 @@ class GaussianModel(Model[SplattingConfigT], Generic[SplattingConfigT]):
 
     def read_counts(self) -> None:
         self.capacity.read()
-
-    # -- pictures ---------------------------------------------------------------------------------------------
-
-    def lit(self, rgb: Tensor, index: int | None) -> Tensor:
-        """Return colours (..., 3) with the appearance of an image; unchanged by default.
-
-        Args:
-            rgb: (..., 3) drawn colours.
-            index: number of a training image; None for the current appearance.
-        """
-        return rgb
-
-    def camera(self, camera: Cameras) -> SplatCamera:
-        """Return the camera of a view outside of training; by default with its own pose.
-
-        Args:
-            camera: one camera.
-        """
-        return splat_camera(camera, self.near, self.look())
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Return the normals, the shortest axes of Gaussians (`Picture.extras`)."""
-        return (NORMALS,)
-
-    def render_view(self, view: View, background: Tensor) -> Picture:
-        return self.render_gaussians(self.gaussians(view.time), view, background)
-
-    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
-        """Render the given Gaussians, such as a part of the model's.
-
-        Args:
-            gaussians: Gaussians in the frame of the scene, at the time of the view.
-            view, background: as in `render_view`.
-        """
-        camera = self.camera(view.camera)
-        picture = draw_view(gaussians, camera, view.stride, background, self.scene.far, self.rasteriser)
-        return replace(picture, rgb=self.lit(picture.rgb, None))
-
-    def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        if self._redrawn is None or self._redrawn.time != view.time:
-            self._redrawn = Redrawn(self.gaussians(view.time), self.rasteriser, view.time)
-        return self.lit(self._redrawn.colors(self.camera(view.camera), view.stride, background), None)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.decisions import Choice, Decision, fill, left_open
 from nerfloom.base.errors import ConfigError, is_out_of_memory
 from nerfloom.data.scene import Scene
@@ -17,9 +17,10 @@ from nerfloom.renderable import RendersFromImages
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import volume_renderer
 from nerfloom.samplers.base import Sampler
-from nerfloom.samplers.choice import SamplingConfig, sampler_choice
-from nerfloom.scene.reasons import DEPTH_REASONS, SPARSE_DEPTH_REASON
+from nerfloom.samplers.choice import sampler_choice
 
+DEPTH_REASONS = {True: "there are depth images", False: "there are no depth images"}
+"""Reason for or against a depth loss, by whether there are depth images."""
 DEPTH = 0.1
 """Default weight of the depth loss with depth images."""
 SPARSE_DEPTH = 0.001
@@ -33,7 +34,6 @@ def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
 
     Args:
         config: the method's settings.
-        scene: properties of the scene.
     """
     return config, []
 
@@ -42,7 +42,8 @@ def depth_choice(scene: Scene) -> Choice:
     """Return the weight of the depth loss that suits the scene."""
     points = scene.num_sparse_depths > 0 and not scene.has_depth
     weight = SPARSE_DEPTH if points else DEPTH if scene.has_depth else 0.0
-    reason = SPARSE_DEPTH_REASON.format(scene.num_sparse_depths) if points else DEPTH_REASONS[scene.has_depth]
+    seen = f"the reconstruction's points are seen in {scene.num_sparse_depths:,} pixels"
+    reason = seen if points else DEPTH_REASONS[scene.has_depth]
     return Choice("depth_loss_mult", weight, reason, "depth loss")
 
 
@@ -75,11 +76,10 @@ class Method:
     """Registered name, from the entry point; set when the method is loaded."""
 
     def decided(self, config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
-        """Return the settings with all open ones decided, first by the method, then by rules for all ray methods.
+        """Return the settings with all open ones decided, first by the method, then by rules for all methods.
 
         Args:
             config: the method's settings.
-            scene: properties of the scene.
 
         Returns:
             The settings and the decisions.
@@ -88,17 +88,15 @@ class Method:
             ConfigError: if a setting is still open.
         """
         config, made = self.decide(config, scene)
-        if isinstance(config, RayConfig):
-            config, more = fill(config, depth_choice(scene))
-            config, _ = fill(
-                config,
-                Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""),
-                Choice("samples_per_batch", None, "steps have a number of rays"),
-            )
-            made = made + more * bool(config.depth_loss_mult)  # do not report a weight of 0
-        if isinstance(config, SamplingConfig):
-            config, more = fill(config, sampler_choice(config, scene.unbounded))
-            made = made + more
+        undecided = left_open(config)
+        for rule in (
+            depth_choice(scene),
+            Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""),
+            Choice("samples_per_batch", None, "steps have a number of rays"),
+            sampler_choice(config, scene.unbounded),
+        ):
+            config, more = fill(config, *[rule] * (rule.setting in undecided))
+            made = made + more * bool(rule.value and rule.reason)  # do not report a weight of 0
         for name in left_open(config):
             flag, value = name.replace("_", "-"), getattr(config, name)
             raise ConfigError(f"--{flag} is {value}, and this method does not decide it; give a value")
@@ -109,7 +107,6 @@ class Method:
 
         Args:
             config: the settings; open ones are decided first.
-            scene: properties of the scene.
 
         Raises:
             ConfigError: if the settings do not fit the scene or each other, if the model does not fit into memory, or

@@ -48,7 +48,11 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
     """
 
     batches: ClassVar[Literal["pixels", "views"]]
-    """Kind of training batch: pixels of all images (`PixelBatch`), or one whole image (`ViewBatch`)."""
+    """Kind of training batch: pixels of all images (`PixelBatch`; its settings are of `RayConfig`), or one whole image
+    (`ViewBatch`)."""
+
+    resizes: ClassVar[bool] = False
+    """Whether `after_step` may change the rows of parameters."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()
@@ -94,13 +98,13 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
         """
 
     def changes_rows(self, step: int, progress: float) -> bool:
-        """Return whether `after_step` may change rows; the trainer then waits to know whether the step was finite.
+        """Return whether `after_step` may change rows now; the trainer then waits to know whether the step was finite.
 
         Args:
             step: number of training steps done before this one.
             progress: fraction of the training budget that is spent.
         """
-        return type(self).after_step is not Model.after_step
+        return self.resizes
 
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         """Return rows of parameters to add, drop or reorder; called after a training step if `changes_rows` is True.

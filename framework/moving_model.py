@@ -9,7 +9,7 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.data.pixels.batch import PixelBatch, thinned
 from nerfloom.model import LearnsMotion, Loss
 from nerfloom.ray_model import RayModel
-from nerfloom.scene.motion import MotionConfig
+from nerfloom.samplers.motion import MotionConfig
 
 MotionConfigT = TypeVar("MotionConfigT", bound=MotionConfig)
 

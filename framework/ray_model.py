@@ -16,7 +16,7 @@ from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.view import View
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
-from nerfloom.encodings.opening import Opening
+from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
@@ -32,7 +32,7 @@ from nerfloom.rendering.traced import error_of_traced, traced_rays
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.base import Sampler, SkipsCells
 from nerfloom.samplers.in_view import pixels_in_view
-from nerfloom.scene.shared_space import SharedSpace
+from nerfloom.scene.covisible_space import CovisibleSpace
 
 RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 
@@ -60,7 +60,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         self.poses: PoseRefinement | None = None
         """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
-        self.shared_space = SharedSpace(scene.box) if starts else None
+        self.covisible_space = CovisibleSpace(scene.box) if starts else None
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         """Render R rays.
@@ -70,7 +70,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
         rays = rays if self.poses is None else self.poses(rays)
-        rays = rays if self.shared_space is None else self.shared_space(rays)
+        rays = rays if self.covisible_space is None else self.covisible_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
         return self.renderer.render(rays, samples, self.field, background)
 
@@ -149,7 +149,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             The rendered values of R rays.
         """
         known = None
-        if self._renders_plainly and self.shared_space is None:
+        if self._renders_plainly and self.covisible_space is None:
             known = traced_rays(rays, background, self.sampler, self.field, self.renderer)
         return self.render(rays, background) if known is None else known
 
@@ -168,7 +168,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         for term in self.losses:
             if (reason := term.varies(self.config)) is not None:
                 return StepKind(varies=reason)
-        if not all(opening.complete for opening in parts(self, Opening)):
+        if not all(opening.complete for opening in parts(self, OpenLevels)):
             return StepKind(varies="levels are still opening")
         return self.sampler.step_kind(step)
 
@@ -177,7 +177,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
 
     def before_step(self, step: int, progress: float) -> None:
         """Open levels of encodings up to `progress`, and update the sampler for `step`."""
-        for opening in parts(self, Opening):
+        for opening in parts(self, OpenLevels):
             opening.advance(progress)
         self.sampler.update(step, self.field.density)
 

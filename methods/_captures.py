@@ -18,9 +18,8 @@ from nerfloom import (
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.optimised import Optimised
-from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.cameras.refinement import POSE_REASONS, PoseRefinement
 from nerfloom.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
-from nerfloom.scene.reasons import MARCHED_REASON, POSE_REASONS
 
 DISTORTION = 2e-3
 """Default weight of the distortion loss in unbounded scenes."""
@@ -29,6 +28,8 @@ PAPER_SAMPLES = 64, 64
 POSE_WARMUP = 512
 """Steps over which the learning rate of poses rises. Before there is a scene, their gradients are noise, and Adam would
 move each camera by about the rate times the square root of the number of steps: half a degree in 100 steps."""
+MARCHED_REASON = "marched samples carry no gradient to rays"
+"""Reason for not refining inexact poses."""
 MARCHED_SAMPLES = 2**16
 """Samples per training step with an occupancy grid, about as many as 2,048 rays have with proposals."""
 
@@ -69,7 +70,6 @@ def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
     """Return the sampler from `sampler_choice`, or proposals if pose refinement is selected.
 
     Args:
-        config: the method's settings.
         contracted: whether the field covers space outside the box.
     """
     choice = sampler_choice(config, contracted)
@@ -83,7 +83,6 @@ def refinement_choice(config: RefinedConfig, scene: Scene) -> Choice:
 
     Args:
         config: the method's settings; the sampler is chosen.
-        scene: properties of the data.
     """
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
     reason = POSE_REASONS[scene.poses]
@@ -99,7 +98,6 @@ def decide_capture(
 
     Args:
         config: the method's settings; open ones are filled in.
-        scene: properties of the data.
         own: the method's own choices.
         proposals: intervals of each proposal without a time limit.
 
@@ -138,9 +136,7 @@ class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
             if scene.warped:
                 raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
             if config.sampler != "proposal":
-                raise ConfigError(
-                    "--camera-optimizer needs --sampler proposal: marched samples carry no gradient to rays"
-                )
+                raise ConfigError(f"--camera-optimizer needs --sampler proposal: {MARCHED_REASON}")
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised(
                 "poses", config.camera_learning_rate, schedule="exponential", warmup_steps=POSE_WARMUP

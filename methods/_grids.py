@@ -26,7 +26,6 @@ def grid_optimiser(config: GridsConfig, name: str = "grids") -> Optimised:
     """Return the optimiser settings of hash grids and their networks.
 
     Args:
-        config: the method's settings, decided.
         name: name of the parameter group.
     """
     return Optimised(name, config.grid_learning_rate, betas=(0.9, 0.99), eps=1e-15, schedule="hold-exponential")

@@ -23,7 +23,7 @@ from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 from nerfloom.moving_model import MovingModel
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
-from nerfloom.scene.motion import MotionConfig, slices_choice
+from nerfloom.samplers.motion import MotionConfig, slices_choice
 
 NUM_STEPS, HASH_NUM_STEPS = 192, 384
 """Steps along the diagonal of the box: with networks, and with a hash grid."""

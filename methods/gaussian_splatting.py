@@ -18,16 +18,16 @@ from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue
-from nerfloom.cameras.refinement import PoseRefinement
+from nerfloom.cameras.refinement import POSE_REASONS, PoseRefinement
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.surfaces import found_surfaces
-from nerfloom.fields.appearance import AFFINE, Appearance, affine_colors
+from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, affine_colors
 from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.losses.functions import mean_depth_error
+from nerfloom.method import DEPTH_REASONS
 from nerfloom.registry import load_method
-from nerfloom.scene.reasons import DEPTH_REASONS, LIGHT_REASONS, POSE_REASONS
 from nerfloom.splats.drawing import splat_camera
 from nerfloom.splats.guide import GUIDE, FoundDistances
 from nerfloom.splats.learning import open_degree
@@ -78,7 +78,7 @@ def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplat
     """Fill in the settings that depend on the budget and the scene.
 
     Args:
-        config: settings, some of which may be open.
+        config: settings; some may be open.
         scene: facts about the data.
     """
     config, made = decide_splatting(config, scene)
@@ -97,7 +97,6 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
     """A model of Gaussians drawn as whole images.
 
     Args:
-        config: the settings, decided.
         scene: facts about the data.
     """
 
@@ -204,7 +203,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
 
     def camera(self, camera: Cameras) -> SplatCamera:
         """Return the camera of a view outside of training, corrected like the training cameras near it."""
-        pose = None if self.poses is None else self.poses.carried_pose(camera.camera_to_worlds[0])
+        pose = None if self.poses is None else self.poses.propagated_pose(camera.camera_to_worlds[0])
         return splat_camera(camera, self.near, self.look(), pose)
 
     def refined_cameras(self, cameras: Cameras) -> Cameras:

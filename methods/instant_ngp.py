@@ -30,9 +30,9 @@ FITTED_SECONDS, FITTED_PIXELS = 150.0, 400
 """Reference for `plan`: seconds of training on two CPU threads, and pixels of the images' longer side. Its settings
 come from trials on Lego, 400 x 400, after 15, 45, 150 and 300 s."""
 TABLE_SECONDS, STEPS_SECONDS, LARGE_STEP_SECONDS = 60.0, 110.0, 300.0
-"""Seconds at which tables have 2^17 entries, after which steps along rays shorten, and at which a training step has
-2^16 samples. On Lego, 2^17 entries were 0.30 and 0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
-LEAST_SAMPLES, MOST_SAMPLES = 24 * 2**10, 2**16
+"""Training times, in seconds: tables have 2^17 entries, steps along rays start to shorten, and a training step has 2^16
+samples. On Lego, 2^17 entries were 0.30 and 0.35 dB better than 2^16 after 45 s (docs/notes/learning.md)."""
+MIN_SAMPLES, MAX_SAMPLES = 24 * 2**10, 2**16
 """Samples per step in the shortest and in the longest time."""
 HASTE_SECONDS, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS = 15.0, 45.0, 150.0
 """Runs up to the first number of seconds use the fastest settings, and runs beyond the second the usual ones. Training
@@ -42,8 +42,8 @@ THIN = 0.5
 """Samples below this fraction of the mean gradient are thinned. On Lego, two seeds gave 28.34 and 28.52 dB after 800
 steps without thinning, and 28.36 and 28.48 dB with it, in 0.78 of the processor time."""
 
-SPARSE_FROM = 17
-"""log2 of the table size from which on updates are sparse. On Lego, three runs of 45 s with 2^16 entries were 0.06,
+MIN_SPARSE_TABLE = 17
+"""Minimum log2 of the table size for sparse updates. On Lego, three runs of 45 s with 2^16 entries were 0.06,
 0.23 and 0.25 dB better with dense updates, which move rarely used entries further. After 300 s with 2^18 entries,
 sparse updates were 0.21 dB better."""
 
@@ -136,7 +136,7 @@ def plan(seconds: float, image_size: int, speed: float = 1.0) -> Plan:
     return Plan(
         log2_table_size=17 + round(math.log2(entries)),
         num_steps=32 * round(16 * longer - 4 * haste),
-        samples=1024 * round(min(max(share, LEAST_SAMPLES / MOST_SAMPLES), 1.0) * MOST_SAMPLES / 1024),
+        samples=1024 * round(min(max(share, MIN_SAMPLES / MAX_SAMPLES), 1.0) * MAX_SAMPLES / 1024),
         detail=round(min(max(2 * time / size, 1.0), 2.0)),
         learning_rate=round(0.01 * 2**haste, 4),
         several_rays_from=round(0.9 - 0.15 * way_between(seconds * speed, NO_HASTE_SECONDS, LATE_UNTIL_SECONDS), 3),
@@ -184,7 +184,7 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
     )
     config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution below
     finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
-    pays = config.log2_table_size >= SPARSE_FROM
+    pays = config.log2_table_size >= MIN_SPARSE_TABLE
     config, more = fill(
         config,
         Choice(
@@ -217,7 +217,6 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
     """Return a field of the same size for the outside of the sphere.
 
     Args:
-        config: the method's settings, decided.
         scene: properties of the data; not used.
     """
     grid = HashGrid.of(config, config.open_levels_until)

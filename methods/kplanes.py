@@ -27,9 +27,9 @@ from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss, TransparentOpacity
 from nerfloom.moving_model import MovingModel
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
-from nerfloom.scene.motion import MotionConfig, slices_choice, vertices_in_time
+from nerfloom.samplers.motion import MotionConfig, slices_choice, vertices_in_time
 
-FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL = 2**14, 2**15, 75.0
+MIN_SAMPLES, MAX_SAMPLES, MIN_SAMPLES_SECONDS = 2**14, 2**15, 75.0
 """Samples per training step of a static scene, for short and long times, and the seconds after which they grow. On Lego
 2^14 and 2^15 samples gave 28.58 and 27.84 dB after 45 s, 32.70 and 33.18 dB after 150 s."""
 MOVING_SAMPLES, MOVING_SAMPLES_OF_A_GPU = 2**13, 2**16
@@ -186,7 +186,7 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
         Choice("num_scales", scales, f"the images have {scene.image_size} pixels", "scales"),
     )
     config, few = decide_few_images(config, scene)
-    samples = batch_choice(config, FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL)
+    samples = batch_choice(config, MIN_SAMPLES, MAX_SAMPLES, MIN_SAMPLES_SECONDS)
     if scene.moving:
         count = MOVING_SAMPLES if devices.device_kind(config.machine) == "cpu" else MOVING_SAMPLES_OF_A_GPU
         samples = Choice("samples_per_batch", count, "the scene moves", "samples a step")

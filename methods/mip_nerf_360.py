@@ -46,8 +46,8 @@ from nerfloom.samplers.proposal import LEARN_EVERY, half_edge
 
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""
-NETWORKS_FROM = 3600.0
-"""Training time on a GPU, in seconds, from which on the default is the paper's networks. After 45 s on a data-centre
+MIN_NETWORK_SECONDS = 3600.0
+"""Minimum training time on a GPU for the paper's networks as the default, seconds. After 45 s on a data-centre
 GPU they reached 20.2 dB on a can, and hash grids 34.8 dB; longer runs were not measured."""
 PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 """Levels of the proposals' hash grids, cells per axis of the first level, and log2 of the entries per level."""
@@ -129,7 +129,7 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
     encoding, reason = "integrated", "a GPU runs the paper's networks"
     if device_kind(config.machine) == "cpu":
         encoding, reason = "hash-grid", "the paper's networks take days on a processor (else: --encoding integrated)"
-    elif config.max_seconds is not None and config.max_seconds < NETWORKS_FROM:
+    elif config.max_seconds is not None and config.max_seconds < MIN_NETWORK_SECONDS:
         encoding, reason = "hash-grid", "the paper's networks take hours on a GPU (else: --encoding integrated)"
     around = "there may be something outside the box" if scene.unbounded else "the scene ends at its box"
     config, made = fill(config, refined_sampler_choice(config, scene.unbounded))

@@ -29,7 +29,7 @@ from nerfloom import (
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.fields.appearance import Appearance
+from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
 from nerfloom.kernels.compositing.density import ray_sum
@@ -40,11 +40,10 @@ from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, RefinedMo
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
 from nerfloom.samplers.choice import batch_choice, make_sampler
-from nerfloom.scene.reasons import LIGHT_REASONS
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
-FEWEST_SAMPLES, FEWEST_UNTIL = 2**15, 150.0
+MIN_SAMPLES, MIN_SAMPLES_SECONDS = 2**15, 150.0
 """Minimum samples per training step with an occupancy grid over a box, used up to this many seconds on two threads."""
 THIN = 0.5
 """Samples are thinned below this fraction of the mean gradient: 1.1 times the steps, with the same PSNR in 45 s."""
@@ -90,7 +89,7 @@ class NormalRenderer(VolumeRenderer):
 
     Args:
         normals: the network that predicts normals.
-        unit_length: distance from the camera up to which gradients are scaled, scene units; None for no scaling.
+        unit_length: gradients are scaled within this distance from the camera, scene units; None for no scaling.
         thin: samples are thinned below this fraction of the mean gradient; 0 for none.
     """
 
@@ -158,7 +157,7 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
     config, made = decide_capture(config, scene, appearance)
     if config.sampler == "occupancy" and not config.contraction:
-        config, samples = fill(config, batch_choice(config, FEWEST_SAMPLES, MARCHED_SAMPLES, FEWEST_UNTIL))
+        config, samples = fill(config, batch_choice(config, MIN_SAMPLES, MARCHED_SAMPLES, MIN_SAMPLES_SECONDS))
         reason = "most samples of an occupancy grid have small gradients"
         config, thinned = fill(config, Choice("thin_gradients", THIN, reason, "gradients thinned, of the mean"))
         made += samples + thinned

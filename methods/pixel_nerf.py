@@ -39,7 +39,7 @@ from nerfloom.data.training_images import evenly_spread
 from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
 from nerfloom.fields.pixel_aligned import PixelAlignedField
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
-from nerfloom.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
+from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
 from nerfloom.samplers.proposal import half_edge
 
 BLOCKS_AFTER = 2
@@ -58,7 +58,7 @@ class PixelNeRFConfig(
     """Settings of pixel-nerf: the paper's structure, with networks that a processor can train."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_coarse_samples": (LEAST_COARSE, 2**14),
+        "num_coarse_samples": (MIN_COARSE, 2**14),
         "num_fine_samples": (1, 2**14),
         "hidden_width": (2, 2**14),
         "num_view_blocks": (1, 64),
@@ -84,8 +84,6 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
     """A model of many scenes: the encoder takes images of a scene, and the field looks up their features.
 
     Args:
-        config: the method's settings, decided.
-        scene: properties of the data.
         field: the conditioned network.
         sampler: chooses the positions along each ray.
         renderer: turns samples into colours and depths.

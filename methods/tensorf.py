@@ -34,7 +34,7 @@ FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
 """Vertices per axis of the first and the last grid, for a cubic box (section 5)."""
 VERTICES_PER_PIXEL = 2
 """Maximum number of vertices per axis, per pixel of the images' longer side; the images do not resolve more."""
-FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL = 2**13, 2**15, 150.0
+MIN_SAMPLES, MAX_SAMPLES, MIN_SAMPLES_SECONDS = 2**13, 2**15, 150.0
 """Samples per training step for short and long times, and the seconds after which they grow. On Lego 2^13 and 2^14
 samples gave 32.18 and 31.91 dB after 150 s."""
 MARGIN = 1
@@ -79,7 +79,7 @@ class TensoRFConfig(
     last_voxels: Auto[int] = AUTO
     """Vertices of the last grid. auto: 300^3 (vm) or 500^3 (cp), or fewer if the images do not resolve as many."""
     upsample_at: tuple[float, ...] = (0.07, 0.1, 0.13, 0.18, 0.23)
-    """Fractions of the budget at which the grid grows, by equal ratios, and the box shrinks to occupied space."""
+    """Fractions of the budget when the grid grows, by equal ratios, and the box shrinks to occupied space."""
     sparsity: float = 8e-5
     """Weight of the mean absolute values of the density factors; halved after the first growth."""
     total_variation: float = 0.0
@@ -119,8 +119,6 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
 
     Args:
-        config: the method's settings, decided.
-        scene: properties of the data.
         field: the `TensorField`.
         sampler: chooses the samples along rays.
         renderer: turns samples into colours and depths.
@@ -205,7 +203,7 @@ def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Dec
     config, sampling = fill(config, sampler_choice(config, scene.unbounded))
     config, made = fill(
         config,
-        batch_choice(config, FEWEST_SAMPLES, MOST_SAMPLES, FEWEST_UNTIL),
+        batch_choice(config, MIN_SAMPLES, MAX_SAMPLES, MIN_SAMPLES_SECONDS),
         Choice("density_components", density, decomposed),
         Choice("appearance_components", appearance, decomposed),
         Choice("first_voxels", first**3, pixels, shown=f"{first}^3"),

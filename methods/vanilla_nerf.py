@@ -34,7 +34,7 @@ marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 51
 dB."""
 
 OPEN_UNTIL = 0.5
-"""Fraction of the budget in which frequencies open with few images, as in FreeNeRF's shorter Blender settings."""
+"""Fraction of the budget for opening frequencies with few images, as in FreeNeRF's shorter Blender settings."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,6 @@ def make_background(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
     """Return the network for the outside of the sphere, at points of the inverted sphere.
 
     Args:
-        config: the method's settings, decided.
         scene: properties of the data; not used.
     """
     return _network(config, dims=4)

@@ -25,7 +25,7 @@ from nerfloom.base.decisions import Choice, is_open
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.multisampled import MultisampledHashGrid
-from nerfloom.fields.appearance import AFFINE, Appearance, exposed
+from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, exposed
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
 from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
@@ -33,7 +33,6 @@ from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, Samp
 from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import ProposalSampler
-from nerfloom.scene.reasons import LIGHT_REASONS
 
 SAMPLES_PER_BATCH = 2**14
 """Samples per training step with an occupancy grid over a box."""

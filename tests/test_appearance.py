@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerfloom.data.image_files import read_image
-from nerfloom.data.light import APPEARANCE_STOPS, GRID, light_of, light_spread
+from nerfloom.data.light_spread import APPEARANCE_STOPS, MAX_PIXELS, light_of, light_spread
 
 
 def scene(seed: int, shape: tuple[int, int] = (90, 120)) -> np.ndarray:
@@ -71,7 +71,7 @@ def test_it_looks_at_opaque_and_kept_pixels_only() -> None:
 def test_it_looks_at_few_pixels() -> None:
     image = stored(scene(0, (1000, 1300)))
     other = np.zeros_like(image)
-    step = int(np.ceil((1000 * 1300 / GRID) ** 0.5))
+    step = int(np.ceil((1000 * 1300 / MAX_PIXELS) ** 0.5))
     other[step // 2 :: step, step // 2 :: step] = image[step // 2 :: step, step // 2 :: step]
     assert np.array_equal(light_of(image), light_of(other))
 

@@ -5,7 +5,7 @@ import torch
 
 from nerfloom.base.device import choose_device, has_bfloat16, peak_memory, stream_seed
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.machine_config import MOST_THREADS, MachineConfig
+from nerfloom.base.machine_config import MAX_THREADS, MachineConfig
 
 
 def test_every_step_has_a_stream_of_its_own() -> None:
@@ -31,7 +31,7 @@ def test_threads_are_set_and_checked() -> None:
         assert torch.get_num_threads() == 1
     finally:
         torch.set_num_threads(before)
-    for number in (0, MOST_THREADS + 1):
+    for number in (0, MAX_THREADS + 1):
         with pytest.raises(ConfigError, match=rf"--machine\.num-threads is {number}; it must be from 1 to "):
             choose_device(MachineConfig(num_threads=number))
     assert torch.get_num_threads() == before

@@ -5,7 +5,7 @@ import pickle
 import pytest
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import LONGEST_MESSAGE, DataError, printable, shown
+from nerfloom.base.errors import MAX_MESSAGE_LENGTH, DataError, printable, shown
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_names_of_files_can_neither_break_the_line_nor_command_the_terminal(
 
 
 def test_a_message_is_never_longer_than_a_screen() -> None:
-    assert len(str(DataError("a" * 10**6))) == LONGEST_MESSAGE + 3
+    assert len(str(DataError("a" * 10**6))) == MAX_MESSAGE_LENGTH + 3
 
 
 def test_errors_pass_between_processes() -> None:

@@ -10,8 +10,8 @@ import torch
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.losses.few_images import (
-    FEW,
-    FEW_WITH_ALPHA,
+    MAX_FEW,
+    MAX_FEW_WITH_ALPHA,
     UNSEEN_START,
     UNSEEN_STEPS,
     FewImagesConfig,
@@ -41,12 +41,12 @@ def parts(config: FewImagesConfig) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_few_images_of_a_capture_are_recognised(method: str) -> None:
-    few, said = decided(method, FEW)
+    few, said = decided(method, MAX_FEW)
     assert few.few_images
     assert any(parts(few))
-    assert f"regularisers for few images: on, as there are {FEW} training images" in said
+    assert f"regularisers for few images: on, as there are {MAX_FEW} training images" in said
     assert "(else: --few-images False)" in said
-    many, said = decided(method, FEW + 1)
+    many, said = decided(method, MAX_FEW + 1)
     assert not many.few_images
     assert parts(many) == (0, 0, 0)
     assert not re.search("few images|unseen|occlusion|levels", said)
@@ -69,7 +69,7 @@ def test_each_part_has_a_flag() -> None:
 
 def test_alpha_shows_what_is_empty_so_that_fewer_images_are_few() -> None:
     """And grids, which open no levels, then have nothing to switch on."""
-    for count, few in ((FEW_WITH_ALPHA, True), (FEW_WITH_ALPHA + 1, False)):
+    for count, few in ((MAX_FEW_WITH_ALPHA, True), (MAX_FEW_WITH_ALPHA + 1, False)):
         config, _ = decided("vanilla-nerf", count, dataclasses.replace(SCENE, has_alpha=True))
         assert config.few_images == few
         assert parts(config) == (0.5 * few, 0, 0)

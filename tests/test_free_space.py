@@ -9,12 +9,12 @@ import torch
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import load_dataset
-from nerfloom.data.free_space import ALONE, CLEAR_SHARE, STEPS, before_points, clear_distances, distances_alone
+from nerfloom.data.free_space import CLEAR_SHARE, MAX_SEEN_SHARE, STEPS, before_points, clear_distances, distances_alone
 from nerfloom.data.sources import PixelSource, Request, make_source
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import weights_and_transmittance
-from nerfloom.losses.functions import WRONG, matter_before
+from nerfloom.losses.functions import WRONG_SHARE, matter_before
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run
 
@@ -32,7 +32,7 @@ def test_two_cameras_side_by_side_see_together_from_a_distance() -> None:
     gap, near, far = 0.6, 0.05, 2.0
     found = distances_alone(row(0.0, gap), near, far)
     assert torch.equal(found[0], found[1])
-    expected = gap / (2 * (1 - ALONE))  # along the axis; slanted rays reach that depth a little later
+    expected = gap / (2 * (1 - MAX_SEEN_SHARE))  # along the axis; slanted rays reach that depth a little later
     assert abs(found[0].item() - expected) < 0.4 * expected + (far - near) / STEPS
 
 
@@ -78,10 +78,10 @@ def test_the_penalty_in_closed_form() -> None:
         weights = weights_and_transmittance(sigma, samples)[0]
         loss = matter_before(weights, samples, torch.tensor([clear], dtype=torch.float64))
         left = math.exp(-before)
-        assert loss.item() == pytest.approx(-math.log((left + WRONG) / (1 + WRONG)), rel=1e-9)
+        assert loss.item() == pytest.approx(-math.log((left + WRONG_SHARE) / (1 + WRONG_SHARE)), rel=1e-9)
         (gradient,) = torch.autograd.grad(loss, sigma)
         counts = torch.tensor([clear > 2, clear > 3, clear > 4], dtype=torch.float64)
-        torch.testing.assert_close(gradient, counts * left / (left + WRONG))
+        torch.testing.assert_close(gradient, counts * left / (left + WRONG_SHARE))
     sigma = torch.tensor([0.0, 30.0, 0.0], dtype=torch.float64, requires_grad=True)
     weights = weights_and_transmittance(sigma, samples)[0]
     loss = matter_before(weights, samples, torch.tensor([3.5], dtype=torch.float64))

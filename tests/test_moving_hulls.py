@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfloom.data.travel import Travel
+from nerfloom.data.motion_bound import MotionBound
 from nerfloom.geometry.points import Points
 from nerfloom.registry import load_method
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
 from nerfloom.scene.silhouettes import Silhouettes
-from nerfloom.scene.speed import travel_of
+from nerfloom.scene.speed import motion_bound
 from nerfloom.training.preparation import decided, skip_by_silhouettes
 from nerfloom.training.trainer import Trainer
 from tests.moving_bodies import BOX, Motion, jump, lost, photographed, swinging_limb, thrown_ball
@@ -40,12 +40,12 @@ def check(moving: Callable[[float], Motion], speed: float, count: int, most_left
     """No matter of what moves is lost, and no more than `most_left` of the box is left, of `count` images."""
     dataset, times = photographed(moving(speed), count)
     silhouettes = Silhouettes.of(dataset)
-    travel = travel_of(silhouettes, BOX, times)
-    assert travel is not None
-    box = moving_box(silhouettes, BOX, times, travel)
-    hulls = moving_hulls(silhouettes, box, CELLS, times, travel, SLICES).view(SLICES, CELLS, CELLS, CELLS)
+    bound = motion_bound(silhouettes, BOX, times)
+    assert bound is not None
+    box = moving_box(silhouettes, BOX, times, bound)
+    hulls = moving_hulls(silhouettes, box, CELLS, times, bound, SLICES).view(SLICES, CELLS, CELLS, CELLS)
     left = float(hulls.double().mean()) * float(((box[1] - box[0]) / 3).prod())
-    found, worst = travel.fastest / 3, lost(hulls, box, moving(speed))
+    found, worst = bound.fastest / 3, lost(hulls, box, moving(speed))
     print(f"{speed:g} edges: found {found:.2f}, at the worst moment {worst:.2%} lost, {left:.1%} left")
     assert worst == 0
     assert left < most_left
@@ -54,12 +54,12 @@ def check(moving: Callable[[float], Motion], speed: float, count: int, most_left
 
 
 def test_distances_add_up_speeds_and_the_larger_of_two_counts() -> None:
-    travel = Travel.of(torch.tensor([0.2, 0.4, 0.8]), torch.tensor([1.0, 3.0, 2.0]))
+    bound = MotionBound.of(torch.tensor([0.2, 0.4, 0.8]), torch.tensor([1.0, 3.0, 2.0]))
     times = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 0.9, 1.0])
     expected = [0.0, 0.1, 0.2, 0.5, 0.8, 1.4, 2.0, 2.2, 2.4]
-    torch.testing.assert_close(travel.at(times), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-6)
-    assert travel.fastest == pytest.approx(3.0)
-    whole = Travel.of(torch.tensor([0.0, 1.0]), torch.tensor([1.0, 2.0]))
+    torch.testing.assert_close(bound.at(times), torch.tensor(expected, dtype=torch.float64), rtol=0, atol=1e-6)
+    assert bound.fastest == pytest.approx(3.0)
+    whole = MotionBound.of(torch.tensor([0.0, 1.0]), torch.tensor([1.0, 2.0]))
     assert whole.fastest == pytest.approx(2.0)
     assert float(whole.at(torch.tensor([0.5]))) == pytest.approx(1.0)
 
@@ -68,9 +68,9 @@ def test_distances_add_up_speeds_and_the_larger_of_two_counts() -> None:
 def test_speeds_are_those_about_each_time() -> None:
     """A ball rests but for a tenth of the time: only about that time it is fast."""
     dataset, times = photographed(thrown_ball(6.0), 100)
-    travel = travel_of(Silhouettes.of(dataset), BOX, times)
-    assert travel is not None
-    speeds = travel.at(times).diff() / times.diff() / 3
+    bound = motion_bound(Silhouettes.of(dataset), BOX, times)
+    assert bound is not None
+    speeds = bound.at(times).diff() / times.diff() / 3
     flying = (times[1:] > 0.42) & (times[:-1] < 0.49)
     print(f"in flight {float(speeds[flying].min()):.2f} to {float(speeds[flying].max()):.2f}")
     assert float(speeds[flying].max()) > 5
@@ -85,9 +85,9 @@ def test_an_opaque_pixel_that_no_motion_explains_is_given_up(tmp_path: Path) -> 
     pixels[20 * 100 * 100 + 1500, 3] = 255
     twice = times.clone()
     twice[1::2] = times[::2]
-    travel = travel_of(Silhouettes.of(replace(dataset, pixels=pixels)), BOX, twice)
-    assert travel is not None
-    assert torch.isfinite(travel.distances).all()
+    bound = motion_bound(Silhouettes.of(replace(dataset, pixels=pixels)), BOX, twice)
+    assert bound is not None
+    assert torch.isfinite(bound.distances).all()
 
 
 @pytest.mark.medium
@@ -110,9 +110,9 @@ def test_of_too_few_images_no_speed_is_found_and_nothing_carved(count: int, tmp_
         assert said["motion"].startswith("at most 0.")
         assert said["silhouettes"].startswith("what is outside all of them")
         assert not torch.equal(trainer.train_set.scene.box, BOX)
-        silhouettes, travel = Silhouettes.of(trainer.train_set), trainer.train_set.travel
-        assert travel is not None
-        hull = moving_hulls(silhouettes, sampler.box, sampler.resolution, times, travel, sampler.slices)
+        silhouettes, bound = Silhouettes.of(trainer.train_set), trainer.train_set.motion_bound
+        assert bound is not None
+        hull = moving_hulls(silhouettes, sampler.box, sampler.resolution, times, bound, sampler.slices)
         assert torch.equal(sampler.carved, ~hull)
         assert 0.1 < float(hull.double().mean()) < 0.9
 
@@ -122,7 +122,7 @@ def test_a_method_of_still_scenes_takes_the_speed_too() -> None:
     """It keeps the data's box, and cells that are occupied at any time."""
     dataset, _ = photographed(thrown_ball(1.5), 40, size=40)
     found, _, made = decided(instant_ngp := load_method("instant-ngp"), instant_ngp.config, dataset)
-    assert found.travel is not None
+    assert found.motion_bound is not None
     assert torch.equal(found.scene.box, BOX)
     assert made[0].option == "motion"
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.carried import carried_poses
+from nerfloom.cameras.pose_propagation import propagated_poses
 from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.geometry.alignment import align_cameras
 from nerfloom.geometry.rays import Rays
@@ -131,7 +131,7 @@ def test_held_out_cameras_follow_those_around_them_where_poses_drift_along_the_w
     given = torch.cat([torch.eye(3).expand(41, 3, 3), centers[:, :, None]], -1)
     refined = torch.cat([turns, (centers + shifts)[:, :, None]], -1)
     between = torch.arange(41) % 8 == 4
-    found, _ = carried_poses(given[between], given[~between], refined[~between])
+    found, _ = propagated_poses(given[between], given[~between], refined[~between])
     apart = (found - refined[between]).flatten(1).norm(dim=1)
     scale, rotation, translation = align_cameras(given[~between], refined[~between])
     alike = torch.cat(
@@ -153,7 +153,7 @@ def test_far_from_all_cameras_other_cameras_follow_the_similarity_alone() -> Non
     refined = torch.cat([turns, given[:, :, 3:] + 0.1 * torch.randn(9, 3, 1)], -1)
     far = torch.cat([torch.eye(3), torch.tensor([[3e4], [2e4], [-1e4]])], -1)[None]
     scale, rotation, translation = align_cameras(given, refined)
-    found, grown = carried_poses(far, given, refined)
+    found, grown = propagated_poses(far, given, refined)
     assert grown == scale
     torch.testing.assert_close(found[0, :, :3], rotation.float(), atol=1e-4, rtol=0)
     expected = (scale * rotation @ far[0, :, 3].double() + translation).float()
@@ -167,7 +167,7 @@ def test_one_camera_and_many_at_one_place_carry_others_too() -> None:
         refined[:, 0, 3] += 0.5
         for place in (torch.ones(3), torch.zeros(3)):
             pose = torch.cat([torch.eye(3), place[:, None]], -1)[None]
-            found, _ = carried_poses(pose, given, refined)
+            found, _ = propagated_poses(pose, given, refined)
             expected = pose.clone()
             expected[:, 0, 3] += 0.5
             torch.testing.assert_close(found, expected)
@@ -186,7 +186,7 @@ def test_rays_from_many_places_are_each_carried_as_alone() -> None:
         torch.testing.assert_close(together.origins[one], alone.origins)
         torch.testing.assert_close(together.directions[one], alone.directions)
         pose = torch.cat([torch.eye(3), rays.origins[index][:, None]], -1)
-        torch.testing.assert_close(poses.carried_pose(pose)[:, 3], alone.origins[0])
+        torch.testing.assert_close(poses.propagated_pose(pose)[:, 3], alone.origins[0])
 
 
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])

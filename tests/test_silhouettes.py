@@ -9,14 +9,14 @@ import torch
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.travel import Travel
+from nerfloom.data.motion_bound import MotionBound
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.kernels.images.silhouettes import hold_balls
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves import candidates
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
 from nerfloom.scene.silhouettes import Silhouettes, pixels_near, visual_hull
-from nerfloom.scene.speed import travel_of
+from nerfloom.scene.speed import motion_bound
 from tests.conftest import write_tiny
 
 BOX = torch.tensor([[-1.2, -1.2, -1.2], [1.2, 1.2, 1.2]])
@@ -101,11 +101,11 @@ def test_of_a_moving_scene_all_that_is_ever_seen_stays(ball: Dataset) -> None:
     silhouettes = Silhouettes.of(replace(ball, pixels=pixels))
     assert not bool(visual_hull(silhouettes, BOX / 2, 16).any())
     times = torch.linspace(0, 1, 24)
-    travel = travel_of(silhouettes, BOX, times)
-    assert travel is not None
-    hull = moving_hulls(silhouettes, BOX, 16, times, travel)
+    bound = motion_bound(silhouettes, BOX, times)
+    assert bound is not None
+    hull = moving_hulls(silhouettes, BOX, 16, times, bound)
     assert bool(hull[centers(16).norm(dim=-1) < 1].all())
-    assert bool(moving_hulls(silhouettes, BOX / 4, 4, times, travel).all())
+    assert bool(moving_hulls(silhouettes, BOX / 4, 4, times, bound).all())
 
 
 def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -> None:
@@ -113,8 +113,8 @@ def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -
     wide = replace(ball, cameras=replace(ball.cameras, fx=ball.cameras.fx / 3, fy=ball.cameras.fy / 3))
     pixels = torch.zeros_like(wide.pixels).view(24, 80, 80, 4)
     pixels[:, 38:42, 38:42, 3] = 255  # all that any of them shows is in the middle
-    times, travel = torch.linspace(0, 1, 24), Travel.of(torch.tensor([0.0, 1.0]), torch.tensor([1.2, 1.2]))
-    hull = moving_hulls(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, times, travel)
+    times, bound = torch.linspace(0, 1, 24), MotionBound.of(torch.tensor([0.0, 1.0]), torch.tensor([1.2, 1.2]))
+    hull = moving_hulls(Silhouettes.of(replace(wide, pixels=pixels.view(-1, 4))), BOX, 16, times, bound)
     assert bool(hull[centers(16).norm(dim=-1) < 0.2].all())
     assert not bool(hull.all())
     assert hull.float().mean() < 0.9
@@ -148,16 +148,16 @@ def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slic
     radius = 0.25
     seen, times = flight(ball, place, radius)
     silhouettes = Silhouettes.of(seen)
-    travel = travel_of(silhouettes, BOX, times)
-    assert travel is not None
-    hull = moving_hulls(silhouettes, BOX, 16, times, travel, slices).view(slices, -1)
+    bound = motion_bound(silhouettes, BOX, times)
+    assert bound is not None
+    hull = moving_hulls(silhouettes, BOX, 16, times, bound, slices).view(slices, -1)
     for time in torch.linspace(0, 1, 97).tolist():
         inside = (centers(16) - place(time)).norm(dim=-1) < radius
         assert bool(inside.any())
         assert bool(hull[min(int(time * slices), slices - 1)][inside].all())
     far = (centers(16) - place(0.0)).norm(dim=-1) > 0.8
     assert hull[0][far].float().mean() < {1: 0.15, 3: 0.05, 8: 0.02}[slices]
-    box = moving_box(silhouettes, BOX, times, travel)
+    box = moving_box(silhouettes, BOX, times, bound)
     for time in torch.linspace(0, 1, 97).tolist():
         assert bool((box[0] < place(time) - radius).all())
         assert bool((box[1] > place(time) + radius).all())
@@ -173,8 +173,8 @@ def test_the_box_of_a_scene_that_frames_cut_is_larger(ball: Dataset) -> None:
     pixels[79, 3] = 255  # a corner of the first image
     cut = Silhouettes.of(replace(seen, pixels=pixels))
     assert not cut.closed_if_whole().closed
-    travel = Travel.of(torch.tensor([0.0, 1.0]), torch.tensor([1.2, 1.2]))
-    small, large = (moving_box(silhouettes, 1.5 * BOX, times, travel) for silhouettes in (whole, cut))
+    bound = MotionBound.of(torch.tensor([0.0, 1.0]), torch.tensor([1.2, 1.2]))
+    small, large = (moving_box(silhouettes, 1.5 * BOX, times, bound) for silhouettes in (whole, cut))
     assert bool((small[0] < -0.25).all())
     assert bool((small[1] > 0.25).all())
     assert bool((large[0] <= small[0]).all())

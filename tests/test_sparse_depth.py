@@ -17,7 +17,7 @@ from nerfloom.data.tracks import Sightings
 from nerfloom.evaluation.evaluator import floaters
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import weights_and_transmittance
-from nerfloom.losses.functions import WRONG, distance_likelihood
+from nerfloom.losses.functions import WRONG_SHARE, distance_likelihood
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_run
@@ -85,7 +85,7 @@ def likelihood(weights: torch.Tensor, samples: Samples, distance: float, deviati
 
 def of_light(hit: float, behind: float, lost: float) -> float:
     """The term in closed form, of the light that is stopped at the point, behind it, and nowhere."""
-    e = WRONG
+    e = WRONG_SHARE
     return -math.log((hit + e * (hit + behind + lost) + e * e) / (1 + e + e * e))
 
 
@@ -96,7 +96,7 @@ def test_the_loss_in_closed_form() -> None:
     hit, behind = before * (1 - math.exp(-2)), before * math.exp(-2) * (1 - math.exp(-1))
     assert loss.item() == pytest.approx(of_light(hit, behind, before * math.exp(-3)), rel=1e-9)
     (gradient,) = torch.autograd.grad(loss, sigma)
-    e, scale = WRONG, hit + WRONG * before + WRONG**2
+    e, scale = WRONG_SHARE, hit + WRONG_SHARE * before + WRONG_SHARE**2
     assert gradient[0].item() == gradient[1].item() == pytest.approx((hit + e * before) / scale, rel=1e-9)
     assert gradient[2].item() == pytest.approx(-before * math.exp(-2) / scale, rel=1e-9)
     assert gradient[3].item() == 0

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from nerfloom.data.tracks import DOUBTS, LARGEST_DEVIATION, Tracks, distance_deviations, doubts_about
+from nerfloom.data.tracks import DOUBTS, MAX_DEVIATION, Tracks, distance_deviations, doubts_about
 
 SOUND = torch.zeros(1, dtype=torch.int64)
 """No doubt about the only point."""
@@ -61,7 +61,7 @@ def test_the_distance_of_a_point_beyond_measure_is_unknown() -> None:
     both = Tracks(points, images, seen, torch.full((4,), 1e-3), torch.zeros(2, dtype=torch.int64))
     found = distance_deviations(both, centers)
     torch.testing.assert_close(found[:2], distance_deviations(tracks, centers))
-    assert not (found[2:] <= LARGEST_DEVIATION).any()
+    assert not (found[2:] <= MAX_DEVIATION).any()
 
 
 def test_one_image_knows_no_distance() -> None:
@@ -79,7 +79,7 @@ def test_rays_that_hardly_differ_know_no_distance() -> None:
     for ratio, count in ((20, 2), (5, 0)):
         tracks, centers = two_rays(ratio * 1e-3, 3.0, 1e-3)
         deviations = distance_deviations(tracks, centers) / 3
-        assert bool((deviations <= LARGEST_DEVIATION).all()) == (count == 2)
+        assert bool((deviations <= MAX_DEVIATION).all()) == (count == 2)
         assert len(tracks.sightings(centers)) == count
 
 

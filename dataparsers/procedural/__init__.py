@@ -80,7 +80,7 @@ class Procedural(DataParser):
 
     def _render(self, folder: Path) -> None:
         if self.num_scenes > 1:
-            from nerfloom.dataparsers.procedural.many import write_scenes  # imported only to render
+            from nerfloom.dataparsers.procedural.random_scenes import write_scenes  # imported only to render
 
             views = self.views_per_scene
             write_scenes(
@@ -95,7 +95,7 @@ class Procedural(DataParser):
 
 def _of_many(parsed: ParsedScene, split: Split) -> ParsedScene:
     """Return parsed images with the indices of their scenes."""
-    from nerfloom.dataparsers.procedural.many import what_is_shown
+    from nerfloom.dataparsers.procedural.random_scenes import what_is_shown
 
     numbers, given = what_is_shown(parsed.image_paths, split)
     return replace(parsed, scene_indices=numbers, source_images=given)

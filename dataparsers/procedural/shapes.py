@@ -37,11 +37,11 @@ class Shape(Protocol):
         """Return the outward unit normals (3, R) at points `p` on the surface."""
 
     def enter(self, offset: Tensor, direction: Tensor, start: Tensor) -> Tensor:
-        """Return the smallest parameter above `start` at which the line enters the solid; inf if there is none.
+        """Return the smallest parameter above `start` where the line enters the solid; inf if there is none.
 
         Args:
             offset, direction: the lines.
-            start: parameters at which the lines start.
+            start: parameters where the lines start.
         """
 
     def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:

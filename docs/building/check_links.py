@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("source", "src"), ("iframe", "src")}
-"""Elements and attributes by which a browser fetches something when it opens a page."""
+"""Elements and attributes that make a browser fetch something when it opens a page."""
 
 
 class Page(HTMLParser):

@@ -3,7 +3,7 @@
 - A table whose last column is headed `result` names a row of a file of results in each line. Cells under headings of
   `python -m benchmarks tables` become what that row says, with the mean and the spread over its seeds; all others stay.
 - A table behind `<!-- results: NAME: HEADING, HEADING -->` shows these headings in every cell, of the result called
-  NAME, in which ROW is the first word in backticks of the line and COLUMN the heading of the column. With `best` behind
+  NAME. ROW is the first word in backticks of the line and COLUMN the heading of the column. With `best` behind
   a second colon the highest PSNR of a line is bold.
 - A table behind `<!-- measured: NAME -->` has the lines of that name in `measured.py`.
 """

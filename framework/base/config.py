@@ -43,7 +43,7 @@ AUTO: Any = "auto"
 Range = tuple[float, float]
 """Minimum and maximum of a setting, inclusive."""
 AT_LEAST_0: Range = (0, math.inf)
-SMALLEST_EPS = 1e-37
+MIN_EPS = 1e-37
 """Minimum epsilon of Adam, close to the smallest normal float32. Without epsilon, a gradient of 0 gives 0 / 0."""
 
 
@@ -140,6 +140,13 @@ class TrainConfig:
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
+    # Values of settings that a method lacks, so that shared code need not know the class of its settings. Without
+    # annotation they are no fields, and so no flags.
+    sampler, bounded_sampler, time_slices = "", "occupancy", 1
+    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = False
+    rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
+    depth_loss_mult = free_space_loss_mult = 0.0
+
     def __init_subclass__(cls, **defaults: Any) -> None:
         """Change defaults of inherited settings, as in `class MyConfig(RayConfig, learning_rate=1e-2)`.
 
@@ -166,8 +173,8 @@ class TrainConfig:
         for name in ("adam_beta1", "adam_beta2"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{_flag(name)} is {getattr(self, name)}; it must be at least 0 and less than 1")
-        if not self.adam_eps >= SMALLEST_EPS:
-            raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {SMALLEST_EPS}")
+        if not self.adam_eps >= MIN_EPS:
+            raise ConfigError(f"--adam-eps is {self.adam_eps}; it must be at least {MIN_EPS}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise ConfigError(f"--max-seconds is {self.max_seconds}; it must be more than 0")
         rates = [rate for rate in (self.learning_rate, self.lr_final) if rate != AUTO]
@@ -229,7 +236,7 @@ class SourceViewsConfig(RayConfig):
     RANGES: ClassVar[dict[str, Range]] = {"num_source_views": (1, 64), "images_per_batch": (1, 1024)}
     """Allowed ranges."""
     num_source_views: int = 3
-    """Number of images from which a view is rendered."""
+    """Number of images that a view is rendered from."""
     images_per_batch: int = 4
     """Number of images that a training step draws pixels from; each is rendered from other images of its scene."""
 

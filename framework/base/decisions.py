@@ -66,7 +66,6 @@ def fill(config: ConfigT, *choices: Choice) -> tuple[ConfigT, list[Decision]]:
     """Fill in the settings that are still open. Other settings stay unchanged and are not reported.
 
     Args:
-        config: the method's settings.
         choices: a value for each setting that may be open.
 
     Returns:

@@ -231,11 +231,7 @@ def peak_memory(device: torch.device) -> int:
 
 
 def free_memory(device: torch.device) -> float:
-    """Return the free memory of a GPU in bytes; infinity for other devices, which share the machine's memory.
-
-    Args:
-        device: the device.
-    """
+    """Return the free memory of a GPU in bytes; infinity for other devices, which share the machine's memory."""
     return float(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else math.inf
 
 

@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Iterable
 from typing import Any
 
-LONGEST_MESSAGE = 2000
+MAX_MESSAGE_LENGTH = 2000
 """Maximum number of characters of an error message. Text quoted from a damaged file may be longer than a screen."""
 
 
@@ -15,13 +15,13 @@ class NerfloomError(ValueError):
     """Base class of the errors that the command line prints as one line, without a traceback.
 
     Args:
-        message: the text. Line breaks and control characters are escaped, and text beyond `LONGEST_MESSAGE` characters
-            is cut off.
+        message: the text. Line breaks and control characters are escaped, and what exceeds `MAX_MESSAGE_LENGTH`
+            characters is cut off.
     """
 
     def __init__(self, message: str) -> None:
         line = printable(message)
-        super().__init__(line if len(line) <= LONGEST_MESSAGE else f"{line[:LONGEST_MESSAGE]}...")
+        super().__init__(line if len(line) <= MAX_MESSAGE_LENGTH else f"{line[:MAX_MESSAGE_LENGTH]}...")
 
 
 class DataError(NerfloomError):

@@ -8,7 +8,7 @@ from typing import Literal
 
 from nerfloom.base.errors import ConfigError, shown
 
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 """Maximum number of CPU threads."""
 
 
@@ -32,9 +32,9 @@ class MachineConfig:
     def __post_init__(self) -> None:
         if not -(2**63) <= self.seed < 2**63:
             raise ConfigError(f"--machine.seed is {shown(self.seed)}; it must be an integer of 64 bits")
-        if self.num_threads is not None and not 1 <= self.num_threads <= MOST_THREADS:
+        if self.num_threads is not None and not 1 <= self.num_threads <= MAX_THREADS:
             number = shown(self.num_threads)
-            raise ConfigError(f"--machine.num-threads is {number}; it must be from 1 to {MOST_THREADS}")
+            raise ConfigError(f"--machine.num-threads is {number}; it must be from 1 to {MAX_THREADS}")
         if self.speed is not None and not 0 < self.speed < math.inf:
             raise ConfigError(f"--machine.speed is {shown(self.speed)}; it must be more than 0")
 

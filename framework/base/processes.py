@@ -24,7 +24,7 @@ from nerfloom.base.errors import ConfigError, LostProcessError
 PATIENCE = timedelta(days=1)
 """Maximum time to wait for another process, which may be evaluating. An ended process is noticed at once."""
 NAMES = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-"""Environment variables in which torchrun numbers its processes."""
+"""Environment variables with torchrun's numbers of processes."""
 
 
 @dataclass(frozen=True)

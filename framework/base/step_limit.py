@@ -16,7 +16,6 @@ def limited_as_given(config: ConfigT, given: Collection[str]) -> ConfigT:
     """Remove the default limit of steps if the user sets only a limit of seconds.
 
     Args:
-        config: the settings.
         given: names of the settings that the user has set.
 
     Raises:

@@ -73,7 +73,7 @@ def in_time(
     keep: Callable[[dict[str, Any]], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Measure parts in order, and skip those for which too little time remains.
+    """Measure parts in order, and skip those that would take too long.
 
     Args:
         parts: the parts, most important first.
@@ -90,14 +90,13 @@ def in_time(
             late.append(part.name)
         else:
             found |= part.measure(left)
-        keep({**found, "left out for want of time": late})
+        keep({**found, "left out, too little time": late})
 
 
 def measured_kernels(device: torch.device, samples: int, repeats: int, seconds: float = math.inf) -> dict[str, Any]:
     """Measure every kernel on a device and print a table; errors come first, because they matter most.
 
     Args:
-        device: the device.
         samples: number of samples in a batch.
         repeats: number of runs for medians.
         seconds: time after which no further kernel is timed.
@@ -190,8 +189,7 @@ def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) 
     """Time training steps of nerfacto and instant-ngp, unchanged and repeated as CUDA graphs.
 
     Args:
-        device: the device.
-        before: untimed steps at the beginning, in which kernels are compiled and steps are captured.
+        before: untimed steps at the beginning, which compile kernels and capture steps.
         steps: number of timed steps.
         settings: settings of the methods other than their defaults.
 

@@ -28,9 +28,9 @@ from nerfloom.benchmarks.kernel_cases import KINDS, Case, cases
 from nerfloom.kernels import dispatch, triton_backend
 from nerfloom.kernels.dispatch import Operation
 
-LEAST = 1e-6
+MIN_SCALE = 1e-6
 """For values below this, errors are reported relative to this instead."""
-LARGEST_FLOAT = torch.finfo(torch.float32).max
+MAX_FLOAT = torch.finfo(torch.float32).max
 
 
 @dataclass(frozen=True)
@@ -113,12 +113,12 @@ def largest_error(value: Tensor, truth: Tensor) -> float:
         return float("inf")
     if not truth.numel():
         return 0.0
-    truth = torch.where(truth.abs() > LARGEST_FLOAT, truth.sign() * torch.inf, truth)  # out of range of float32
+    truth = torch.where(truth.abs() > MAX_FLOAT, truth.sign() * torch.inf, truth)  # out of range of float32
     odd = ~truth.isfinite()
     if not torch.equal(odd, ~value.isfinite()):
         return float("inf")
     error, largest = ((each.masked_fill(odd, 0)).abs().max() for each in (value - truth, truth))
-    return float(error / largest.clamp(min=LEAST))
+    return float(error / largest.clamp(min=MIN_SCALE))
 
 
 def interpreted() -> list[Error]:

@@ -18,19 +18,18 @@ from nerfloom.kernels import native
 from nerfloom.training.machine import kernels, machine
 from nerfloom.training.run import Run
 
-SHOWN, NAME = 25, 90
+MAX_PRINTED, MAX_NAME_LENGTH = 25, 90
 """Number of GPU kernels that are printed, and length of their names."""
-MEASURED, FEWEST, LONGEST = 200, 8, 30.0
+MAX_STEPS, MIN_STEPS, MAX_SECONDS = 200, 8, 30.0
 """Number of steps over which times are averaged; fewer, but at least the second number, if they take longer than the
 third, seconds."""
 
 
 def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
-    """Train a method, measure up to `MEASURED` further steps, and print a line for each kernel.
+    """Train a method, measure up to `MAX_STEPS` further steps, and print a line for each kernel.
 
     Args:
-        run: the run to train.
-        steps: training steps before the measurement, in which the occupancy grid finds empty space.
+        steps: training steps before the measurement; the occupancy grid finds empty space in them.
         max_seconds: time budget, seconds, for the method's choice of settings.
 
     Returns:
@@ -43,7 +42,7 @@ def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
         wait_for(trainer.device)
         native.spent, rays = {}, trainer.state.rays
         start, count = time.perf_counter(), 0
-        while count < FEWEST or (count < MEASURED and time.perf_counter() - start < LONGEST):
+        while count < MIN_STEPS or (count < MAX_STEPS and time.perf_counter() - start < MAX_SECONDS):
             trainer.train_step()
             count += 1
         wait_for(trainer.device)
@@ -52,12 +51,12 @@ def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:
         spent_in, native.spent = {name: seconds / count * 1e3 for name, seconds in native.spent.items()}, None
         rest = "Python and torch"
         if trainer.device.type == "cuda":
-            spent_in, rest = gpu_kernels(trainer.train_step, FEWEST), "the GPU waits"
+            spent_in, rest = gpu_kernels(trainer.train_step, MIN_STEPS), "the GPU waits"
         repeated = 0 if trainer.graphs is None else trainer.graphs.repeated
         used = kernels(trainer.device)
     spent_in[rest] = step - sum(spent_in.values())
     parts = dict(sorted(spent_in.items(), key=lambda item: -item[1]))
-    for name, spent in list(parts.items())[:SHOWN]:
+    for name, spent in list(parts.items())[:MAX_PRINTED]:
         say(f"{name:28s} {spent:6.2f} ms  {spent / step:6.1%}")
     say(f"{'a step':28s} {step:6.2f} ms  {rays:,} rays, {used}, {repeated} steps repeated as CUDA graphs")
     return {
@@ -85,6 +84,6 @@ def gpu_kernels(train_step: Callable[[], object], steps: int) -> dict[str, float
         torch.cuda.synchronize()
     spent = Counter[str]()
     for event in recorded.events():
-        if event.device_type == torch.autograd.DeviceType.CUDA:
-            spent[event.name[:NAME]] += event.self_device_time_total / 1e3 / steps
+        if event.device_type.name == "CUDA":
+            spent[event.name[:MAX_NAME_LENGTH]] += event.self_device_time_total / 1e3 / steps
     return dict(spent)

@@ -36,7 +36,7 @@ def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:
     Args:
         run: the run to train; its own budget and folder are not used.
         seconds: time budget, seconds, for the method's choice of settings.
-        folder: folder in which the run's folder is created.
+        folder: parent of the run's folder.
     """
     config = dataclasses.replace(run.config, vis="none", max_seconds=seconds)
     run = dataclasses.replace(run, config=config, folder=folder / "run")

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, nearest, shown
+from nerfloom.base.json_files import read_json
 from nerfloom.cameras.cameras import Cameras, check_pose
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.lenses import panorama
@@ -26,15 +27,15 @@ from nerfloom.geometry.lenses import panorama
 CameraType = Literal["perspective", "fisheye", "equirectangular"]
 CAMERA_TYPES: dict[str, str] = {"perspective": "pinhole", "fisheye": "fisheye", "equirectangular": "equirectangular"}
 """`camera_type` of the file -> projection, a key of `LENSES`."""
-LARGEST_SIDE, LARGEST_IMAGE = 16_384, 2**27
+MAX_SIDE, MAX_IMAGE = 16_384, 2**27
 """Maximum width and height, and maximum number of pixels of an image."""
-MOST_FRAMES = 100_000
+MAX_FRAMES = 100_000
 """Maximum number of frames of a path."""
-FARTHEST = 1e9
+MAX_COORDINATE = 1e9
 """Maximum coordinate of a camera, scene units."""
-ANGLES = (0.01, 179.0)
+FIELDS_OF_VIEW = (0.01, 179.0)
 """Range of the vertical field of view, degrees."""
-SPEEDS = (0.01, 1000.0)
+SPEED_RANGE = (0.01, 1000.0)
 """Range of the number of frames per second."""
 PANORAMA_FOV = 90.0
 """Field of view written for a panorama, degrees; panoramas do not use it."""
@@ -79,7 +80,7 @@ class CameraPath:
     smoothness_value: float = 0.0
     """Tension of the spline through the keyframes."""
     keyframes: tuple[Keyframe, ...] = ()
-    """Cameras from which the path was made; empty if unknown."""
+    """Cameras that the path was made from; empty if unknown."""
     placement: Placement | None = None
     """Placement of the input in the path's scene; None if unknown."""
     has_crop: bool = False
@@ -184,17 +185,17 @@ def read_camera_path(file: Path) -> CameraPath:
     Raises:
         DataError: if the file cannot be read, has another format, or holds invalid cameras.
     """
-    content = _object(_json(file), str(file))
+    content = _object(read_json(file), str(file))
     width, height = (_side(content, f"render_{name}", file) for name in ("width", "height"))
-    if width * height > LARGEST_IMAGE:
-        raise DataError(f"{file}: images of {width}x{height} pixels are too large; the limit is {LARGEST_IMAGE} pixels")
+    if width * height > MAX_IMAGE:
+        raise DataError(f"{file}: images of {width}x{height} pixels are too large; the limit is {MAX_IMAGE} pixels")
     camera_type = content.get("camera_type", "perspective")
     if camera_type not in get_args(CameraType):
         hint = nearest(camera_type, CAMERA_TYPES) if isinstance(camera_type, str) else nearest("", CAMERA_TYPES)
         raise DataError(f"{file}: unknown camera_type {shown(camera_type)}. {hint}")
     frames = _list(content, "camera_path", file)
-    if not 1 <= len(frames) <= MOST_FRAMES:
-        raise DataError(f"{file}: 'camera_path' has {len(frames)} frames; it must have 1 to {MOST_FRAMES}")
+    if not 1 <= len(frames) <= MAX_FRAMES:
+        raise DataError(f"{file}: 'camera_path' has {len(frames)} frames; it must have 1 to {MAX_FRAMES}")
     labels = [f"{file}: frame {index} of 'camera_path'" for index in range(len(frames))]
     placed = [(_object(frame, label), label) for frame, label in zip(frames, labels, strict=True)]
     for frame, label in placed:
@@ -225,7 +226,7 @@ def read_transforms(file: Path) -> Placement:
     Raises:
         DataError: if the file cannot be read or holds no similarity.
     """
-    return read_placement(_json(file), str(file))
+    return read_placement(read_json(file), str(file))
 
 
 def read_placement(content: Any, where: str) -> Placement:
@@ -241,18 +242,9 @@ def read_placement(content: Any, where: str) -> Placement:
     values = _object(content, where)
     transform = _rigid(values.get("transform"), f"{where}: 'transform'")
     scale = _number(values, "scale", where, above=0.0)
-    if not 1 / FARTHEST < scale < FARTHEST:
+    if not 1 / MAX_COORDINATE < scale < MAX_COORDINATE:
         raise DataError(f"{where}: 'scale' is {scale:g}, which is out of range")
     return Placement(transform, scale)
-
-
-def _json(file: Path) -> Any:
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"cannot read {file}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not JSON: {error}") from error
 
 
 def _object(value: Any, where: str) -> dict[str, Any]:
@@ -294,8 +286,8 @@ def _flag(content: dict[str, Any], name: str, where: str) -> bool:
 
 def _side(content: dict[str, Any], name: str, file: Path) -> int:
     side = _number(content, name, str(file), above=0.0)
-    if side != round(side) or not 1 <= side <= LARGEST_SIDE:
-        raise DataError(f"{file}: '{name}' is {shown(content[name])}; it must be from 1 to {LARGEST_SIDE} pixels")
+    if side != round(side) or not 1 <= side <= MAX_SIDE:
+        raise DataError(f"{file}: '{name}' is {shown(content[name])}; it must be from 1 to {MAX_SIDE} pixels")
     return round(side)
 
 
@@ -305,9 +297,10 @@ def _seconds(content: dict[str, Any], frames: int, where: str) -> float:
         seconds = _number(content, "seconds", where, above=0.0)
     else:
         seconds = frames / _number(content, "fps", where, above=0.0)
-    if not seconds * SPEEDS[0] <= frames <= seconds * SPEEDS[1]:
+    slowest, fastest = SPEED_RANGE
+    if not seconds * slowest <= frames <= seconds * fastest:
         raise DataError(
-            f"{where}: {frames} frames in {seconds:g} seconds; allowed are {SPEEDS[0]:g} to {SPEEDS[1]:g} per second"
+            f"{where}: {frames} frames in {seconds:g} seconds; allowed are {slowest:g} to {fastest:g} per second"
         )
     return seconds
 
@@ -316,8 +309,9 @@ def _fov(content: dict[str, Any], camera_type: str, where: str) -> float:
     if camera_type == "equirectangular":
         return _number(content, "fov", where, default=PANORAMA_FOV)
     fov = _number(content, "fov", where)
-    if not ANGLES[0] <= fov <= ANGLES[1]:
-        raise DataError(f"{where}: 'fov' is {fov:g}; it must be from {ANGLES[0]:g} to {ANGLES[1]:g} degrees")
+    least, most = FIELDS_OF_VIEW
+    if not least <= fov <= most:
+        raise DataError(f"{where}: 'fov' is {fov:g}; it must be from {least:g} to {most:g} degrees")
     return fov
 
 
@@ -345,8 +339,8 @@ def _rigid(value: Any, where: str) -> Tensor:
     except (OverflowError, RuntimeError) as error:  # an integer beyond any float
         raise DataError(f"{where} holds a number out of range") from error
     check_pose(pose, where)
-    if not bool((pose[:3, 3].abs() < FARTHEST).all()):
-        raise DataError(f"{where}: the position is farther than {FARTHEST:g} from the origin")
+    if not bool((pose[:3, 3].abs() < MAX_COORDINATE).all()):
+        raise DataError(f"{where}: the position is farther than {MAX_COORDINATE:g} from the origin")
     return pose[:3]
 
 
@@ -354,8 +348,8 @@ def _keyframes(content: dict[str, Any], camera_type: str, file: Path) -> tuple[K
     """Return the keyframes; none for files of nerfstudio's first viewer, whose matrices are text."""
     given = content.get("keyframes")
     given = [] if given is None else _list(content, "keyframes", file)
-    if len(given) > MOST_FRAMES:
-        raise DataError(f"{file}: 'keyframes' has {len(given)} cameras; the limit is {MOST_FRAMES}")
+    if len(given) > MAX_FRAMES:
+        raise DataError(f"{file}: 'keyframes' has {len(given)} cameras; the limit is {MAX_FRAMES}")
     found = []
     for index, value in enumerate(given):
         where = f"{file}: {index} of 'keyframes'"

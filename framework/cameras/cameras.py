@@ -25,7 +25,7 @@ from nerfloom.kernels.dispatch import CPP, Operation
 
 ROTATION_TOLERANCE = 1e-3
 """Maximum deviation of a pose's rotation matrix from an orthonormal one."""
-LARGEST_SIDE = 10**9
+MAX_SIDE = 10**9
 """Maximum width or height that a file may state, pixels; file formats allow up to 2^64."""
 CENTER = torch.zeros(1, 2)
 """The pixel's centre as the only sample position, in columns and rows from the centre."""
@@ -40,7 +40,7 @@ class Cameras:
     """M cameras of one model. Intrinsics are in pixels of the corresponding images.
 
     The unit of a focal length depends on the model: pixels per tangent (pinhole, opencv), per radian (fisheye, and
-    equirectangular, for which `lenses.panorama` gives the values), or per scene unit (orthographic).
+    equirectangular, see `lenses.panorama`), or per scene unit (orthographic).
     """
 
     camera_to_worlds: Tensor
@@ -112,7 +112,7 @@ class Cameras:
         Args:
             camera_indices: (R,) camera of each ray.
             columns, rows: (R,) coordinates of the pixels; integers are pixel centres, and fractions are allowed.
-            near, far: distances at which the rays start and end.
+            near, far: distances where the rays start and end.
             times: (M,) time of each camera.
 
         Returns:
@@ -216,7 +216,7 @@ class Cameras:
 
         Args:
             flat: (P,) int64 numbers of the pixels, consecutive over all images.
-            near, far: distances at which the rays start and end.
+            near, far: distances where the rays start and end.
             times: (M,) time of each camera.
             subpixels: (K, 2) positions in a pixel, in columns and rows from its centre.
 

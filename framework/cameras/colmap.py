@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from nerfloom.base.errors import DataError
-from nerfloom.cameras.cameras import LARGEST_SIDE
+from nerfloom.cameras.cameras import MAX_SIDE
 from nerfloom.geometry.lenses import LENSES
 
 PARAMETERS: dict[str, tuple[str, str]] = {
@@ -67,7 +67,7 @@ def from_colmap(model_name: str, params: Sequence[float], width: int, height: in
     values = dict(zip(names, (float(value) for value in params), strict=True))
     fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
     finite = all(math.isfinite(value) for value in values.values())
-    if not finite or min(fx, fy, width, height) <= 0 or max(width, height) > LARGEST_SIDE:
+    if not finite or min(fx, fy, width, height) <= 0 or max(width, height) > MAX_SIDE:
         numbers = " ".join(f"{name}={value:g}" for name, value in values.items())
         raise DataError(
             f"a COLMAP camera of model {model_name} is invalid: {width}x{height} pixels, {numbers}; "

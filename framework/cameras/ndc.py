@@ -16,7 +16,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import CENTER, Cameras
 from nerfloom.geometry.rays import Rays
 
-LEAST_AHEAD = 1e-3
+MIN_AHEAD = 1e-3
 """Minimum cosine of the angle between a ray and the common axis; other rays do not reach the box."""
 
 
@@ -46,7 +46,7 @@ class Ndc:
         # Products and sums, because autocast would round a matrix product to bfloat16.
         origins = (frame[:, :3] * rays.origins[:, None, :]).sum(-1) + frame[:, 3]
         directions = (frame[:, :3] * rays.directions[:, None, :]).sum(-1)
-        ahead = -directions[:, 2] > LEAST_AHEAD
+        ahead = -directions[:, 2] > MIN_AHEAD
         depth = torch.where(ahead, -directions[:, 2], torch.ones_like(directions[:, 2]))
         slope = directions[:, :2] / depth[:, None]
         size = frame.new_tensor([self.half_width, self.half_height])
@@ -111,7 +111,7 @@ def find_ndc(poses: Tensor, corners: Tensor, nears: Tensor) -> Ndc:
     Args:
         poses: (M, 3, 4) camera-to-world, scene coordinates.
         corners: (M, 4, 3) directions through the corners of the images, scene coordinates, of depth 1 in their camera.
-        nears: (M,) depth up to which the camera sees nothing.
+        nears: (M,) depth before anything that the camera sees.
 
     Raises:
         DataError: if the cameras do not look the same way, or one camera is behind the near plane of another.
@@ -121,7 +121,7 @@ def find_ndc(poses: Tensor, corners: Tensor, nears: Tensor) -> Ndc:
     positions = poses[:, :, 3] @ frame[:, :3].T + frame[:, 3]
     largest_depth = float(-positions[:, 2].min())
     near = float(-(positions[:, None] + nears[:, None, None] * ahead)[:, :, 2].max())
-    if not bool((-ahead[:, :, 2] > LEAST_AHEAD * ahead.norm(dim=-1)).all()) or near <= max(largest_depth, 0):
+    if not bool((-ahead[:, :, 2] > MIN_AHEAD * ahead.norm(dim=-1)).all()) or near <= max(largest_depth, 0):
         raise DataError(
             "normalised device coordinates need cameras that all look the same way, in front of the scene; "
             "these cameras do not: use --ndc False"

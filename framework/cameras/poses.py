@@ -22,9 +22,9 @@ NEAR_SHARE = 0.5
 """Near distance as a fraction of the distance to the nearest sparse points."""
 SMALL_VIEW = 0.5
 """Scenes whose images show less than this where their cameras look are enlarged (`enlargement`), scene units."""
-MOST_LOOK = 0.9
+MIN_SHARE_LOOKING = 0.9
 """Fraction of the cameras that must see the common point they look at, for a scene to be enlarged."""
-MOST_POINTS = 2000
+MAX_POINTS = 2000
 """Maximum number of sparse points used."""
 
 
@@ -212,7 +212,8 @@ def enlargement(poses: Tensor, spreads: Tensor) -> float:
         spreads: (M,) length shown by the longer side of each image at distance 1.
 
     Returns:
-        The factor; 1 if fewer than `MOST_LOOK` of the cameras see a common point, or if they see enough around it.
+        The factor; 1 if a common point is seen by fewer than `MIN_SHARE_LOOKING` of the cameras, or with enough around
+        it.
     """
     point = looked_at(poses)
     if point is None:
@@ -222,7 +223,7 @@ def enlargement(poses: Tensor, spreads: Tensor) -> float:
     shown = depths * spreads
     inside = (depths > 0) & ((away.norm(dim=-1).square() - depths.square()).clamp(min=0).sqrt() < shown / 2)
     median = float(shown.median())
-    return 1 / median if 0 < median < SMALL_VIEW and float(inside.double().mean()) >= MOST_LOOK else 1.0
+    return 1 / median if 0 < median < SMALL_VIEW and float(inside.double().mean()) >= MIN_SHARE_LOOKING else 1.0
 
 
 def _principal_axes(points: Tensor, up: Tensor) -> Tensor:
@@ -237,7 +238,7 @@ def _principal_axes(points: Tensor, up: Tensor) -> Tensor:
 
 
 def estimate_near(cameras: Cameras, points: Tensor | None) -> float:
-    """Estimate from sparse points a distance in scene units up to which images show nothing.
+    """Estimate from sparse points the distance from cameras, in scene units, that images show to be empty.
 
     With few images, little constrains the space right in front of the cameras: for a can in 62 images, the PSNR of
     held-out images was 3 dB higher when rays started at 0.3 rather than at 0.05.
@@ -248,7 +249,7 @@ def estimate_near(cameras: Cameras, points: Tensor | None) -> float:
     """
     if points is None or not len(points):
         return NEAR
-    points = points[evenly_spaced(len(points), MOST_POINTS).to(points.device)]
+    points = points[evenly_spaced(len(points), MAX_POINTS).to(points.device)]
     visible_distances = []
     for index in range(len(cameras)):
         columns, rows, ahead = cameras.project(points, index)

@@ -10,12 +10,18 @@ from torch import Tensor, nn
 
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.carried import carried_poses
+from nerfloom.cameras.pose_propagation import propagated_poses
 from nerfloom.cameras.rigid_motion import rigid_motions
 from nerfloom.geometry.rays import Rays
 
 Group = Literal["SO3xR3", "SE3"]
 """Parameterisation of a small rigid motion."""
+POSE_REASONS = {
+    "exact": "the poses are exact",
+    "photographs": "the poses were estimated from the photographs",
+    "device": "the poses were tracked by the device",
+}
+"""Reason for or against refining poses, by their source (`Scene.poses`)."""
 
 
 class PoseRefinement(nn.Module):
@@ -25,8 +31,8 @@ class PoseRefinement(nn.Module):
         count: number of cameras.
         group: SO3xR3: the camera is rotated about its own centre, and the centre is translated. SE3: one screw motion
             about the scene's origin.
-        given: (count, 3, 4) poses to be refined. Other cameras then follow nearby training cameras (`carried_poses`),
-            because all training cameras may drift together with the scene. If None, other cameras stay unchanged.
+        given: (count, 3, 4) poses to be refined. Other cameras then follow nearby ones (`propagated_poses`), because
+            all training cameras may drift together with the scene. If None, other cameras stay unchanged.
     """
 
     given: Tensor | None
@@ -49,7 +55,7 @@ class PoseRefinement(nn.Module):
     def forward(self, rays: Rays) -> Rays:
         """Move the rays of training cameras by their refinements, and those of other cameras as their neighbours."""
         if rays.camera_indices is None:
-            return self.carried(rays)
+            return self.propagated(rays)
         # Not `motions[camera_indices]`: the order of summation of its gradient depends on the threads.
         motions = nn.functional.embedding(rays.camera_indices, self.motions().flatten(1)).view(-1, 3, 4)
         directions = (motions[:, :, :3] * rays.directions[:, None]).sum(-1)
@@ -59,7 +65,7 @@ class PoseRefinement(nn.Module):
         return replace(rays, origins=origins + motions[:, :, 3], directions=directions)
 
     @torch.no_grad()
-    def carried(self, rays: Rays) -> Rays:
+    def propagated(self, rays: Rays) -> Rays:
         """Transform `rays` from the given poses' frame to the refined poses'; lengths are scaled too."""
         if self.given is None:
             return rays
@@ -68,7 +74,7 @@ class PoseRefinement(nn.Module):
             origins = origins[:1]
         axes = torch.eye(3).to(origins).expand(len(origins), 3, 3)
         poses = torch.cat([axes, origins[:, :, None]], dim=-1)
-        moved, scale = carried_poses(poses, self.given, self._moved(self.given))
+        moved, scale = propagated_poses(poses, self.given, self._moved(self.given))
         return replace(
             rays,
             origins=moved[:, :, 3].expand_as(rays.origins),
@@ -78,13 +84,13 @@ class PoseRefinement(nn.Module):
         )
 
     @torch.no_grad()
-    def carried_pose(self, pose: Tensor) -> Tensor:
-        """Move the pose of another camera like nearby training cameras (`carried_poses`).
+    def propagated_pose(self, pose: Tensor) -> Tensor:
+        """Move the pose of another camera like nearby training cameras (`propagated_poses`).
 
         Args:
             pose: (3, 4) camera-to-scene pose.
         """
-        return pose if self.given is None else carried_poses(pose[None], self.given, self._moved(self.given))[0][0]
+        return pose if self.given is None else propagated_poses(pose[None], self.given, self._moved(self.given))[0][0]
 
     def pose(self, index: int, given: Tensor) -> Tensor:
         """Return the refined pose (3, 4) of a training camera, with a gradient.

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nerfloom.kernels.dispatch import TORCH, Operation
 from nerfloom.kernels.math import cross_matrix
 
-SMALL = 0.25
+MAX_SERIES_ANGLE = 0.25
 """Below this squared angle the factors are computed as series, which neither divide by 0 nor cancel."""
 
 
@@ -53,7 +53,7 @@ def _closed_form(tangents: Tensor, screw: bool) -> Tensor:
     """Compute `rigid_motions` in closed form, which is faster and does not wait for the device."""
     translation, rotation = tangents[:, :3], tangents[:, 3:]
     squared = rotation.square().sum(-1)[:, None, None]
-    small = squared < SMALL
+    small = squared < MAX_SERIES_ANGLE
     # Each form gets valid arguments, so that the unused one has a finite gradient.
     near, angle = torch.where(small, squared, 0), torch.where(small, 1, squared).sqrt()
     first = torch.where(small, _series(near, 1), angle.sin() / angle)

@@ -14,7 +14,7 @@ from nerfloom.kernels.math import safe_normalize
 NEIGHBOURS = 3
 """Number of neighbouring cameras whose poses are averaged into an unobserved view."""
 REACH = 1.25
-"""Size of the triangle from which positions are drawn, relative to the triangle of the three cameras."""
+"""Size of the triangle that positions are drawn from, relative to the triangle of the three cameras."""
 
 
 def unseen_patches(rays: Rays, poses: Tensor, side: int, stride: float = 1.0) -> Rays:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-LEAST_TURN = 0.15
+MIN_TURN = 0.15
 """Minimum difference of second moments of the column axes, in their plane minus across it: that of an 80 degree arc."""
-CLEARER = 2.0
+MIN_CLARITY_RATIO = 2.0
 """Minimum ratio of clarity of the plane of the column axes to that of the row axes."""
-LEAST_WIDTH = 0.25
+MIN_WIDTH = 0.25
 """Minimum spread of the camera positions along their second principal direction, relative to the first."""
-LOOKING_DOWN = 0.1
+MIN_DOWNWARD = 0.1
 """Minimum mean sine of the downward angle; below it, the viewing direction does not tell up from down."""
 
 
@@ -23,8 +23,8 @@ def sideways_up(poses: Tensor) -> Tensor | None:
     (y) of images that lie on their side. The result is None unless the plane of y is twice as clear as that of x, and
     the cameras stand around something. For cameras in a line, looking up and down turns y in a plane too.
 
-    Up is the normal of this plane for which the cameras look down. If they look neither up nor down, up is the left of
-    the image, as in a phone's photographs stored in sensor orientation.
+    Up is the normal of this plane, on the side that makes the cameras look down. If they look neither up nor down, up
+    is the left of the image, as in a phone's photographs stored in sensor orientation.
 
     Args:
         poses: (M, 3 or 4, 4) camera-to-world, OpenGL axes, of images that were all held the same way.
@@ -38,11 +38,11 @@ def sideways_up(poses: Tensor) -> Tensor | None:
     right, up, ahead, positions = precise[:, :, 0], precise[:, :, 1], -precise[:, :, 2], precise[:, :, 3]
     (_, in_upright), (normal, in_sideways) = _plane(right), _plane(up)
     widths = torch.linalg.svdvals(positions - positions.mean(0))
-    around = bool(widths[1] > LEAST_WIDTH * widths[0])
-    if in_sideways < LEAST_TURN or in_sideways < CLEARER * in_upright or not around:
+    around = bool(widths[1] > MIN_WIDTH * widths[0])
+    if in_sideways < MIN_TURN or in_sideways < MIN_CLARITY_RATIO * in_upright or not around:
         return None
     down = float(ahead.mean(0) @ normal)
-    towards = down if abs(down) > LOOKING_DOWN else float(right.mean(0) @ normal)
+    towards = down if abs(down) > MIN_DOWNWARD else float(right.mean(0) @ normal)
     return -normal if towards > 0 else normal
 
 

@@ -12,10 +12,8 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, nearest
 from nerfloom.cli.bench_flags import FramesFlags, KernelFlags, MethodFlags, ProfileFlags
 from nerfloom.cli.bench_gpu import GpuFlags, measure_gpu
-from nerfloom.cli.bench_results import write_results
-from nerfloom.cli.common import chosen_kind, make_room, run_command
-from nerfloom.cli.flags import read_flags
-from nerfloom.training.run_path import check_data
+from nerfloom.cli.bench_results import run_benchmark, write_results
+from nerfloom.cli.common import make_room, run_command
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -37,13 +35,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    if (chosen := chosen_kind(arguments, KINDS, USAGE, "there is no benchmark")) is None:
-        return
-    name, (flags, run), rest = chosen
-    settings = read_flags(flags, f"ns-bench {name}", rest)
-    if getattr(settings, "data", None) is not None:
-        check_data(settings.data)
-    run(settings)
+    run_benchmark("ns-bench", arguments, KINDS, USAGE)
 
 
 def _kernels(flags: KernelFlags) -> None:

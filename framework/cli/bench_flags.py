@@ -69,6 +69,6 @@ class ProfileFlags:
     steps: int = 900
     """Training steps before the measurement."""
     max_seconds: float = 45.0
-    """Time budget from which the method chooses its settings, seconds; training does not stop after it."""
+    """Time budget for the method's choice of settings, seconds; training does not stop after it."""
     output_dir: Path = RESULTS
     """Folder of profile-step.json; a row for the method is added."""

@@ -11,9 +11,9 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cli.bench_results import RESULTS, write_results
 from nerfloom.cli.common import make_room
 
-AROUND, STEPS_SECONDS = 30.0, 60.0
+SETUP_SECONDS, STEPS_SECONDS = 30.0, 60.0
 """Expected seconds of a method's start and evaluation, and of the timed steps."""
-BEFORE = 300
+WARM_UP_STEPS = 300
 """Training steps before the timed ones; CUDA graphs are captured during these steps."""
 
 
@@ -69,7 +69,7 @@ def measure_gpu(flags: GpuFlags) -> None:
     make_room(path)
     device = torch.device("cuda")
     plan = gpu_plan(flags.data, flags.seconds, flags.run_dir or Path("outputs") / f"bench-gpu-{name}")
-    training = len(METHODS) * (flags.seconds + AROUND)
+    training = len(METHODS) * (flags.seconds + SETUP_SECONDS)
     parts = (
         Part(
             "kernels",
@@ -77,7 +77,7 @@ def measure_gpu(flags: GpuFlags) -> None:
             lambda left: measured_kernels(device, flags.samples, flags.repeats, left - training - STEPS_SECONDS),
         ),
         Part("training", training, lambda left: {"training": reached(compare(plan))}),
-        Part("CUDA graphs", STEPS_SECONDS, lambda left: {"steps": timed_steps(device, BEFORE, flags.steps)}),
+        Part("CUDA graphs", STEPS_SECONDS, lambda left: {"steps": timed_steps(device, WARM_UP_STEPS, flags.steps)}),
     )
     in_time(parts, flags.limit, lambda found: write_results(path, found))
 

@@ -1,16 +1,40 @@
-"""Result files of `ns-bench`."""
+"""Choice of a benchmark, and its result files, for `ns-bench` and `python -m benchmarks`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from nerfloom.base.console import say
+from nerfloom.cli.common import chosen_kind
+from nerfloom.cli.flags import read_flags
+from nerfloom.training.run_path import check_data
 
 RESULTS = Path("docs/results")
 """Default folder of the results."""
 PICTURES = Path("docs/pictures")
 """Default folder of pictures."""
+
+
+def run_benchmark(
+    command: str, arguments: list[str], kinds: Mapping[str, tuple[type, Callable[[Any], None]]], usage: str
+) -> None:
+    """Run the benchmark that the first argument names, or print the help.
+
+    Args:
+        command: the command, for the help.
+        arguments: its arguments.
+        kinds: flags and function of each benchmark by name.
+        usage: text of the help.
+    """
+    if (chosen := chosen_kind(arguments, kinds, usage, "there is no benchmark")) is None:
+        return
+    name, (flags, run), rest = chosen
+    settings: Any = read_flags(flags, f"{command} {name}", rest)
+    if getattr(settings, "data", None) is not None:
+        check_data(settings.data)
+    run(settings)
 
 
 def write_results(path: Path, content: dict[str, Any]) -> None:

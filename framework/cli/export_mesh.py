@@ -62,7 +62,7 @@ class TsdfFlags(MeshFlags):
     """Write a mesh of what the training cameras see, from their fused depth images; works with every method."""
 
     truncation: float = 4.0
-    """Maximum distance from the surface at which depth images count, cells; larger is smoother, smaller keeps thin
+    """Depth images count up to this distance from the surface, cells; larger is smoother, smaller keeps thin
     parts."""
     max_num_views: int = 200
     """Maximum number of rendered training views, evenly spaced."""

@@ -26,7 +26,7 @@ from nerfloom.data.parsed_scene import DataParser
 from nerfloom.losses.few_images import FewImagesConfig
 from nerfloom.samplers.background import BackgroundConfig
 from nerfloom.samplers.choice import HierarchicalConfig, SamplingConfig
-from nerfloom.scene.motion import MotionConfig
+from nerfloom.samplers.motion import MotionConfig
 
 EVERYDAY = "everyday"
 """Title of the group that `--help` shows; `--help-all` shows all groups."""
@@ -61,7 +61,6 @@ def grouped_flags(
 
     Args:
         method: the method's name.
-        config: the method's settings.
         data_format: the data format's name.
         parser: the data format with its settings.
         everyday: whether the help shows only the everyday flags.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError, FlagError
@@ -95,14 +96,6 @@ class Record3DFlags(PhoneFlags):
     """Convert Record3D's export with EXR and RGBD."""
 
 
-KINDS: dict[str, type[OutputFlags]] = {
-    "images": ImagesFlags,
-    "video": VideoFlags,
-    "polycam": PolycamFlags,
-    "record3d": Record3DFlags,
-}
-
-
 def main() -> None:
     """Run ns-process-data on the arguments of the process."""
     run_command(_command)
@@ -111,17 +104,18 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
         return
-    name, kind, rest = chosen
+    name, (kind, process), rest = chosen
     words = _spelt_out(rest, kind)
     if (other := _what_it_is(name, words)) is not None:
         name, words = other
-        kind = KINDS[name]
+        kind, process = KINDS[name]
     flags = read_flags(kind, f"ns-process-data {name}", words)
     flags.check()
     try:
-        _process(flags)
+        _check_input(flags)
+        process(flags)
     except KeyboardInterrupt as stop:
-        kept = "--resume continues with the features and matches so far, " if isinstance(flags, ColmapFlags) else ""
+        kept = "--resume continues with the features and matches so far, " if flags.can_resume else ""
         note = f"interrupted; {flags.output_dir} is unfinished; {kept}--overwrite starts again"
         raise Stopped(signal_of(stop), note) from None
 
@@ -154,59 +148,82 @@ def _spelt_out(arguments: list[str], kind: type[OutputFlags]) -> list[str]:
     return words
 
 
-def _process(flags: OutputFlags) -> None:
+def _check_input(flags: OutputFlags) -> None:
     from nerfloom.processing.output import check_apart
 
     if not flags.data.exists():
         raise DataError(f"--data {flags.data}: there is no such file or folder")
     check_apart(flags.output_dir, flags.data)
-    if isinstance(flags, ColmapFlags):
-        _find_poses(flags)
-    else:
-        _convert(flags)
 
 
-def _find_poses(flags: ColmapFlags) -> None:
+def _is_finished(flags: ColmapFlags) -> bool:
+    """Return whether there is nothing to resume, and say so; raise ConfigError if COLMAP is missing."""
     from nerfloom.processing import colmap
-    from nerfloom.processing.ffmpeg import frame_count
-    from nerfloom.processing.job import Job
-    from nerfloom.processing.listing import find_images
-    from nerfloom.processing.output import FINISHED, begin, ready
-    from nerfloom.processing.pipeline import process
-    from nerfloom.processing.sequence import is_sequence
-    from nerfloom.processing.unfinished import frames_of
+    from nerfloom.processing.output import FINISHED, ready
 
     colmap.require()
-    if flags.resume and (flags.output_dir / FINISHED).exists():
+    finished = flags.resume and (flags.output_dir / FINISHED).exists()
+    if finished:
         say(f"nothing to resume: it is finished. {ready(flags.output_dir)}")
+    return finished
+
+
+def _process_images(flags: ImagesFlags) -> None:
+    from nerfloom.processing.job import Job
+    from nerfloom.processing.listing import find_images
+    from nerfloom.processing.output import begin
+    from nerfloom.processing.pipeline import process
+    from nerfloom.processing.sequence import is_sequence
+
+    if _is_finished(flags):
         return
-    if isinstance(flags, VideoFlags):
-        frame_count(flags.data)  # before anything is removed, check that the video can be read
-        begin(flags, [Path(flags.data.name)])
-        job = Job(flags, ordered=True)
-        with job.timed("reading the video"):
-            folder, sources = frames_of(flags.output_dir, flags.data, flags.num_frames_target)
-        process(job, folder, sources, None)
-        return
-    masks = flags.masks_dir if isinstance(flags, ImagesFlags) else None
-    sources = find_images(flags.data, [flags.output_dir, *([] if masks is None else [masks])])
+    sources = find_images(flags.data, [flags.output_dir, *([] if flags.masks_dir is None else [flags.masks_dir])])
     begin(flags, sources)
-    process(Job(flags, ordered=is_sequence(sources)), flags.data, sources, masks)
+    process(Job(flags, ordered=is_sequence(sources)), flags.data, sources, flags.masks_dir)
 
 
-def _convert(flags: OutputFlags) -> None:
-    from nerfloom.processing import polycam, record3d
+def _process_video(flags: VideoFlags) -> None:
+    from nerfloom.processing.ffmpeg import frame_count
+    from nerfloom.processing.job import Job
+    from nerfloom.processing.output import begin
+    from nerfloom.processing.pipeline import process
+    from nerfloom.processing.unfinished import frames_of
+
+    if _is_finished(flags):
+        return
+    frame_count(flags.data)  # before anything is removed, check that the video can be read
+    begin(flags, [Path(flags.data.name)])
+    job = Job(flags, ordered=True)
+    with job.timed("reading the video"):
+        folder, sources = frames_of(flags.output_dir, flags.data, flags.num_frames_target)
+    process(job, folder, sources, None)
+
+
+def _convert_polycam(flags: PolycamFlags) -> None:
     from nerfloom.processing.output import claim
+    from nerfloom.processing.polycam import check, convert
 
-    if isinstance(flags, PolycamFlags):
-        polycam.check(flags.data)
-        claim(flags.output_dir, flags.data, flags.overwrite)
-        crop = flags.crop_border_pixels
-        polycam.convert(flags.data, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
-    elif isinstance(flags, Record3DFlags):
-        record3d.find_root(flags.data)
-        claim(flags.output_dir, flags.data, flags.overwrite)
-        record3d.convert(flags.data, flags.output_dir, flags.num_downscales, flags.most)
+    check(flags.data)
+    claim(flags.output_dir, flags.data, flags.overwrite)
+    crop = flags.crop_border_pixels
+    convert(flags.data, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
+
+
+def _convert_record3d(flags: Record3DFlags) -> None:
+    from nerfloom.processing.output import claim
+    from nerfloom.processing.record3d import convert, find_root
+
+    find_root(flags.data)
+    claim(flags.output_dir, flags.data, flags.overwrite)
+    convert(flags.data, flags.output_dir, flags.num_downscales, flags.most)
+
+
+KINDS: dict[str, tuple[type[OutputFlags], Callable[[Any], None]]] = {
+    "images": (ImagesFlags, _process_images),
+    "video": (VideoFlags, _process_video),
+    "polycam": (PolycamFlags, _convert_polycam),
+    "record3d": (Record3DFlags, _convert_record3d),
+}
 
 
 if __name__ == "__main__":

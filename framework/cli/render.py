@@ -13,15 +13,7 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.from_nerfstudio import render_answer
 from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
-from nerfloom.cli.render_flags import (
-    PATHS,
-    USAGE,
-    CameraPathFlags,
-    DatasetFlags,
-    Flags,
-    TimeFlags,
-    check_flags,
-)
+from nerfloom.cli.render_flags import PATHS, USAGE, PathFlags
 from nerfloom.cli.run_flags import OPENS
 from nerfloom.evaluation.video_suffixes import check_suffix
 
@@ -57,14 +49,11 @@ def _command(arguments: list[str]) -> None:
     _render(name, flags, named)
 
 
-def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
-    check_flags(flags)
+def _render(name: str, flags: PathFlags, named: DataFormat | None) -> None:
+    flags.check()
     check_suffix(flags.output_path)
     found = flags.run.check()
-    output = flags.output_path
-    is_folder = not output.suffix
-    if isinstance(flags, DatasetFlags) and is_folder:
-        output = output / flags.split
+    output, is_folder = flags.folder_or_file, not flags.output_path.suffix
     make_room(output / "render.json" if is_folder else output)
     from contextlib import nullcontext
 
@@ -78,7 +67,7 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     loaded = flags.run.load(found, rays_per_pixel=flags.outputs.rays_per_pixel, data_format=named)
     model = loaded.model
     outputs = chosen_outputs(model, flags.outputs.rendered_output_names)
-    views, background = _views(flags, loaded), model.background
+    views, background = _views(name, flags, loaded), model.background
     facts = _facts(name, flags, loaded, views)
     if is_folder:
         _check_folder(output, facts)
@@ -97,18 +86,13 @@ def _render(name: str, flags: Flags, named: DataFormat | None) -> None:
     frames.remove()
 
 
-def _views(flags: Flags, loaded: Loaded) -> Views:
+def _views(name: str, flags: PathFlags, loaded: Loaded) -> Views:
     """Return what is rendered, at its final size."""
     import torch
 
-    from nerfloom.cli.render_paths import camera_path_views, dataset_views, path_views
+    from nerfloom.cli.render_paths import VIEWS
 
-    if isinstance(flags, CameraPathFlags):
-        views = camera_path_views(flags, loaded)
-    elif isinstance(flags, DatasetFlags):
-        views = dataset_views(flags, loaded)
-    else:
-        views = path_views(flags, loaded)
+    views = VIEWS[name](flags, loaded)
     sizes = torch.stack([views.cameras.widths, views.cameras.heights])
     if int(sizes.min()) < 1:
         raise ConfigError(f"--downscale-factor {flags.outputs.downscale_factor} leaves no pixel")
@@ -117,7 +101,7 @@ def _views(flags: Flags, loaded: Loaded) -> Views:
     return views
 
 
-def _facts(name: str, flags: Flags, loaded: Loaded, views: Views) -> dict[str, Any]:
+def _facts(name: str, flags: PathFlags, loaded: Loaded, views: Views) -> dict[str, Any]:
     """Return everything that determines the pictures, as plain data."""
     from nerfloom.base.config import to_plain
     from nerfloom.evaluation.frames import hash_of_file, hash_of_tensors
@@ -161,7 +145,7 @@ def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
 
 
 def _write(
-    flags: Flags, frames: Frames, output: Path, views: Views, facts: dict[str, Any], outputs: Sequence[Output]
+    flags: PathFlags, frames: Frames, output: Path, views: Views, facts: dict[str, Any], outputs: Sequence[Output]
 ) -> None:
     """Write the requested files, and print their paths."""
     from nerfloom.base.console import say, track
@@ -178,9 +162,7 @@ def _write(
             _write_depths(flags, frames, output / name, stems, name)
             names.remove(name)
     ranges = {name: _colored_range(flags, frames, name, kinds[name]) for name in names if kinds[name] in NUMBERS}
-    apart = flags.files.apart
-    if apart is None:
-        apart = isinstance(flags, DatasetFlags) and is_folder
+    apart = flags.shows_images and is_folder if flags.files.apart is None else flags.files.apart
     for group in [[name] for name in names] if apart else [names] if names else []:
         pictures = (side_by_side([shown_output(kept, name, ranges) for name in group]) for kept in frames)
         shown = track(pictures, "Writing", total=frames.count)
@@ -191,7 +173,7 @@ def _write(
             say(f"{frames.count} images ({', '.join(group)}): {folder}")
             continue
         file = output.with_name(f"{output.stem}-{group[0]}{output.suffix}") if apart and len(names) > 1 else output
-        if isinstance(flags, TimeFlags) and file.suffix.lower() == ".png":
+        if flags.png_is_strip and file.suffix.lower() == ".png":
             write_strip(file, shown)
         else:
             write_video(file, shown, views.fps)
@@ -200,7 +182,7 @@ def _write(
         write_file(output / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
 
 
-def _colored_range(flags: Flags, frames: Frames, name: str, kind: str) -> tuple[float, float]:
+def _colored_range(flags: PathFlags, frames: Frames, name: str, kind: str) -> tuple[float, float]:
     """Return and print the values at the ends of an output's colour map; flags set the range of distances."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.outputs import distance_range
@@ -214,24 +196,24 @@ def _colored_range(flags: Flags, frames: Frames, name: str, kind: str) -> tuple[
     return near, far
 
 
-def _write_depths(flags: Flags, frames: Frames, folder: Path, stems: Sequence[str], name: str) -> None:
+def _write_depths(flags: PathFlags, frames: Frames, folder: Path, stems: Sequence[str], name: str) -> None:
     """Write distances as numbers, with depth.json, which gives their unit."""
     from nerfloom.base.console import say, track
     from nerfloom.evaluation.frames import write_file
     from nerfloom.evaluation.outputs import largest_distance, opaque_distance
-    from nerfloom.evaluation.videos import MOST, write_distances
+    from nerfloom.evaluation.videos import MAX_UINT16, write_distances
 
     packed = flags.files.depth_format == "png16"
     farthest = flags.outputs.depth_far_plane
     if packed and farthest is None:
         farthest = largest_distance(track(frames, "Measuring distances", total=frames.count), name)
-    unit = (farthest or 1.0) / MOST if packed else 1.0
+    unit = (farthest or 1.0) / MAX_UINT16 if packed else 1.0
     distances: Iterator[np.ndarray] = map(partial(opaque_distance, name=name), frames)
     suffix = ".png" if packed else ".npy"
     paths = [folder / f"{stem}{suffix}" for stem in stems]
     write_distances(paths, track(distances, "Writing", total=frames.count), unit)
     meaning = {"unit": unit, "distance": "along the ray, in units of the input: the file's value times 'unit'"}
-    meaning |= {"unknown": 0, "saturated": MOST} if packed else {"unknown": 0}
+    meaning |= {"unknown": 0, "saturated": MAX_UINT16} if packed else {"unknown": 0}
     write_file(folder / "depth.json", (json.dumps(meaning, indent=2) + "\n").encode())
     say(f"{frames.count} maps of {name} (unit {unit:.6g} of the input): {folder}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from nerfloom.base.config import RaysPerPixel
 from nerfloom.base.errors import FlagError
@@ -38,7 +38,7 @@ class ViewFlags:
     """Outputs of a view, and their colours."""
 
     rendered_output_names: tuple[str, ...] = ("rgb",)
-    """Outputs, from left to right. rgb: colour; depth: mean distance; median_depth: distance at which half of the light
+    """Outputs, from left to right. rgb: colour; depth: mean distance; median_depth: distance where half of the light
     is absorbed; accumulation: opacity; outputs of the method, such as normals; with 'dataset' also gt-rgb: the
     photograph, and error: the difference from it."""
     depth_near_plane: float | None = None
@@ -76,6 +76,59 @@ class PathFlags:
     """Outputs of a view, and their colours."""
     files: FileFlags = field(default_factory=FileFlags)
     """Output files."""
+    output_path: Path = Path()
+    """File or folder to write."""
+    fps: float | None = None
+    """Frames per second."""
+    shows_images: ClassVar[bool] = False
+    """Whether it renders the cameras of images, which have true colours; their outputs go to folders of their own."""
+    png_is_strip: ClassVar[bool] = False
+    """Whether a PNG file shows the frames side by side; if not, it is an animation."""
+
+    def check(self) -> None:
+        """Refuse flags that contradict each other or are out of range.
+
+        Raises:
+            FlagError: with what is wrong.
+        """
+        shown, outputs = self.outputs, self.outputs.rendered_output_names
+        if (self.fps is not None and not 0 < self.fps <= 1000) or shown.downscale_factor < 1:
+            raise FlagError("--downscale-factor must be at least 1, --fps more than 0 and at most 1000")
+        if not outputs or len(set(outputs)) < len(outputs):
+            raise FlagError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
+        if not self.shows_images and (unknown := {"error", "gt-rgb"} & set(outputs)):
+            raise FlagError(f"--rendered-output-names {min(unknown)}: only 'ns-render dataset' has true images")
+        near, far = shown.depth_near_plane, shown.depth_far_plane
+        if not 0 <= (near or 0) < (1e30 if far is None else far):
+            raise FlagError(f"--depth-near-plane {near} and --depth-far-plane {far}: near must be from 0 to far")
+        if self.files.depth_format != "color":
+            if not {"depth", "median_depth"} & set(outputs):
+                raise FlagError(f"--depth-format {self.files.depth_format}: add depth to --rendered-output-names")
+            if self.output_path.suffix:
+                raise FlagError(
+                    f"--depth-format {self.files.depth_format} needs a folder: --output-path without an extension, "
+                    f"such as {self.output_path.with_suffix('')}"
+                )
+
+    @property
+    def folder_or_file(self) -> Path:
+        """Folder or file that is written."""
+        return self.output_path
+
+
+@dataclass(frozen=True)
+class FramesFlags(PathFlags):
+    """Flags of paths with a chosen number of frames."""
+
+    num_frames: int = 48
+    """Number of frames."""
+    fps: float = 16.0
+    """Frames per second."""
+
+    def check(self) -> None:
+        super().check()
+        if self.num_frames < 1:
+            raise FlagError(f"--num-frames is {self.num_frames}; it must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -93,19 +146,17 @@ class CameraPathFlags(PathFlags):
 
 
 @dataclass(frozen=True)
-class InterpolateFlags(PathFlags):
+class InterpolateFlags(FramesFlags):
     """Render a smooth walk past the training cameras, in the order of their images' names: 2.jpg before 10.jpg."""
 
     output_path: Path = Path("interpolate.gif")
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
     num_frames: int = 96
     """Number of frames."""
-    fps: float = 16.0
-    """Frames per second."""
 
 
 @dataclass(frozen=True)
-class SpiralFlags(PathFlags):
+class SpiralFlags(FramesFlags):
     """Render a spiral around the mean camera, for cameras that look the same way (LLFF's path)."""
 
     output_path: Path = Path("spiral.gif")
@@ -117,9 +168,14 @@ class SpiralFlags(PathFlags):
     radius: float | None = None
     """Radius along each axis of the camera, scene units. Default: from the spread of the cameras."""
 
+    def check(self) -> None:
+        super().check()
+        if self.radius is not None and not 0 < self.radius < 1e9:
+            raise FlagError(f"--radius is {self.radius:g}; it must be above zero")
+
 
 @dataclass(frozen=True)
-class OrbitFlags(PathFlags):
+class OrbitFlags(FramesFlags):
     """Render a horizontal circle around the scene, with the mean height and distance of the training cameras.
 
     If the photographs of a capture leave out a sixth of the circle or more, the path swings over their part and back.
@@ -127,10 +183,6 @@ class OrbitFlags(PathFlags):
 
     output_path: Path = Path("orbit.gif")
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images."""
-    num_frames: int = 48
-    """Number of frames."""
-    fps: float = 16.0
-    """Frames per second."""
     full_circle: bool = False
     """Render the full circle around a capture even where photographs are missing, instead of a swing and back."""
     time: float | None = None
@@ -138,7 +190,7 @@ class OrbitFlags(PathFlags):
 
 
 @dataclass(frozen=True)
-class TimeFlags(PathFlags):
+class TimeFlags(FramesFlags):
     """Render the view of one camera while time runs from 0 to 1."""
 
     output_path: Path = Path("time.gif")
@@ -146,8 +198,7 @@ class TimeFlags(PathFlags):
     folder of images."""
     num_frames: int = 32
     """Number of frames."""
-    fps: float = 16.0
-    """Frames per second."""
+    png_is_strip = True
     split: Literal["train", "val", "test"] = "test"
     """Split of the camera."""
     camera_index: int = 0
@@ -166,10 +217,14 @@ class DatasetFlags(PathFlags):
     """Frames per second of a video."""
     split: Literal["train", "val", "test"] = "test"
     """Split to render."""
+    shows_images = True
+
+    @property
+    def folder_or_file(self) -> Path:
+        return self.output_path if self.output_path.suffix else self.output_path / self.split
 
 
-Flags = CameraPathFlags | InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags | DatasetFlags
-PATHS: dict[str, type[Flags]] = {
+PATHS: dict[str, type[PathFlags]] = {
     "camera-path": CameraPathFlags,
     "interpolate": InterpolateFlags,
     "spiral": SpiralFlags,
@@ -178,35 +233,3 @@ PATHS: dict[str, type[Flags]] = {
     "dataset": DatasetFlags,
 }
 """Name of a path -> its flags."""
-
-
-def check_flags(flags: Flags) -> None:
-    """Refuse flags that contradict each other or are out of range.
-
-    Args:
-        flags: flags of a path.
-
-    Raises:
-        FlagError: with what is wrong.
-    """
-    shown, outputs = flags.outputs, flags.outputs.rendered_output_names
-    count = 1 if isinstance(flags, (CameraPathFlags, DatasetFlags)) else flags.num_frames
-    if count < 1 or (flags.fps is not None and not 0 < flags.fps <= 1000) or shown.downscale_factor < 1:
-        raise FlagError("--num-frames and --downscale-factor must be at least 1, --fps more than 0 and at most 1000")
-    if not outputs or len(set(outputs)) < len(outputs):
-        raise FlagError(f"--rendered-output-names {' '.join(outputs)}: name at least one output, and each once")
-    if not isinstance(flags, DatasetFlags) and (unknown := {"error", "gt-rgb"} & set(outputs)):
-        raise FlagError(f"--rendered-output-names {min(unknown)}: only 'ns-render dataset' has true images")
-    if isinstance(flags, SpiralFlags) and flags.radius is not None and not 0 < flags.radius < 1e9:
-        raise FlagError(f"--radius is {flags.radius:g}; it must be above zero")
-    near, far = shown.depth_near_plane, shown.depth_far_plane
-    if not 0 <= (near or 0) < (1e30 if far is None else far):
-        raise FlagError(f"--depth-near-plane {near} and --depth-far-plane {far}: near must be at least 0, below far")
-    if flags.files.depth_format != "color":
-        if not {"depth", "median_depth"} & set(outputs):
-            raise FlagError(f"--depth-format {flags.files.depth_format}: add depth to --rendered-output-names")
-        if flags.output_path.suffix:
-            raise FlagError(
-                f"--depth-format {flags.files.depth_format} needs a folder: --output-path without an extension, "
-                f"such as {flags.output_path.with_suffix('')}"
-            )

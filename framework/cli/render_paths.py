@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from nerfloom.cameras.poses import looked_at
 from nerfloom.cli.render_flags import (
     CameraPathFlags,
     DatasetFlags,
+    FramesFlags,
     InterpolateFlags,
     OrbitFlags,
     SpiralFlags,
@@ -40,7 +42,7 @@ from nerfloom.evaluation.paths import (
     spiral,
     stretches,
 )
-from nerfloom.scene.folds import in_order
+from nerfloom.scene.folded_poses import in_order
 from nerfloom.training.loaded import Loaded
 
 
@@ -86,65 +88,64 @@ def camera_path_views(flags: CameraPathFlags, loaded: Loaded) -> Views:
     return Views(cameras, times, path.fps if flags.fps is None else flags.fps)
 
 
-def path_views(flags: InterpolateFlags | SpiralFlags | OrbitFlags | TimeFlags, loaded: Loaded) -> Views:
-    """Return the views of a path that follows from the data's cameras.
+def path_views(
+    flags: FramesFlags, loaded: Loaded, parsed: ParsedScene, cameras: Cameras, moment: float | None = None
+) -> Views:
+    """Return the views of cameras that follow from the data's.
 
     Args:
         flags: flags of the path.
         loaded: what is rendered.
-
-    Raises:
-        DataError: if the data cannot be read.
-        ConfigError: if a flag does not fit the run.
+        parsed: the data.
+        cameras: F cameras, as large as the data's files.
+        moment: time of all frames of a moving scene; None if it runs from 0 to 1.
     """
-    scene, count = loaded.model.scene, flags.num_frames
-    if loaded.source is None and isinstance(flags, OrbitFlags):
-        cameras = orbit(around(scene), scene.box.mean(0).cpu(), count).scaled(1 / flags.outputs.downscale_factor)
-        return Views(cameras.to(loaded.model.device), None, flags.fps)
-    parsed = loaded.run.parse(flags.split if isinstance(flags, TimeFlags) else "train")
-    moving = scene.moving
-    times = torch.linspace(0, 1, count) if moving else None
-    if isinstance(flags, TimeFlags):
-        cameras = _one_camera(flags, parsed, moving)
-    elif isinstance(flags, OrbitFlags):
-        cameras, times = _circle(flags, loaded, parsed)
-    elif isinstance(flags, SpiralFlags):
-        cameras = _spiral(flags, loaded, parsed)
-    else:
-        cameras = walk_past(parsed, count)
+    times, count = None, len(cameras)
+    if loaded.model.scene.moving:
+        times = torch.linspace(0, 1, count) if moment is None else torch.full((count,), moment)
     cameras = cameras.scaled(1 / (flags.outputs.downscale_factor * parsed.downscale_factor))
     return Views(cameras.to(loaded.model.device), times, flags.fps)
 
 
-def _one_camera(flags: TimeFlags, parsed: ParsedScene, moving: bool) -> Cameras:
-    if not moving:
+def _interpolated(flags: InterpolateFlags, loaded: Loaded) -> Views:
+    parsed = loaded.run.parse("train")
+    return path_views(flags, loaded, parsed, walk_past(parsed, flags.num_frames))
+
+
+def _one_camera(flags: TimeFlags, loaded: Loaded) -> Views:
+    parsed = loaded.run.parse(flags.split)
+    if not loaded.model.scene.moving:
         raise ConfigError("ns-render time: the photographs of this run have no times")
     if not 0 <= flags.camera_index < len(parsed.cameras):
         last = len(parsed.cameras) - 1
         raise FlagError(f"--camera-index is {flags.camera_index}; '{flags.split}' has cameras 0 to {last}")
-    return parsed.cameras[torch.full((flags.num_frames,), flags.camera_index)]
+    cameras = parsed.cameras[torch.full((flags.num_frames,), flags.camera_index)]
+    return path_views(flags, loaded, parsed, cameras)
 
 
-def _circle(flags: OrbitFlags, loaded: Loaded, parsed: ParsedScene) -> tuple[Cameras, Tensor | None]:
+def _circle(flags: OrbitFlags, loaded: Loaded) -> Views:
     scene = loaded.model.scene
+    if loaded.source is None:
+        middle, factor = scene.box.mean(0).cpu(), flags.outputs.downscale_factor
+        cameras = orbit(around(scene), middle, flags.num_frames).scaled(1 / factor)
+        return Views(cameras.to(loaded.model.device), None, flags.fps)
+    parsed = loaded.run.parse("train")
     if scene.warped:
         raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
     # An object's centre is the box's; a capture's is the point that its cameras look at.
-    middle = looked_at(parsed.cameras.camera_to_worlds) if scene.unbounded else None
-    middle = scene.box.mean(0).cpu() if middle is None else middle.float()
+    target = looked_at(parsed.cameras.camera_to_worlds) if scene.unbounded else None
+    middle = scene.box.mean(0).cpu() if target is None else target.float()
     # Around an object all directions are rendered; a capture is known only in the directions of its photographs.
     arc = arc_of(parsed.cameras, middle) if scene.unbounded and not flags.full_circle else None
     if arc is not None:
-        around = f"the photographs go around {math.degrees(arc.width):.0f} of 360 degrees"
-        say(f"{around}: the path swings there and back (--full-circle True goes all around)")
-    cameras = orbit(parsed.cameras, middle, flags.num_frames, arc)
-    if flags.time is None:
-        return cameras, torch.linspace(0, 1, flags.num_frames) if scene.moving else None
-    if not scene.moving:
+        swept = f"the photographs go around {math.degrees(arc.width):.0f} of 360 degrees"
+        say(f"{swept}: the path swings there and back (--full-circle True goes all around)")
+    if flags.time is not None and not scene.moving:
         raise ConfigError(f"--time {flags.time:g}: the photographs of this run have no times")
-    if not 0 <= flags.time <= 1:
+    if flags.time is not None and not 0 <= flags.time <= 1:
         raise FlagError(f"--time is {flags.time:g}; it must be from 0 to 1")
-    return cameras, torch.full((flags.num_frames,), flags.time)
+    cameras = orbit(parsed.cameras, middle, flags.num_frames, arc)
+    return path_views(flags, loaded, parsed, cameras, flags.time)
 
 
 def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
@@ -165,11 +166,11 @@ def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
     return interpolate(cameras, num_frames)
 
 
-def _spiral(flags: SpiralFlags, loaded: Loaded, parsed: ParsedScene) -> Cameras:
-    model = loaded.model
+def _spiral(flags: SpiralFlags, loaded: Loaded) -> Views:
+    model, parsed = loaded.model, loaded.run.parse("train")
     middle = replace_poses(parsed.cameras, middle_pose(parsed.cameras)[None]).scaled(1 / parsed.downscale_factor)
     focus = focus_distance(model, middle.to(model.device), model.background)
-    return spiral(parsed.cameras, flags.num_frames, focus, flags.radius)
+    return path_views(flags, loaded, parsed, spiral(parsed.cameras, flags.num_frames, focus, flags.radius))
 
 
 def dataset_views(flags: DatasetFlags, loaded: Loaded) -> Views:
@@ -211,3 +212,14 @@ def _stems(names: tuple[str, ...]) -> tuple[str, ...]:
     if max(Counter(stems).values()) == 1:
         return tuple(stems)
     return tuple(f"{index:04d}_{stem}" for index, stem in enumerate(stems))
+
+
+VIEWS: dict[str, Callable[[Any, Loaded], Views]] = {
+    "camera-path": camera_path_views,
+    "interpolate": _interpolated,
+    "spiral": _spiral,
+    "orbit": _circle,
+    "time": _one_camera,
+    "dataset": dataset_views,
+}
+"""The function of each path of `render_flags.PATHS`."""

@@ -18,13 +18,13 @@ from nerfloom.base.processes import from_first, joined_processes, processes
 from nerfloom.cli.common import check_weights
 from nerfloom.cli.next_steps import after_training
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels.residence import on_device
+from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.model import StartsFromImages
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.budget import evaluation_seconds
 from nerfloom.training.checkpoint import FOLDER, list_checkpoints, load_newest
-from nerfloom.training.curve import FEW
+from nerfloom.training.curve import MAX_IMAGES
 from nerfloom.training.datasets import first_split, load_split
 from nerfloom.training.lock import sole_user
 from nerfloom.training.machine import kernels
@@ -35,7 +35,7 @@ from nerfloom.training.signals import Stopped, handled, signal_of
 from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 
-PICTURES = 4
+MAX_PICTURES = 4
 """Maximum number of held-out views whose pictures are written at the end."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
@@ -87,7 +87,7 @@ def _prepare(run: Run) -> Trainer:
     check_weights(run.config.lpips_weights)
     device = choose_device(run.config.machine)
     train_set, images = on_device(load_split(run, "train"), device)
-    eval_set = _held_out(run, device, FEW) if processes().first else None
+    eval_set = _held_out(run, device, MAX_IMAGES) if processes().first else None
     source = run.config.data or ("the embedded scene" if train_set.scene.num_scenes == 1 else "random scenes")
     say(f"{run.method} on {source} ({run.dataparser}), on {device.type}, kernels: {kernels(device)}")
     if processes().count > 1:
@@ -184,7 +184,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         max_images=run.config.max_eval_images,
         seconds=evaluation_seconds(run.config, trainer.state),
         pictures=run.folder / "pictures",
-        max_pictures=PICTURES,
+        max_pictures=MAX_PICTURES,
         lpips_weights=run.config.lpips_weights,
     )
     say(f"test: {evaluation.line()}")  # before files are written, which may fail on a full disk

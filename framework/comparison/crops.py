@@ -14,11 +14,11 @@ import numpy as np
 from nerfloom.evaluation.images import error_map
 from nerfloom.evaluation.view_files import WORST
 
-VIEWS = 3
+MAX_VIEWS = 3
 """Maximum number of views shown."""
 CROP_SHARE = 4
 """Ratio of the image's shorter side to the side of a crop."""
-LEAST_CROP = 32
+MIN_CROP = 32
 """Minimum side of a crop, pixels, if the image is large enough."""
 IMAGE_SUFFIX = "_photograph.png"
 """End of the file name of a held-out image; a render's file name ends in .png only."""
@@ -58,7 +58,7 @@ class View:
     strips: tuple[Strip, ...]
 
 
-def views(folders: Sequence[tuple[str, Path]], count: int = VIEWS) -> list[View]:
+def views(folders: Sequence[tuple[str, Path]], count: int = MAX_VIEWS) -> list[View]:
     """Return views that all contenders have rendered, evenly spaced.
 
     Args:
@@ -108,7 +108,7 @@ def worst_square(errors: np.ndarray) -> tuple[int, int, int]:
         errors: (H, W).
     """
     height, width = errors.shape
-    side = min(max(min(height, width) // CROP_SHARE, LEAST_CROP), height, width)
+    side = min(max(min(height, width) // CROP_SHARE, MIN_CROP), height, width)
     sums = np.pad(errors, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
     inside = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     top, left = np.unravel_index(int(inside.argmax()), inside.shape)

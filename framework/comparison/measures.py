@@ -14,8 +14,8 @@ from typing import Any
 
 from nerfloom.comparison.plan import Conditions, Job
 
-SAME_TIME = 0.01
-"""Relative difference below which times count as equal: a run ends with the step in which its time is up."""
+TIME_TOLERANCE = 0.01
+"""Relative difference below which times count as equal: a run ends with the step that uses up its time."""
 Curve = tuple[tuple[float, float], ...]
 """Pairs (seconds of training, PSNR on the validation views), in order."""
 
@@ -66,7 +66,7 @@ class Measured:
     skipped_steps: int
     curve: Curve
     seconds_to: dict[int, float]
-    """Integer PSNR, dB -> training time at which the curve reached it, seconds."""
+    """Integer PSNR, dB -> training time when the curve reached it, seconds."""
     decisions: tuple[str, ...]
     """Decisions of the scene's profile."""
     skipped: tuple[str, ...]
@@ -87,7 +87,6 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
     """Return the measurements of a job; None if it is not finished or its images are not finite.
 
     Args:
-        job: the job.
         conditions: the conditions of the comparison.
     """
     summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)
@@ -152,7 +151,7 @@ def read_json(path: Path) -> Any:
 
 
 def whole_levels(curve: Curve) -> dict[int, float]:
-    """Return the time at which a curve first reached each integer PSNR, interpolated linearly between its points.
+    """Return the time when a curve first reached each integer PSNR, interpolated linearly between its points.
 
     The level of the first point counts as reached there, because nothing was measured earlier.
 
@@ -228,12 +227,12 @@ def pareto(points: Sequence[tuple[float, float]]) -> list[bool]:
     """Return whether each point is on the Pareto front: no other point has at most its cost and at least its quality.
 
     Args:
-        points: pairs (cost, quality). Lower cost is better, and costs within `SAME_TIME` are equal; higher quality is
-            better. Another point must be strictly better in one of the two.
+        points: pairs (cost, quality). Lower cost is better, and costs within `TIME_TOLERANCE` are equal; higher quality
+            is better. Another point must be strictly better in one of the two.
     """
 
     def dominated(cost: float, quality: float) -> bool:
-        no_costlier = [(c, q) for c, q in points if c <= cost * (1 + SAME_TIME)]
-        return any(q > quality or (q == quality and c < cost * (1 - SAME_TIME)) for c, q in no_costlier)
+        no_costlier = [(c, q) for c, q in points if c <= cost * (1 + TIME_TOLERANCE)]
+        return any(q > quality or (q == quality and c < cost * (1 - TIME_TOLERANCE)) for c, q in no_costlier)
 
     return [not dominated(*point) for point in points]

@@ -20,7 +20,7 @@ FIRST_SEED = 42
 """Seed of the first run of each contender; further runs have the following seeds."""
 CURVE_POINTS = 8
 """Number of evaluations during a run, for its learning curve."""
-LEAST_VIEWS = 25
+MIN_VIEWS = 25
 """Minimum number of views of a final evaluation if the number depends on the time budget."""
 PICTURES = 3
 """Number of views with pictures, which a report shows."""
@@ -90,7 +90,7 @@ def views_for(max_seconds: float | None) -> int | None:
     """
     if max_seconds is None or not math.isfinite(max_seconds):  # which the conditions refuse
         return None
-    return max(LEAST_VIEWS, round(max_seconds))
+    return max(MIN_VIEWS, round(max_seconds))
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Conditions:
     max_num_iterations: int | None
     """Steps of training."""
     target_psnr: float | None
-    """PSNR on the validation views at which training stops, dB."""
+    """PSNR on the validation views that stops training, dB."""
     num_threads: int | None
     """CPU threads; None for all."""
     device_type: str

@@ -18,7 +18,7 @@ from rich.table import Table
 from nerfloom.base.atomic import write_atomically
 from nerfloom.comparison import plots
 from nerfloom.comparison.crops import views
-from nerfloom.comparison.measures import SAME_TIME, Measured, Row, pareto
+from nerfloom.comparison.measures import TIME_TOLERANCE, Measured, Row, pareto
 from nerfloom.comparison.plan import Conditions, Plan
 from nerfloom.evaluation.images import ERROR_AT_WHITE
 from nerfloom.evaluation.lpips import NETWORK
@@ -49,7 +49,7 @@ COLUMNS = (
     Column("MS-SSIM", "ms_ssim", "{:.4f}".format, max),
     Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
-    Column("training, s", "seconds", "{:.1f}".format, min, SAME_TIME),
+    Column("training, s", "seconds", "{:.1f}".format, min, TIME_TOLERANCE),
     Column("steps", "steps", "{:,.0f}".format, None),
     Column("training, rays/s", "rays_per_second", "{:,.0f}".format, None),  # pixels for methods that render images
     Column("rendering, s/image", "render_seconds", "{:.2f}".format, min),
@@ -135,7 +135,6 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
     """Return the conditions shared by all runs, as sentences.
 
     Args:
-        conditions: the conditions.
         repeats: number of seeds for each contender.
         runs: measurements of all finished runs.
     """
@@ -252,7 +251,7 @@ def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _when(row: Row, level: int) -> str:
-    """Return the time at which a contender reached a PSNR, as text."""
+    """Return the time when a contender reached a PSNR, as text."""
     if (time := row.seconds_to(level)) is not None:
         return f"{time:.1f}"
     return "–" if (before := row.seconds_before(level)) is None else f"< {before:.1f}"

@@ -129,7 +129,6 @@ def run_job(job: Job, conditions: Conditions, device: str | None, stopped: threa
     """Train and evaluate one job.
 
     Args:
-        job: the job.
         conditions: the conditions of the comparison.
         device: value of CUDA_VISIBLE_DEVICES, or None to leave it unchanged.
         stopped: set if the job is to end early.

@@ -15,7 +15,7 @@ from nerfloom.data.pixels.pixel_set import PixelSet
 
 BLOCK = 1 << 20
 """Number of pixels tested at once."""
-SURE = 0.99
+UNTESTED_RADIUS = 0.99
 """Positions within this fraction of the lens's radius have a ray for certain and are not tested."""
 
 
@@ -23,8 +23,8 @@ SURE = 0.99
 def unreachable_pixels(cameras: Cameras) -> Tensor:
     """Return the pixels (K,) int64 whose centre has no ray, counted over all images.
 
-    Rays computed for such pixels are finite but wrong. Only positions beyond the radius within which every position has
-    a ray are tested, usually none. Cameras with equal intrinsics are tested once.
+    Rays computed for such pixels are finite but wrong. Only positions beyond a radius that is known to be safe are
+    tested, usually none. Cameras with equal intrinsics are tested once.
 
     Args:
         cameras: cameras of any model.
@@ -94,7 +94,7 @@ def _may_lack_rays(cameras: Cameras, index: int) -> bool:
     x, y, rays = cameras.look(torch.full((4,), index, device=width.device), columns, rows)
     if cameras.distortion is None:
         return not bool(rays.valid.all())
-    return not bool((torch.hypot(x, y) < SURE * cameras.distortion.bounds[index, 0]).all())
+    return not bool((torch.hypot(x, y) < UNTESTED_RADIUS * cameras.distortion.bounds[index, 0]).all())
 
 
 def _have_rays(cameras: Cameras, index: int, pixels: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ def _have_rays(cameras: Cameras, index: int, pixels: Tensor) -> Tensor:
     x = (columns + 0.5 - cameras.cx[index]) / cameras.fx[index]
     y = (rows + 0.5 - cameras.cy[index]) / cameras.fy[index]
     distance, (inner, outer) = torch.hypot(x, y), cameras.distortion.bounds[index]
-    reached = distance < SURE * inner
+    reached = distance < UNTESTED_RADIUS * inner
     doubtful = ~reached & (distance <= outer)
     valid = cameras.look(torch.full_like(pixels, index)[doubtful], columns[doubtful], rows[doubtful])[2].valid
     return reached.masked_scatter(doubtful, valid)

@@ -1,4 +1,4 @@
-"""Images with poses: the data set from which batches are drawn, and its construction from a parsed scene."""
+"""Images with poses: the data set that batches are drawn from, and its construction from a parsed scene."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from nerfloom.cameras.view import View
 from nerfloom.data.coverage import pixels_with_rays
 from nerfloom.data.decoding import Decoded, ImageFiles, decode
 from nerfloom.data.depths import read_depths
-from nerfloom.data.light import APPEARANCE_STOPS, light_spread
+from nerfloom.data.light_spread import APPEARANCE_STOPS, light_spread
+from nerfloom.data.motion_bound import MotionBound
 from nerfloom.data.names_on_disk import nearest_on_disk
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
 from nerfloom.data.sparse_depth import SparseDepth, sparse_depth
-from nerfloom.data.travel import Travel
 
 Masks = Literal["auto", "ignored", "empty"]
 """Meaning of masked-out pixels. ignored: unknown content. empty: background."""
@@ -55,7 +55,7 @@ class Dataset:
     scale: float
     """Scene units per unit of the input."""
     drawn: PixelSet | None = None
-    """Pixels from which batches are drawn, counted over all images; None for all."""
+    """Pixels that batches are drawn from, counted over all images; None for all."""
     kept: PixelSet | None = None
     """Pixels that have a ray and are not masked out; None for all."""
     opaque: PixelSet | None = None
@@ -70,14 +70,14 @@ class Dataset:
     points: Tensor | None = None
     """(K, 3) sparse points on surfaces, scene coordinates; None if there are none."""
     sparse_depth: SparseDepth | None = None
-    """Pixels in which images see sparse points, and their distances; None if there are none."""
+    """Pixels where images see sparse points, and their distances; None if there are none."""
     reductions: Tensor | None = None
-    """(M,) int64 factor by which each image is reduced relative to full size, if images are used at several sizes."""
+    """(M,) int64 reduction factor of each image relative to full size, if images are used at several sizes."""
     scene_indices: Tensor | None = None
     """(M,) int64 on the CPU, index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
-    """(M,) bool on the CPU, source images, from which others may be rendered; they are not evaluated. None without."""
-    travel: Travel | None = None
+    """(M,) bool on the CPU, source images, for rendering others; they are not evaluated. None without."""
+    motion_bound: MotionBound | None = None
     """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 
     def __len__(self) -> int:
@@ -331,7 +331,7 @@ def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:
 
 
 def _sparse_depth(parsed: ParsedScene, cameras: Cameras, shown: PixelSet | None) -> SparseDepth | None:
-    """Return the pixels in `shown` (None for all) in which images see sparse points; None if there are none."""
+    """Return the pixels in `shown` (None for all) where images see sparse points; None if there are none."""
     if parsed.sightings is None or isinstance(cameras, NdcCameras):
         return None
     found = sparse_depth(parsed.sightings, cameras)

@@ -20,10 +20,10 @@ from torch import Tensor
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import may_be_transparent, read_image, reduce_image
-from nerfloom.data.light import light_of
+from nerfloom.data.light_spread import light_of
 from nerfloom.data.masks import read_mask
 from nerfloom.data.pixels.cache import MB, PixelMemory, cache_path, no_room, pack, temporary_store, unpack
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.pixels.store import MemoryStore, PixelStore, drop_fourth, move
 
@@ -47,7 +47,7 @@ class ImageFiles:
     sizes: tuple[tuple[int, int], ...]
     """M widths and heights after reduction, pixels."""
     factors: tuple[int, ...]
-    """M integer factors by which images are reduced."""
+    """M integer reduction factors of the images."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 DEPTH_SUFFIXES = (*IMAGE_SUFFIXES, ".npy", ".exr")
 """Suffixes of depth images, in lower case."""
-MOST_PIXELS = 64
+MAX_PIXELS = 64
 """Maximum number of depth pixels per image pixel; usually there is less than one."""
 
 
@@ -48,10 +48,10 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     shape = _or_unreadable(path, _exr_shape if is_exr else _shape) if stored is None else stored.shape
     if len(shape) != 2 or 0 in shape:
         raise DataError(f"the depth image {path} has shape {shape}; it must be (height, width)")
-    if shape[0] * shape[1] > MOST_PIXELS * width * height:  # checked before memory is allocated
+    if shape[0] * shape[1] > MAX_PIXELS * width * height:  # checked before memory is allocated
         raise DataError(
             f"the depth image {path} has {shape[1]} x {shape[0]} pixels, its image {width} x {height}; "
-            f"the limit is {MOST_PIXELS} times as many pixels"
+            f"the limit is {MAX_PIXELS} times as many pixels"
         )
     rows, columns = (
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)

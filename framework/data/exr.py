@@ -26,7 +26,7 @@ COMPRESSIONS = ("none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DW
 """Names of compressions, by number."""
 LIKELIEST = ("Z", "V", "DEPTH", "DISTANCE", "Y", "R")
 """Names of a depth channel, without layer and in capitals, most likely first."""
-LONGEST_TEXT = 256
+MAX_TEXT_LENGTH = 256
 """Maximum number of bytes of a name in the header, terminator included."""
 
 
@@ -163,7 +163,7 @@ def _channels(attribute: bytes) -> tuple[tuple[str, np.dtype], ...]:
 
 def _text(content: bytes, place: int) -> tuple[str, int]:
     """Return the text at a position, up to a zero, and the position after it."""
-    end = content.find(b"\0", place, place + LONGEST_TEXT)
+    end = content.find(b"\0", place, place + MAX_TEXT_LENGTH)
     if end < 0:
         raise DataError("its header is damaged; copy it again")
     return content[place:end].decode("utf-8", "replace"), end + 1

@@ -15,30 +15,30 @@ from nerfloom.data.sparse_depth import SparseDepth
 
 CLEAR_SHARE = 0.7
 """Space up to this fraction of the distance of a camera's nearest points counts as empty."""
-NEAREST = 0.02
+WRONG_SHARE = 0.02
 """Fraction of a camera's points that may be nearer than its "nearest" points, since a few points are always wrong."""
-FEWEST_POINTS = 10
+MIN_POINTS = 10
 """Minimum number of points of a camera for an estimate."""
 RAYS, STEPS = 8, 24
 """Number of rays along each side of an image, and of distances along a ray, tested for visibility in other cameras."""
-MOST_CAMERAS = 64
+MAX_CAMERAS = 64
 """Maximum number of other cameras tested."""
-FARTHEST = 2.0
+MAX_DISTANCE = 2.0
 """Maximum distance of space that counts as empty because no other camera sees it, scene units."""
-ALONE = 0.1
+MAX_SEEN_SHARE = 0.1
 """Maximum fraction of an image's rays that another camera may see where the image counts as alone."""
 
 
 @torch.no_grad()
 def clear_distances(cameras: Cameras, known: SparseDepth | None, near: float, far: float) -> Tensor:
-    """Return the distance (M,) from each camera up to which its image shows nothing, as far as is known.
+    """Return the distance (M,) from each camera that its image shows to be empty, as far as is known.
 
     Args:
         cameras: M training cameras.
         known: pixels of their images with known distance; None if there are none.
         near, far: ends of the scene's rays, scene units.
     """
-    alone = distances_alone(cameras, near, min(far, FARTHEST))
+    alone = distances_alone(cameras, near, min(far, MAX_DISTANCE))
     return alone if known is None else torch.maximum(alone, before_points(cameras, known))
 
 
@@ -54,15 +54,15 @@ def before_points(cameras: Cameras, known: SparseDepth) -> Tensor:
     # Sorted by image and, within an image, by distance.
     order = known.distances.argsort(stable=True)
     order = order[images[order].argsort(stable=True)]
-    enough = counts >= FEWEST_POINTS
-    ranks = (counts.cumsum(0) - counts + (NEAREST * counts).long())[enough]
+    enough = counts >= MIN_POINTS
+    ranks = (counts.cumsum(0) - counts + (WRONG_SHARE * counts).long())[enough]
     nearest = known.distances.new_zeros(len(cameras))
     nearest[enough] = known.distances[order[ranks]]
     return CLEAR_SHARE * nearest
 
 
 def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
-    """Return the distance (M,) from each camera up to which no other camera sees the same space.
+    """Return the distance (M,) from each camera that no other camera sees.
 
     For a single camera it is 0: no other camera sees anything, which says nothing about the space.
 
@@ -75,7 +75,7 @@ def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
         return torch.zeros(1, device=device)
     steps = torch.linspace(near, far, STEPS, device=device)
     across = (torch.arange(RAYS, device=device) + 0.5) / RAYS
-    asked = evenly_spaced(len(cameras), MOST_CAMERAS).to(device)
+    asked = evenly_spaced(len(cameras), MAX_CAMERAS).to(device)
     found = torch.zeros(len(cameras), device=device)
     for index in range(len(cameras)):
         columns = (across * cameras.widths[index] - 0.5).repeat(RAYS)
@@ -86,7 +86,7 @@ def distances_alone(cameras: Cameras, near: float, far: float) -> Tensor:
         seeing = others.repeat_interleave(len(points))
         left, top, ahead = cameras.project(points.repeat(len(others), 1), seeing)
         inside = ahead & (left >= 0) & (left < cameras.widths[seeing]) & (top >= 0) & (top < cameras.heights[seeing])
-        shared = inside.view(len(others), RAYS * RAYS, STEPS).any(0).float().mean(0) > ALONE
+        shared = inside.view(len(others), RAYS * RAYS, STEPS).any(0).float().mean(0) > MAX_SEEN_SHARE
         alone = int(shared.int().argmax()) if bool(shared.any()) else STEPS
         found[index] = steps[alone - 1] if alone > 0 else 0.0
     return found

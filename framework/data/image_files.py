@@ -16,7 +16,7 @@ from nerfloom.data.suffixes import UNREAD_SUFFIXES
 # Pillow detects the format from the content, not from the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False
 
-LARGEST_FILE = 2**30
+MAX_FILE = 2**30
 """Maximum size of an image file, bytes."""
 BAND = 64
 """Number of rows of a reduced image computed at once: float64 takes eight times the memory of the source pixels."""
@@ -55,7 +55,7 @@ class Content(io.BytesIO):
     """
 
     def __init__(self, path: Path) -> None:
-        if (size := path.stat().st_size) > LARGEST_FILE:
+        if (size := path.stat().st_size) > MAX_FILE:
             raise DataError(f"{path} has {size / 1e9:.1f} GB; the limit for images is 1 GB")
         super().__init__(path.read_bytes())
         self.path = path
@@ -69,7 +69,7 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
 
     Args:
         path: the file.
-        factor: integer factor by which the image is reduced.
+        factor: integer reduction factor of the image.
 
     Raises:
         DataError: if the image cannot be decoded, or has more than 8 bits per channel.

@@ -25,13 +25,13 @@ LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
 """Endings tried, in this order, for a name without one."""
 REDUCED = (1, 2, 4, 8)
 """Factors of images reduced in advance; `images_2` holds images reduced by 2."""
-MOST_FILES = 200_000
+MAX_FILES = 200_000
 """Maximum number of files below a folder that are searched."""
 COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
 """Beginnings of names of folders whose files accompany images under the same names, in lower case."""
-MOST_FOLDERS = 100
+MAX_FOLDERS = 100
 """Maximum number of folders searched for one image."""
-MOST_NAMED = 3
+MAX_NAMED = 3
 """Maximum number of names suggested in a message."""
 
 
@@ -128,14 +128,14 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
         found |= {(inside / name).as_posix() for name in suited}
         if inside.parts and (base := _full_size(inside.parts[0])):
             found |= {Path(base, *inside.parts[1:], name).as_posix() for name in suited}
-        if len(found) > MOST_FILES:
+        if len(found) > MAX_FILES:
             return []
     return sorted(found)
 
 
 def has_images(folder: Path) -> bool:
     """Return whether a quick look finds an image in or below `folder`. Never raises."""
-    return any(_is_image(name) for _, _, names in islice(os.walk(folder), MOST_FOLDERS) for name in names)
+    return any(_is_image(name) for _, _, names in islice(os.walk(folder), MAX_FOLDERS) for name in names)
 
 
 def nearest_on_disk(path: Path) -> str:
@@ -144,18 +144,18 @@ def nearest_on_disk(path: Path) -> str:
     while not parent.is_dir() and parent != parent.parent:
         path, parent = parent, parent.parent
     try:
-        there = sorted(islice((entry.name for entry in os.scandir(parent) if entry.name[0] != "."), MOST_FILES))
+        there = sorted(islice((entry.name for entry in os.scandir(parent) if entry.name[0] != "."), MAX_FILES))
     except OSError:
         there = []
     if not there:
         return f"{parent} is empty"
     lower = {name.casefold(): name for name in there}
-    near = difflib.get_close_matches(path.name.casefold(), lower, MOST_NAMED, 0.5) or list(lower)[:MOST_NAMED]
+    near = difflib.get_close_matches(path.name.casefold(), lower, MAX_NAMED, 0.5) or list(lower)[:MAX_NAMED]
     return f"{parent} has no {path.name}, but {', '.join(lower[name] for name in near)}"
 
 
 def _as_written(folder: Path, name: str) -> str | None:
-    """Return the name if the file exists, otherwise the name with the first likely ending for which a file exists."""
+    """Return the name if the file exists, otherwise the name with the first likely ending that a file has."""
     if (folder / name).is_file():
         return name
     if _is_image(name):

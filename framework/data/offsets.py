@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, shown
+from nerfloom.base.json_files import read_json
 
 SUFFIX = ".offset.json"
 """Suffix of an offset file, appended to the name of its file."""
@@ -61,14 +62,9 @@ def read_offset(file: Path) -> Tensor:
         DataError: if the offset cannot be read, or is not three finite numbers.
     """
     beside = offset_file(file)
-    try:
-        content = json.loads(beside.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not beside.exists():
         return torch.zeros(3, dtype=torch.float64)
-    except OSError as error:
-        raise DataError(f"cannot read {beside}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{beside} is not JSON: {error}") from error
+    content = read_json(beside)
     values = content.get("offset") if isinstance(content, dict) else None
     numbers = values if isinstance(values, list) and all(type(value) in (int, float) for value in values) else []
     if len(numbers) != 3 or not all(abs(value) < math.inf for value in numbers):

@@ -27,9 +27,9 @@ class ParsedScene:
     box: Tensor
     """(2, 3) corners of the region of interest."""
     near: float
-    """Distance from a camera at which the scene starts."""
+    """Distance from a camera where the scene starts."""
     far: float
-    """Distance from a camera at which the scene ends."""
+    """Distance from a camera where the scene ends."""
     times: Tensor | None = None
     """(M,) time of each image in [0, 1]; None for a static scene."""
     transform: Tensor | None = None
@@ -38,9 +38,9 @@ class ParsedScene:
     scale: float = 1.0
     """Scene units per unit of the input."""
     downscale_factor: int = 1
-    """Integer factor by which images are reduced when they are loaded."""
+    """Integer reduction factor of images when they are loaded."""
     num_scales: int = 1
-    """Number of sizes at which each image is used: the loaded size, and then 1/2, 1/4, ... of it."""
+    """Number of sizes of each image in use: the loaded size, and then 1/2, 1/4, ... of it."""
     mask_paths: tuple[Path | None, ...] | None = None
     """M mask files, white for pixels to train on and black for others; None for an image without mask."""
     points: Tensor | None = None
@@ -60,7 +60,7 @@ class ParsedScene:
     scene_indices: Tensor | None = None
     """(M,) int64 index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
-    """(M,) bool, source images, from which a method may render others; they are not evaluated. None without."""
+    """(M,) bool, source images, which a method may render others from; they are not evaluated. None without."""
 
     @property
     def placement(self) -> Placement:

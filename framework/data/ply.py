@@ -27,9 +27,9 @@ NAMES = {"uint8": "uchar", "float32": "float", "float64": "double"}
 """numpy's types that are written, to PLY's names of them."""
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 """PLY's formats, to numpy's prefixes of byte order."""
-LONGEST_HEADER = 1000
+MAX_HEADER_LENGTH = 1000
 """Maximum number of lines of a header."""
-LONGEST_LINE = 1000
+MAX_LINE_LENGTH = 1000
 """Maximum number of bytes of a line of the header."""
 
 
@@ -133,7 +133,7 @@ def read_columns(file: Path, element: PlyElement, names: Sequence[str]) -> list[
     with _opened(file) as stream:
         remaining, row = file.stat().st_size - element.start, element.row()
         ascii_ = element.order == "ascii"
-        # In ascii at least a digit and a separator, of which the last may be missing.
+        # In ascii at least a digit and a separator, and the last may be missing.
         needed = 2 * len(element.columns) * element.count - 1 if ascii_ else row.itemsize * element.count
         if needed > remaining:
             raise DataError(
@@ -158,12 +158,12 @@ def _opened(file: Path) -> Iterator[BinaryIO]:
 
 
 def _header(stream: BinaryIO, file: Path) -> PlyHeader:
-    if stream.readline(LONGEST_LINE).strip() != b"ply":
+    if stream.readline(MAX_LINE_LENGTH).strip() != b"ply":
         raise DataError(f"{file} is not a PLY file: its first line is not 'ply'")
     order, comments = "", []
     described: list[tuple[str, int, list[tuple[str, str]]]] = []
-    for _ in range(LONGEST_HEADER):
-        words = stream.readline(LONGEST_LINE).decode("ascii", "replace").split()
+    for _ in range(MAX_HEADER_LENGTH):
+        words = stream.readline(MAX_LINE_LENGTH).decode("ascii", "replace").split()
         if words[:1] == ["end_header"]:
             break
         if words[:1] == ["format"] and len(words) > 1:

@@ -14,11 +14,11 @@ from nerfloom.base.errors import shown
 
 PoseSource = Literal["exact", "photographs", "device"]
 """Source of the cameras' poses: known exactly, estimated from the images, or tracked by the device that took them."""
-MOST_CAMERAS = 10**7
+MAX_CAMERAS = 10**7
 """Maximum number of cameras of a scene read from a file."""
-LARGEST_SIZE = 10**9
+MAX_SIZE = 10**9
 """Maximum side of an image of a scene read from a file, pixels."""
-FARTHEST = 1e9
+MAX_COORDINATE = 1e9
 """Maximum coordinate of the box of a scene read from a file, scene units."""
 
 
@@ -29,9 +29,9 @@ class Scene:
     box: Tensor
     """(2, 3) minimum and maximum corner of the region of interest, scene units."""
     near: float
-    """Distance from a camera at which the scene starts."""
+    """Distance from a camera where the scene starts."""
     far: float
-    """Distance from a camera at which the scene ends."""
+    """Distance from a camera where the scene ends."""
     num_cameras: int
     """Number of training images."""
     has_alpha: bool
@@ -74,11 +74,11 @@ class Scene:
             raise ValueError(
                 f"the scene's box has shape {tuple(box.shape)} and type {box.dtype}; it must be (2, 3) and float32"
             )
-        if not bool((box.abs() < FARTHEST).all()) or not bool((box[0] < box[1]).all()):
+        if not bool((box.abs() < MAX_COORDINATE).all()) or not bool((box[0] < box[1]).all()):
             raise ValueError("the scene's box is empty or too large")
-        if not 1 <= count <= MOST_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
+        if not 1 <= count <= MAX_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
             raise ValueError(f"the scene's number of cameras, {shown(count)}, does not match its poses")
-        if not 0 <= scene.near < scene.far < math.inf or not 1 <= scene.image_size <= LARGEST_SIZE:
+        if not 0 <= scene.near < scene.far < math.inf or not 1 <= scene.image_size <= MAX_SIZE:
             raise ValueError(
                 f"the scene has near {scene.near}, far {scene.far} and images of {shown(scene.image_size)} pixels; "
                 "near must be less than far, and sizes positive"

@@ -8,7 +8,7 @@ from nerfloom.data.dataset import Dataset
 
 
 def images_of(dataset: Dataset, scene: int | None) -> Tensor:
-    """Return the indices (K,) int64, on the CPU, of a scene's source images, from which others may be rendered.
+    """Return the indices (K,) int64, on the CPU, of a scene's source images, which other images may be rendered from.
 
     Args:
         dataset: images of one scene or of several.

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RayConfig, SourceViewsConfig, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.processes import processes
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.view import View
@@ -105,8 +105,8 @@ class PixelSource(BatchSource):
         seed: seed of the run.
         by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
         keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
-        clear: (M,) distances up to which images show nothing; None if they are not used.
-        num_images: number of images from which the pixels of a step are drawn; None for all.
+        clear: (M,) distances from cameras that images show to be empty; None if they are not used.
+        num_images: number of images that the pixels of a step come from; None for all.
     """
 
     def __init__(
@@ -241,9 +241,7 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
         return ViewSource(dataset, background, config.machine.seed)
-    if not isinstance(config, RayConfig):
-        return PixelSource(dataset, background, config.machine.seed)
-    num_images = config.images_per_batch if isinstance(config, SourceViewsConfig) else None
+    num_images = config.images_per_batch or None
     keypoints = KEYPOINTS if num_images is None and config.depth_loss_mult and not dataset.scene.has_depth else 0.0
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:

@@ -36,7 +36,7 @@ class SparseDepth:
 
 @torch.no_grad()
 def sparse_depth(sightings: Sightings, cameras: Cameras) -> SparseDepth:
-    """Return the pixels in which images see sparse points, from the points' projections, lens included.
+    """Return the pixels where images see sparse points, from the points' projections, lens included.
 
     If a pixel shows several points, the one with the best-known distance is used. A point's distance along the ray of
     its pixel's centre is that of the nearest position on the ray.

@@ -7,19 +7,19 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-FEWEST = 2
+MIN_IMAGES = 2
 """Minimum number of training images that see a point; one image alone determines no distance."""
-LARGEST_DEVIATION = 0.1
+MAX_DEVIATION = 0.1
 """Maximum standard deviation of a distance in use, as a fraction of the distance."""
-SHORTEST_TRACK = 3
+MIN_TRACK_LENGTH = 3
 """Minimum number of images that observe a point in use; two can agree on a wrong one."""
-LARGEST_ERROR = 2.0
+MAX_ERROR = 2.0
 """Maximum mean reprojection error of a point in use, pixels."""
 DOUBTS = (
     "",
     "without a track",
-    f"seen by fewer than {SHORTEST_TRACK} images",
-    f"with a reprojection error above {LARGEST_ERROR:g} pixels",
+    f"seen by fewer than {MIN_TRACK_LENGTH} images",
+    f"with a reprojection error above {MAX_ERROR:g} pixels",
 )
 """Reasons not to use a point's distances, as indexed by `doubts_about`; the first entry stands for no reason."""
 
@@ -93,13 +93,13 @@ class Tracks:
         return Tracks(points[finite], self.images[kept], seen, self.angles[kept], self.doubts[finite])
 
     def confirmed(self) -> Tensor:
-        """Return whether at least `FEWEST` of the images see a point, (K,) bool."""
-        return self._counts() >= FEWEST
+        """Return whether at least `MIN_IMAGES` of the images see a point, (K,) bool."""
+        return self._counts() >= MIN_IMAGES
 
     def known_without(self, images: Tensor) -> Tensor:
         """Return whether the position of each point is known without some images, (K,) bool.
 
-        This holds if these images do not see the point, or if at least `FEWEST` others do.
+        This holds if these images do not see the point, or if at least `MIN_IMAGES` others do.
 
         Args:
             images: (M,) bool, the images.
@@ -114,7 +114,7 @@ class Tracks:
     def known_distances(self, centers: Tensor) -> Tensor:
         """Return whether the distance of each sighting is accurate enough to learn from, (O,) bool.
 
-        This holds if at least `FEWEST` images see the point, it has no doubts, and the distance's deviation is small.
+        This holds if at least `MIN_IMAGES` images see the point, it has no doubts, and its distance deviates little.
 
         Args:
             centers: (M, 3) positions of the cameras.
@@ -134,7 +134,7 @@ class Tracks:
     def _known(self, deviations: Tensor, centers: Tensor) -> Tensor:
         distances = (self.points[self.seen] - centers[self.images].to(self.points)).norm(dim=-1)
         believed = self.confirmed() & (self.doubts == 0)
-        return believed[self.seen] & (deviations <= LARGEST_DEVIATION * distances)
+        return believed[self.seen] & (deviations <= MAX_DEVIATION * distances)
 
 
 def doubts_about(lengths: Tensor, errors: Tensor) -> Tensor:
@@ -144,8 +144,8 @@ def doubts_about(lengths: Tensor, errors: Tensor) -> Tensor:
         lengths: (K,) number of images that observe each point.
         errors: (K,) mean reprojection error of each point, pixels.
     """
-    doubts = torch.where(errors > LARGEST_ERROR, 3, 0)
-    doubts[lengths < SHORTEST_TRACK] = 2
+    doubts = torch.where(errors > MAX_ERROR, 3, 0)
+    doubts[lengths < MIN_TRACK_LENGTH] = 2
     doubts[lengths == 0] = 1
     return doubts
 

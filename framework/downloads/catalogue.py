@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Source:
-    """A server from which an archive can be downloaded.
+    """A server with an archive to download.
 
     Args:
         url: address of the file, http or https.

@@ -51,7 +51,7 @@ class _Answered:
 
     Args:
         url: requested address.
-        validator: ETag or date of the file, with which the server checks that it is unchanged; empty if none.
+        validator: ETag or date of the file, that lets the server check that it is unchanged; empty if none.
         md5: the file's MD5 in hexadecimal, as stated by Google's storage; empty if none.
     """
 
@@ -185,7 +185,7 @@ def _network_errors() -> Iterator[None]:
 
 
 def _extent(status: int, headers: Message, have: int) -> tuple[int, int | None]:
-    """Return the byte at which a response's body starts, and the size of the whole file; None if unknown."""
+    """Return the byte where a response's body starts, and the size of the whole file; None if unknown."""
     if status == 206:
         match = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", headers.get("Content-Range", ""))
         if match is not None and int(match[1]) == have:

@@ -169,7 +169,6 @@ def _placement(archive: Archive, scenes: Sequence[str], names: Sequence[tuple[st
     """Return the target of each file of an archive: files below a scene's folder go into a folder named like the scene.
 
     Args:
-        archive: the archive.
         scenes: the scenes to unpack.
         names: paths of all its files, split into parts.
     """

@@ -17,8 +17,8 @@ MAX_FILES = 200_000
 """Maximum number of entries of an archive. The largest in the catalogue has about ten thousand."""
 MAX_EXPANSION = 20
 """Maximum number of unpacked bytes per byte of an archive. Images are compressed already; text may be a tenth."""
-ALLOWANCE = 1 << 20
-"""Number of bytes to which any archive may unpack, however small it is."""
+MIN_ALLOWANCE = 1 << 20
+"""Minimum unpacked size that is allowed for any archive, bytes."""
 CHUNK = 1 << 20
 """Number of bytes written at a time."""
 UNSAFE = re.compile(r'[\x00-\x1f\x7f<>:"|?*\\]|[. ]$')
@@ -113,7 +113,7 @@ def _check_sizes(entries: Sequence[zipfile.ZipInfo], archive: Path) -> None:
     if sum(entry.compress_size for entry in entries) > size:
         raise DataError(f"{archive}: its entries overlap, which is unsafe; nothing was unpacked")
     total = sum(entry.file_size for entry in entries)
-    if total > MAX_EXPANSION * size + ALLOWANCE:
+    if total > MAX_EXPANSION * size + MIN_ALLOWANCE:
         raise DataError(f"{archive} of {size} bytes would unpack to {total}; nothing was unpacked")
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nerfloom.base.config import Range, TrainConfig
 from nerfloom.base.optimised import Optimised
-from nerfloom.encodings.opening import Opening
+from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.kernels.grids.hash_grid import LOOK_UP, hash_grid
 from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION, HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
@@ -57,7 +57,7 @@ class HashGrid(nn.Module):
         log2_table_size: maximum number of entries of one level, as a power of two.
         sparse: whether the optimiser updates only the entries that a step has used. The compiled kernels then keep the
             gradient of the table in `deferred` for the optimiser, and `table.grad` stays None.
-        opening: levels open one after the other (`Opening`) during this fraction of the training budget; 0: all are
+        opening: levels open one after the other (`OpenLevels`) during this fraction of the training budget; 0: all are
             open.
 
     Raises:
@@ -82,7 +82,7 @@ class HashGrid(nn.Module):
         self.table = nn.Parameter(table(self.layout.num_entries, features_per_level).uniform_(-1e-4, 1e-4))
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = TableGradient(LOOK_UP, self.layout) if sparse else None
-        self.opening = Opening(num_levels, min(FIRST_LEVELS, num_levels), opening) if opening else None
+        self.opening = OpenLevels(num_levels, min(FIRST_LEVELS, num_levels), opening) if opening else None
         self.num_features = num_levels * features_per_level
 
     @classmethod

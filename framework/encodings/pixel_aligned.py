@@ -13,7 +13,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.kernels.table_memory import require
 
-MOST_LEVELS = 8
+MAX_LEVELS = 8
 """Maximum number of levels of an image encoder; a pixel of the eighth is 128 pixels wide."""
 
 
@@ -71,14 +71,14 @@ class ImageEncoder(nn.Module):
         widths: number of features of each level, the finest first.
 
     Raises:
-        ConfigError: if there are no levels or more than `MOST_LEVELS`, if a level has no features, or if the weights
+        ConfigError: if there are no levels or more than `MAX_LEVELS`, if a level has no features, or if the weights
             need more memory than the machine has.
     """
 
     def __init__(self, widths: Sequence[int]) -> None:
         super().__init__()
-        if not 1 <= len(widths) <= MOST_LEVELS or min(widths) < 1:
-            raise ConfigError(f"an image encoder has 1 to {MOST_LEVELS} levels of 1 feature or more each")
+        if not 1 <= len(widths) <= MAX_LEVELS or min(widths) < 1:
+            raise ConfigError(f"an image encoder has 1 to {MAX_LEVELS} levels of 1 feature or more each")
         require(72.0 * sum(width * max(widths) for width in widths), "an image encoder")
         self.num_features = sum(widths)
         """Number C of features of a pixel."""

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from nerfloom.base import device as devices
 from nerfloom.base.optimised import Optimised
-from nerfloom.encodings.opening import Opening
+from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.kernels.grids.drawn_bands import drawn_bands
 from nerfloom.kernels.grids.plane_bands import Band, band_variation, plane_bands, variation
 from nerfloom.kernels.grids.planes import PlanesGradient, planes
@@ -30,7 +30,7 @@ class FeaturePlanes(nn.Module):
         axes: the axis or two axes of each factor, per group; a plane for every pair of axes if None.
         sparse: whether the optimiser updates only the entries that a step has used, as for `HashGrid`.
         resizable: whether `resample` may be called; a checkpoint may then have other resolutions.
-        opening: groups are scales that open from coarse to fine (`Opening`) during this fraction of the training
+        opening: groups are scales that open from coarse to fine (`OpenLevels`) during this fraction of the training
             budget; 0: all are open.
 
     Raises:
@@ -62,7 +62,7 @@ class FeaturePlanes(nn.Module):
                         self.layout.factor(self.table, group, index).fill_(1)
         self.optimised = Optimised("tables", sparse=True) if sparse else None
         self.deferred = PlanesGradient(self.layout) if sparse else None
-        self.opening = Opening(self.layout.num_groups, 1, opening) if opening else None
+        self.opening = OpenLevels(self.layout.num_groups, 1, opening) if opening else None
 
     def forward(self, positions: Tensor) -> Tensor:
         """Return the features (N, G * F) at `positions` (N, D) in [0, 1]."""

@@ -22,7 +22,7 @@ from nerfloom.renderable import HasAppearance, Renderable, RendersRays
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Steps of Adam, pixels per step, and learning rate for fitting an appearance vector."""
-CANDIDATES = 32
+MAX_CANDIDATES = 32
 """Maximum number of training images' vectors tried as the initial vector."""
 
 
@@ -112,7 +112,7 @@ def _closest(model: Renderable, appearance: Appearance, dataset: Dataset, pixels
     mean = appearance.vectors.mean(0)
     if not len(pixels) or not isinstance(model, RendersRays):
         return mean
-    candidates = torch.cat([mean[None], _some(appearance.vectors, CANDIDATES)])
+    candidates = torch.cat([mean[None], _some(appearance.vectors, MAX_CANDIDATES)])
     some = _some(pixels, PIXELS)
     batch = gather_batch(dataset, some, background.repeat(len(some), 1))
     rays, errors = replace(batch.rays, camera_indices=None), []

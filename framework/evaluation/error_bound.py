@@ -12,7 +12,7 @@ from nerfloom.evaluation.evaluator import spread, timed_view
 from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import StopsEarly
 
-MEASURED_VIEWS = 4
+MAX_VIEWS = 4
 """Maximum number of views used to measure the error."""
 
 
@@ -68,7 +68,7 @@ def measured_error(model: Renderable, dataset: Dataset, bound: float) -> tuple[f
         The maximum difference of a colour channel from rendering without early stop, and the ratio of the two times.
     """
     background, worst, times = model.background, 0.0, [0.0, 0.0]
-    chosen = spread(len(dataset), MEASURED_VIEWS)
+    chosen = spread(len(dataset), MAX_VIEWS)
     for index in track(chosen, "Measuring the error", total=len(chosen)):
         views = []
         for number, stop in enumerate((0.0, bound)):

@@ -23,8 +23,8 @@ from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.appearance import appearance_of, fitted_appearance, right_half
-from nerfloom.evaluation.lpips import NETWORK, SMALLEST_OF_LPIPS, Lpips, load_lpips
-from nerfloom.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim, psnr, quick_ssim
+from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, NETWORK, Lpips, load_lpips
+from nerfloom.evaluation.metrics import MIN_SIDE_OF_SCALES, ms_ssim, psnr, quick_ssim
 from nerfloom.evaluation.statistics import statistics
 from nerfloom.evaluation.view_files import Judged, ViewFiles
 from nerfloom.kernels.images.ssim import WINDOW
@@ -33,9 +33,9 @@ from nerfloom.rendering.rendered import Picture
 
 T = TypeVar("T")
 
-BEFORE = 0.9
+CLEAR_SHARE = 0.9
 """A view that sees a sparse point should show nothing up to this fraction of the point's distance."""
-FAR_BELOW, MOST_NAMED = 3.0, 3
+MIN_DROP, MAX_NAMED = 3.0, 3
 """Views this far below the mean PSNR, dB, are named; and the maximum number of views named."""
 MASKED = (
     "PSNR is over kept pixels, SSIM and MS-SSIM over windows without ignored pixels, LPIPS is the mean of its map over "
@@ -112,7 +112,7 @@ def floaters(picture: Picture, dataset: Dataset, index: int) -> float | None:
     """Return the percentage of a view's sparse points with matter in front of them.
 
     These are points that the image sees according to the reconstruction's tracks, and whose pixel has a median depth
-    below `BEFORE` of their distance. Half of such a pixel's light is stopped in space that the image shows to be empty.
+    below `CLEAR_SHARE` of their distance. Half of such a pixel's light is stopped in space that should be empty.
     This is defined for every method that renders depth.
 
     Args:
@@ -128,10 +128,10 @@ def floaters(picture: Picture, dataset: Dataset, index: int) -> float | None:
     start, end = dataset.cameras.ends[index : index + 2]
     pixels = dataset.sparse_depth.pixels
     known = dataset.sparse_depth[(pixels >= start) & (pixels < end)]
-    known = known[known.deviations < (1 - BEFORE) / 3 * known.distances]
+    known = known[known.deviations < (1 - CLEAR_SHARE) / 3 * known.distances]
     if not len(known):
         return None
-    before = picture.median_depth.reshape(-1)[known.pixels - start] < BEFORE * known.distances
+    before = picture.median_depth.reshape(-1)[known.pixels - start] < CLEAR_SHARE * known.distances
     return 100 * before.float().mean().item()
 
 
@@ -176,13 +176,13 @@ class Evaluation:
 
     @property
     def far_below(self) -> str | None:
-        """The views `FAR_BELOW` or more below the mean PSNR, worst first, as text; None if there are none."""
+        """The views `MIN_DROP` or more below the mean PSNR, worst first, as text; None if there are none."""
         mean = self.results["psnr"]
-        low = sorted((row for row in self.per_image if row["psnr"] <= mean - FAR_BELOW), key=lambda row: row["psnr"])
+        low = sorted((row for row in self.per_image if row["psnr"] <= mean - MIN_DROP), key=lambda row: row["psnr"])
         if not low:
             return None
-        named = ", ".join(f"{row['name']} {row['psnr']:.2f} dB" for row in low[:MOST_NAMED])
-        return f"far below the mean: {named}" + (f", and {len(low) - MOST_NAMED} more" if len(low) > MOST_NAMED else "")
+        named = ", ".join(f"{row['name']} {row['psnr']:.2f} dB" for row in low[:MAX_NAMED])
+        return f"far below the mean: {named}" + (f", and {len(low) - MAX_NAMED} more" if len(low) > MAX_NAMED else "")
 
     def line(self) -> str:
         """Return the results as a line of text."""
@@ -223,7 +223,7 @@ def evaluate(
 
     Images that are given to the method (`Dataset.source_images`) are shown to it and not judged. Masked-out pixels do
     not count: PSNR omits them, SSIM omits the windows that have any, at one scale and at five (`ms_ssim`), and LPIPS is
-    the mean of its map over the others, for which masked-out pixels are copied from the true image. Images without
+    the mean of its map over the others, with masked-out pixels copied from the true image. Images without
     other pixels are skipped. If appearance is fitted to left halves (`Appearance.held_out`), right halves count. An
     image has no SSIM if no window counts.
 
@@ -317,8 +317,8 @@ def _judge(
     pair, kept = _judged(rgb, target, dataset.kept_of(index), half)
     row = _row(dataset, index, measure(*pair, kept), spent)
     smallest = min(pair[0].shape[:2])
-    row["ms_ssim"] = None if smallest < SMALLEST_OF_SCALES else ms_ssim(*pair, kept)
-    row["lpips"] = None if lpips is None or smallest < SMALLEST_OF_LPIPS else lpips(*pair, kept)
+    row["ms_ssim"] = None if smallest < MIN_SIDE_OF_SCALES else ms_ssim(*pair, kept)
+    row["lpips"] = None if lpips is None or smallest < MIN_SIDE_OF_LPIPS else lpips(*pair, kept)
     row["pixels"] = pair[0][..., 0].numel() if kept is None else int(kept.sum())
     row["ignored_pixels"] = pair[0][..., 0].numel() - row["pixels"]
     return row | {"floaters": floaters(picture, dataset, index)}, Judged(rgb, target, picture)

@@ -133,7 +133,7 @@ def hash_of_file(path: Path) -> str:
 
 
 def hash_of_tensors(*tensors: Tensor | None) -> str:
-    """Return a SHA-256 of the values, types and shapes of `tensors`, any of which may be None."""
+    """Return a SHA-256 of the values, types and shapes of `tensors`, which may be None."""
     found = hashlib.sha256()
     for tensor in tensors:
         if tensor is not None:

@@ -25,7 +25,7 @@ from nerfloom.base.extras import install_command
 
 NETWORK = "alex"
 """Name of the network in the `lpips` package."""
-SMALLEST_OF_LPIPS = 31
+MIN_SIDE_OF_LPIPS = 31
 """Minimum width and height of an image, pixels; below, AlexNet's last layers have no position."""
 SHAPES = ((11, 11, 3, 64), (5, 5, 64, 192), (3, 3, 192, 384), (3, 3, 384, 256), (3, 3, 256, 256))
 """Shapes of AlexNet's convolutions: height, width, input and output channels."""
@@ -33,7 +33,7 @@ STRIDES, PADDING, POOLED_BEFORE = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
 """Strides and padding of the convolutions, and the indices of those after a maximum over 3 x 3 positions."""
 MEAN, DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """Offset and divisor for colours in [-1, 1]."""
-HEADERS = 64 * 1024
+MAX_HEADERS = 64 * 1024
 """Maximum number of bytes of a weights file besides the weights."""
 Lpips = Callable[[Tensor, Tensor, Tensor | None], float]
 """LPIPS of two images (H, W, 3) in [0, 1], over the counted pixels (H, W) bool, or over all if None."""
@@ -70,7 +70,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     where = f"--lpips-weights {path}"
     size = 4 * sum(int(np.prod(shape)) + 2 * shape[-1] for shape in SHAPES)
     try:
-        if uncompressed_size(path) > size + HEADERS:
+        if uncompressed_size(path) > size + MAX_HEADERS:
             raise ConfigError(f"{where} is too large for LPIPS's weights with AlexNet: {size / 1e6:.1f} MB")
         with np.load(path, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}

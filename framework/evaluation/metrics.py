@@ -19,7 +19,7 @@ MAX_PSNR = 100.0
 """PSNR of identical images, dB, instead of infinity, which JSON does not support."""
 EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of SSIM at five scales, from the finest (Wang, Simoncelli and Bovik 2003, section 3.2)."""
-SMALLEST_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
+MIN_SIDE_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
 """Minimum width and height of an image for SSIM at five scales, pixels: 176."""
 
 
@@ -111,9 +111,9 @@ def ms_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> f
     Raises:
         ValueError: if the window does not fit into the image at the coarsest scale.
     """
-    if min(prediction.shape[:2]) < SMALLEST_OF_SCALES:
+    if min(prediction.shape[:2]) < MIN_SIDE_OF_SCALES:
         height, width = prediction.shape[:2]
-        least = SMALLEST_OF_SCALES
+        least = MIN_SIDE_OF_SCALES
         raise ValueError(f"SSIM at five scales needs at least {least}x{least} pixels, not {width}x{height}")
     counted = [None] * len(EXPONENTS) if kept is None else windows_of_scales(kept)
     if counted[-1] is not None and not counted[-1].any():

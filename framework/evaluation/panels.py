@@ -14,9 +14,9 @@ from nerfloom.evaluation.images import ERROR_AT_WHITE, heat, to_uint8
 from nerfloom.rendering.outputs import ACCUMULATION, MEDIAN_DEPTH, Output
 from nerfloom.rendering.rendered import Picture
 
-SMALLEST_WIDTH = 160
+MIN_WIDTH = 160
 """Minimum width of a panel, pixels; smaller images are enlarged by a whole number."""
-TEXT_SHARE, SMALLEST_TEXT = 24, 12
+TEXT_SHARE, MIN_TEXT = 24, 12
 """Ratio of a panel's width to the height of text, and the minimum height of text, pixels."""
 INK, PAPER = (20, 20, 20), (255, 255, 255)
 """Colours of text and background, 8-bit RGB."""
@@ -119,9 +119,9 @@ def composed(panels: Sequence[Panel]) -> Tensor:
         panels: panels of equal size. Small panels are enlarged by a whole number, without interpolation.
     """
     height, width = panels[0].image.shape[:2]
-    factor = max(-(-SMALLEST_WIDTH // width), 1)
+    factor = max(-(-MIN_WIDTH // width), 1)
     height, width = height * factor, width * factor
-    size = max(width // TEXT_SHARE, SMALLEST_TEXT)
+    size = max(width // TEXT_SHARE, MIN_TEXT)
     font, gap, line = ImageFont.load_default(size), size, round(1.6 * size)
     bars = gap // 2 + size // 2 + line if any(panel.bar is not None for panel in panels) else 0
     paper = Image.new("RGB", (len(panels) * (width + gap) + gap, height + line + bars + gap // 2), PAPER)

@@ -16,19 +16,19 @@ from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.renderable import Renderable
 
-JUMP = 5.0
+MIN_JUMP = 5.0
 """A walk counts as jumping if a step reaches this multiple of the median step."""
 AROUND, ABOVE, OPENING = 1.0, math.radians(20), math.radians(50)
 """Of cameras around a scene: distance from its middle in edges of its box, elevation and field of view, radians."""
-FEWEST = 3
+MIN_CAMERAS = 3
 """Minimum number of cameras between two jumps; shorter stretches are left out of an interpolated path."""
-GAP = 60.0
+MAX_GAP = 60.0
 """Cameras stand all around a centre if no gap between them exceeds this angle, degrees."""
-NEARLY_ABOVE = 0.2
+MIN_HORIZONTAL = 0.2
 """Cameras closer to the vertical axis than this, relative to the mean horizontal distance, count as above or below."""
-STOPS = 24
+SMOOTHING = 24
 """Number of cameras divided by the standard deviation, in cameras, of the weights of an interpolated path."""
-SAME_WAY = 0.7
+MIN_MEAN_DIRECTION = 0.7
 """Cameras look the same way if the mean of their unit viewing directions is at least this long."""
 SMALL_RADIUS = 0.1
 """Ratio of a spiral's radius to its focus distance, for cameras that look different ways."""
@@ -62,7 +62,7 @@ class Arc:
 def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
     """Return the arc around a centre where cameras stand; None if they stand all around it.
 
-    They stand all around if no gap between neighbours exceeds `GAP`. Cameras almost above or below the centre are
+    They stand all around if no gap between neighbours exceeds `MAX_GAP`. Cameras almost above or below the centre are
     ignored.
 
     Args:
@@ -71,13 +71,13 @@ def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
     """
     offsets = (cameras.camera_to_worlds[:, :2, 3] - center[:2]).double().cpu()
     away = offsets.norm(dim=-1)
-    offsets = offsets[away > NEARLY_ABOVE * away.mean()]
-    if len(offsets) < FEWEST:
+    offsets = offsets[away > MIN_HORIZONTAL * away.mean()]
+    if len(offsets) < MIN_CAMERAS:
         return None
     angles = torch.atan2(offsets[:, 1], offsets[:, 0]).sort().values
     gaps = torch.cat([angles[1:], angles[:1] + 2 * torch.pi]) - angles
     largest = int(gaps.argmax())
-    if gaps[largest] <= math.radians(GAP):
+    if gaps[largest] <= math.radians(MAX_GAP):
         return None
     width = 2 * math.pi - float(gaps[largest])
     return Arc(float(angles[(largest + 1) % len(angles)]) + width / 2, width)
@@ -138,7 +138,7 @@ def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
     parts = stretches(cameras)
     kept = torch.cat(parts)
     part = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(each) for each in parts]))
-    width = max(len(kept) / STOPS, 0.5)
+    width = max(len(kept) / SMOOTHING, 0.5)
     positions = torch.linspace(0, len(kept) - 1, num_frames, dtype=torch.float64)
     weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(len(kept))) / width).square())
     weights = weights * (part == part[positions.round().long(), None])
@@ -156,9 +156,9 @@ def stretches(cameras: Cameras) -> list[Tensor]:
     centers = cameras.camera_to_worlds[:, :, 3].double().cpu()
     steps = (centers[1:] - centers[:-1]).norm(dim=-1)
     usual = float(steps.median()) if len(steps) else 0.0
-    jumps = (steps > JUMP * usual).nonzero()[:, 0] + 1 if usual > 0 else torch.zeros(0, dtype=torch.long)
+    jumps = (steps > MIN_JUMP * usual).nonzero()[:, 0] + 1 if usual > 0 else torch.zeros(0, dtype=torch.long)
     parts = torch.tensor_split(torch.arange(len(cameras)), jumps)
-    return [part for part in parts if len(part) >= FEWEST] or [torch.arange(len(cameras))]
+    return [part for part in parts if len(part) >= MIN_CAMERAS] or [torch.arange(len(cameras))]
 
 
 def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:
@@ -204,8 +204,8 @@ def middle_pose(cameras: Cameras) -> Tensor:
 
 
 def look_same_way(cameras: Cameras) -> bool:
-    """Return whether the mean of the viewing directions of `cameras` is longer than `SAME_WAY`."""
-    return float(cameras.camera_to_worlds[:, :, 2].mean(0).norm()) > SAME_WAY
+    """Return whether the mean of the viewing directions of `cameras` is longer than `MIN_MEAN_DIRECTION`."""
+    return float(cameras.camera_to_worlds[:, :, 2].mean(0).norm()) > MIN_MEAN_DIRECTION
 
 
 def focus_distance(model: Renderable, camera: Cameras, background: Tensor) -> float:

@@ -19,7 +19,7 @@ QUALITY = 18
 """Constant rate factor of H.264; 18 is considered visually lossless."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
-MOST = 65_535
+MAX_UINT16 = 65_535
 """Largest value of a 16-bit PNG."""
 
 
@@ -139,7 +139,7 @@ def write_distances(paths: Iterable[Path], distances: Iterable[np.ndarray], unit
             np.save(content, values, allow_pickle=False)
             write_file(path, content.getvalue())
         else:
-            steps = np.clip(np.round(values.astype(np.float64) / unit), 0, MOST).astype(np.uint16)
+            steps = np.clip(np.round(values.astype(np.float64) / unit), 0, MAX_UINT16).astype(np.uint16)
             write_file(path, _encoded(np.where(values > 0, np.maximum(steps, 1), 0).astype(np.uint16), ".png"))
 
 

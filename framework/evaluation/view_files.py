@@ -16,7 +16,7 @@ from nerfloom.rendering.rendered import Picture
 
 WORST = "worst"
 """Name, without suffix, of the files of the view with the lowest PSNR; the next evaluation overwrites them."""
-LONGEST_STEM = 150
+MAX_STEM_LENGTH = 150
 """Maximum number of bytes of an image's name within names of written files."""
 
 
@@ -81,5 +81,5 @@ class ViewFiles:
 
 
 def _short_stem(name: str) -> str:
-    """Return an image's name without its extension, cut to `LONGEST_STEM` bytes."""
-    return os.fsencode(Path(name).stem)[:LONGEST_STEM].decode("utf-8", "ignore")
+    """Return an image's name without its extension, cut to `MAX_STEM_LENGTH` bytes."""
+    return os.fsencode(Path(name).stem)[:MAX_STEM_LENGTH].decode("utf-8", "ignore")

@@ -13,7 +13,7 @@ from torch import Tensor
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras, join_cameras
-from nerfloom.cameras.carried import carried_poses
+from nerfloom.cameras.pose_propagation import propagated_poses
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.geometry.lenses import LENSES
@@ -35,7 +35,7 @@ def refined_cameras(model: Renderable, cameras: Cameras) -> Cameras:
     return model.refined_cameras(cameras) if isinstance(model, RefinesPoses) else cameras
 
 
-def carried_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
+def propagated_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
     """Return cameras that were not refined, moved as the training cameras around them were.
 
     Args:
@@ -44,7 +44,7 @@ def carried_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Camer
     """
     if torch.equal(given.camera_to_worlds, refined.camera_to_worlds):
         return cameras
-    poses, _ = carried_poses(cameras.camera_to_worlds, given.camera_to_worlds, refined.camera_to_worlds)
+    poses, _ = propagated_poses(cameras.camera_to_worlds, given.camera_to_worlds, refined.camera_to_worlds)
     return replace(cameras, camera_to_worlds=poses)
 
 
@@ -55,7 +55,7 @@ def all_cameras(scenes: Mapping[str, ParsedScene], given: Cameras, refined: Came
         scenes: split -> its images, with the cameras as they are given.
         given, refined: the training cameras of the images that could be read, before and after refinement.
     """
-    found = {split: carried_cameras(scene.cameras, given, refined) for split, scene in scenes.items()}
+    found = {split: propagated_cameras(scene.cameras, given, refined) for split, scene in scenes.items()}
     if "train" in found and len(found["train"]) == len(refined):
         found["train"] = replace(found["train"], camera_to_worlds=refined.camera_to_worlds.cpu())
     return found

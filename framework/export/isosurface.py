@@ -18,7 +18,7 @@ from torch import Tensor
 from nerfloom.base.errors import ConfigError
 from nerfloom.export.lattice import Lattice
 
-SMALLEST = 1e-3
+MIN_VALUE = 1e-3
 """Minimum distance of a value from 0. A vertex is then never on a lattice point, so that its edge is known, and no
 triangle has lost its area."""
 MAX_VERTICES = 40_000_000
@@ -76,7 +76,7 @@ def _marched(values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     unknown = np.isnan(values)
     any_unknown = bool(unknown.any())
     filled = np.where(unknown, np.float32(-1), values).astype(np.float32)
-    np.copyto(filled, np.copysign(np.float32(SMALLEST), filled), where=np.abs(filled) < SMALLEST)
+    np.copyto(filled, np.copysign(np.float32(MIN_VALUE), filled), where=np.abs(filled) < MIN_VALUE)
     if not filled.min() < 0 < filled.max():
         return None
     function: Any = marching_cubes
@@ -101,7 +101,7 @@ def _beside(unknown: np.ndarray) -> np.ndarray:
 def _identified(vertices: np.ndarray, start: np.ndarray, cells: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return a number (V,) for the lattice edge, or the cell, that each vertex lies on, and its lattice coordinates."""
     nearest = np.round(vertices)
-    on_point = np.abs(vertices - nearest) < SMALLEST / 4
+    on_point = np.abs(vertices - nearest) < MIN_VALUE / 4
     corner = np.where(on_point, nearest, np.floor(vertices)).astype(np.int64) + start
     # A vertex on an edge has one fractional coordinate; the one inside a cell, if any, has three.
     within = (~on_point).sum(1) != 1

@@ -119,7 +119,6 @@ def cavities(mesh: Mesh, owners: Tensor, cameras: Tensor) -> Tensor:
     bounds nothing, and a room that holds a camera is no hollow, though its volume is negative too.
 
     Args:
-        mesh: the mesh.
         owners: (F,) int64 component of each face.
         cameras: (M, 3) positions of cameras, in the frame of the mesh.
     """
@@ -169,7 +168,6 @@ def simplified(mesh: Mesh, target_num_faces: int) -> Mesh:
     Normals and colours are dropped. A mesh that has no more faces is returned as it is.
 
     Args:
-        mesh: the mesh.
         target_num_faces: number of faces to reach.
 
     Raises:

@@ -15,7 +15,7 @@ from nerfloom.rendering.outputs import NORMALS
 
 OPAQUE = 0.5
 """Minimum opacity of a ray that ends on a surface."""
-MOST_VIEWS = 200
+MAX_VIEWS = 200
 """Maximum number of views that are rendered of a method that casts no rays."""
 
 
@@ -78,7 +78,7 @@ def surface_points(model: RendersRays, dataset: Dataset, count: int, reach: floa
 def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
     """Return surface points at the median depth of random pixels of rendered training views, view by view.
 
-    It is for methods that cast no rays; views are evenly spaced in the data set, at most `MOST_VIEWS`.
+    It is for methods that cast no rays; views are evenly spaced in the data set, at most `MAX_VIEWS`.
 
     Args:
         model: the model in evaluation mode.
@@ -113,7 +113,7 @@ def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float
 
 def num_views(dataset: Dataset) -> int:
     """Return the number of views of `dataset` that `picture_points` renders."""
-    return min(len(dataset), MOST_VIEWS)
+    return min(len(dataset), MAX_VIEWS)
 
 
 def _within(model: Renderable, positions: Tensor, reach: float | None) -> Tensor:

@@ -32,7 +32,7 @@ from nerfloom.export.web import (
 )
 from nerfloom.method import Method
 from nerfloom.renderable import Renderable, RendersRays
-from nerfloom.scene.folds import in_order
+from nerfloom.scene.folded_poses import in_order
 from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
@@ -40,7 +40,7 @@ from nerfloom.splats.transform import transformed
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
 
-VIEWS = 5
+MAX_VIEWS = 5
 """Maximum number of views for comparing a page with the model."""
 
 
@@ -163,7 +163,7 @@ def closeness(
     """
     background = model.background
     judged = (views_to_judge(dataset) if dataset else []) or list(range(len(cameras)))
-    chosen = [judged[rank] for rank in spread(len(judged), VIEWS)]
+    chosen = [judged[rank] for rank in spread(len(judged), MAX_VIEWS)]
     as_seen = cameras.model in DRAWN
     cameras = cameras if as_seen else pinhole(cameras)
     own: list[float] = []

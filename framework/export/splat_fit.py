@@ -43,21 +43,21 @@ PICTURES_SHARE = 0.45
 """Share of the budget for rendering pictures; the rest is for training steps."""
 PICTURES = 48
 """Number of pictures that should fit into their share; determines the part of an image that each shows."""
-FEWEST_PICTURES = 6
+MIN_PICTURES = 6
 """Minimum number of pictures, even if they exceed their share."""
-LONGEST_SIDE = 800
+MAX_SIDE = 800
 """Maximum longer side of an image in pixels; larger ones are reduced."""
-SMALLEST_PART = 0.5
+MIN_PART = 0.5
 """Minimum share of an image's width and height that a picture shows."""
 TIMED_RAYS = 8192
 """Number of rays for measuring speed."""
 BETWEEN = 4
 """Every Nth picture is from between two cameras."""
-PASSES = 4
+MAX_PASSES = 4
 """Maximum number of rounds of drawing rays, since some rays hit no surface."""
 OPACITY, SIZE = 0.5, 0.7
 """Initial opacity of Gaussians, and their standard deviation in mean distances to neighbours."""
-MOST_GAUSSIANS, MOST_RATE = 300_000, 5.0
+MAX_GAUSSIANS, MAX_RATE = 300_000, 5.0
 """Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
 """Assumed steps per second when the factor of learning rates is chosen."""
@@ -141,7 +141,7 @@ def fit_gaussians(
     """
     begun = time.perf_counter()
     seed_step(machine.seed, 0)
-    most = number_for(seconds, MOST_GAUSSIANS)
+    most = number_for(seconds, MAX_GAUSSIANS)
     points, colors = _surfaces(model, dataset, most)
     shots = _shots(model, dataset, cameras, PICTURES_SHARE * seconds)
     photographs = _photographs(model, dataset)
@@ -158,7 +158,7 @@ def fit_gaussians(
         # On a slow machine even the fewest pictures exceed their share; training still needs time.
         max_seconds=max(seconds - (time.perf_counter() - begun), own_share),
         num_gaussians=most,
-        rate_factor=rate_factor(STEPS_PER_SECOND * own_share, MOST_RATE),
+        rate_factor=rate_factor(STEPS_PER_SECOND * own_share, MAX_RATE),
         machine=machine,
     )
     learnt = replace(dataset, cameras=cameras, scene=replace(dataset.scene, num_scenes=1))
@@ -180,7 +180,7 @@ def fit_gaussians(
 def _surfaces(model: RendersRays, dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
     """Return up to `count` points (K, 3) on surfaces and their colours (K, 3), on the model's device."""
     positions, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    for _ in track(range(PASSES), "Looking for surfaces", total=PASSES):
+    for _ in track(range(MAX_PASSES), "Looking for surfaces", total=MAX_PASSES):
         if (left := count - sum(map(len, positions))) > 0:
             found = joined(surface_points(model, dataset, 2 * left, None))
             positions.append(found.positions[:left])
@@ -199,11 +199,11 @@ def _shots(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: floa
     They are crops of images, since small images have too little detail.
     """
     end = time.perf_counter() + seconds
-    cameras = cameras.scaled(min(1.0, LONGEST_SIDE / float(torch.maximum(cameras.widths, cameras.heights).max())))
+    cameras = cameras.scaled(min(1.0, MAX_SIDE / float(torch.maximum(cameras.widths, cameras.heights).max())))
     share = _part(model, dataset, cameras, seconds)
     shots: list[Shot] = []
     for camera, index in track(_order(cameras), "Rendering pictures", total=PICTURES):
-        if len(shots) >= FEWEST_PICTURES and time.perf_counter() > end:
+        if len(shots) >= MIN_PICTURES and time.perf_counter() > end:
             break
         moment = None if dataset.times is None else float(dataset.times[index])
         shots.append(_shot(model, cropped(camera, share), moment))
@@ -222,7 +222,7 @@ def _part(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: float
     wait_for(model.device)
     each = (time.perf_counter() - start) / (view.width * view.height)
     wanted = min(PICTURES, 2 * len(cameras))
-    return min(max(math.sqrt(seconds / (each * pixels * wanted)), SMALLEST_PART), 1.0)
+    return min(max(math.sqrt(seconds / (each * pixels * wanted)), MIN_PART), 1.0)
 
 
 def cropped(camera: Cameras, share: float) -> Cameras:
@@ -297,7 +297,7 @@ def _photograph(dataset: Dataset, cameras: Cameras, index: int) -> Shot:
     """Return a photograph, or a random part of a large one."""
     camera = cameras[index : index + 1]
     height, width = int(camera.heights[0]), int(camera.widths[0])
-    part = cropped(camera, min(1.0, LONGEST_SIDE / max(height, width)))
+    part = cropped(camera, min(1.0, MAX_SIDE / max(height, width)))
     left, top = round(float(camera.cx[0] - part.cx[0])), round(float(camera.cy[0] - part.cy[0]))
     where = slice(top, top + int(part.heights[0])), slice(left, left + int(part.widths[0]))
     image, kept = dataset.image(index)[where].float() / 255, dataset.kept_of(index)

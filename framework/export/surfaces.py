@@ -16,7 +16,7 @@ from nerfloom.export.points import SurfacePoints, joined, surface_points
 from nerfloom.method import Method
 from nerfloom.training.trainer import Trainer
 
-PASSES = 16
+MAX_PASSES = 16
 """Maximum number of times that rays are drawn, since some end on no surface."""
 
 
@@ -68,7 +68,7 @@ def found_surfaces(
             break
     model = trainer.model.eval()
     parts: list[SurfacePoints] = []
-    while (left := count - sum(len(part.positions) for part in parts)) > 0 and len(parts) < PASSES:
+    while (left := count - sum(len(part.positions) for part in parts)) > 0 and len(parts) < MAX_PASSES:
         found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
         parts.append(found[torch.arange(len(found.positions)) < left])
     found, cameras = joined(iter(parts)), dataset.cameras.to("cpu")

@@ -1,6 +1,6 @@
 """Textures of meshes: an image, and the place on it of each triangle.
 
-The image is divided into squares, each of which holds two triangles of equal size. This wastes more space than charts
+The image is divided into squares, and each holds two triangles of equal size. This wastes more space than charts
 of neighbouring triangles, but it works for every mesh, takes no time and needs no package. Each triangle owns all
 texels that its interpolation reads, so that other colours do not bleed into it.
 """
@@ -18,9 +18,9 @@ from torch import Tensor
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError, FlagError
 
-SMALLEST, LARGEST = 64, 16_384
+MIN_EDGE, MAX_EDGE = 64, 16_384
 """Bounds of a texture's edge, in texels."""
-LEAST_SQUARE = 5
+MIN_SQUARE = 5
 """Minimum edge of a square, in texels: the legs of its triangles are three shorter."""
 CHUNK = 1 << 17
 """Maximum number of texels that are coloured at once."""
@@ -37,8 +37,8 @@ class Texturing:
 
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
-        if not SMALLEST <= self.size <= LARGEST:
-            raise FlagError(f"--texture-size is {self.size}; it must be from {SMALLEST} to {LARGEST}")
+        if not MIN_EDGE <= self.size <= MAX_EDGE:
+            raise FlagError(f"--texture-size is {self.size}; it must be from {MIN_EDGE} to {MAX_EDGE}")
         if not self.max_seconds > 0:
             raise FlagError(f"--texture-seconds is {self.max_seconds:g}; it must be above zero")
 
@@ -74,11 +74,11 @@ class Atlas:
 
     def check(self) -> None:
         """Raise ConfigError if triangles would be too small."""
-        if self.side < LEAST_SQUARE:
-            needed = LEAST_SQUARE * self.columns
+        if self.side < MIN_SQUARE:
+            needed = MIN_SQUARE * self.columns
             raise ConfigError(
                 f"a texture of {self.size} x {self.size} texels is too small for {self.num_faces:,} faces: give "
-                f"--texture-size {needed} or --target-num-faces {2 * (self.size // LEAST_SQUARE) ** 2}"
+                f"--texture-size {needed} or --target-num-faces {2 * (self.size // MIN_SQUARE) ** 2}"
             )
 
     def corners(self) -> Tensor:

@@ -28,7 +28,7 @@ BLOCKS_AT_ONCE = 48
 """Number of blocks whose points are projected at once."""
 OPAQUE = 0.5
 """Minimum opacity of a pixel that shows a surface; others show empty space as far as the scene goes."""
-LEAST_WEIGHT = 0.05
+MIN_WEIGHT = 0.05
 """Weight of a view that sees the surface at a right angle to its normal; one that looks along the normal weighs 1."""
 MAX_PIXELS = 30_000_000
 """Maximum number of pixels of all views together, which take 270 MB."""
@@ -73,7 +73,6 @@ def stride_for(cameras: Cameras, lattice: Lattice, most_pixels: int = MAX_PIXELS
 
     Args:
         cameras: the cameras to be rendered.
-        lattice: the lattice.
         most_pixels: maximum number of pixels of all views together.
     """
     middle = lattice.positions(torch.tensor([lattice.cells]) / 2)
@@ -127,7 +126,7 @@ def _facing(points: Tensor, directions: Tensor) -> Tensor:
     across, down = padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]
     normal = torch.linalg.cross(across, down)
     cosine = (normal * directions).sum(-1).abs() / normal.norm(dim=-1).clamp(min=1e-20)
-    return torch.where(cosine.isfinite(), cosine, 0).clamp(LEAST_WEIGHT, 1)
+    return torch.where(cosine.isfinite(), cosine, 0).clamp(MIN_WEIGHT, 1)
 
 
 def surface_points(view: DepthView) -> Tensor:

@@ -30,11 +30,11 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
 from nerfloom.splats.spz import encoded, out_of_range, read_spz
 
-LARGEST = 32.0
+MAX_MEGABYTES = 32.0
 """Maximum size of a page in millions of bytes; larger ones are refused by some phones."""
 BITS = (8, 8)
 """Bits of harmonics where there is room: the page looks like the Gaussians to 55 dB, with SPZ's usual 5 and 4 to 41."""
-MOST_CAMERAS = 300
+MAX_CAMERAS = 300
 """Maximum number of the capture's cameras in a page, evenly spaced."""
 SCRIPTS = ("spz.js", "splats.js", "viewer.js")
 """Files of the page's program, in their order."""
@@ -101,7 +101,7 @@ def pinhole(cameras: Cameras) -> Cameras:
 
 
 def camera_rows(cameras: Cameras, names: Sequence[str], turn: Tensor) -> list[list[Any]]:
-    """Return the rows of `PageFacts.cameras`, of at most MOST_CAMERAS cameras.
+    """Return the rows of `PageFacts.cameras`, of at most MAX_CAMERAS cameras.
 
     Args:
         cameras: M pinhole cameras.
@@ -109,7 +109,7 @@ def camera_rows(cameras: Cameras, names: Sequence[str], turn: Tensor) -> list[li
         turn: (3, 3) rotation of the scene.
     """
     count = len(cameras)
-    chosen = [rank * count // MOST_CAMERAS for rank in range(MOST_CAMERAS)] if count > MOST_CAMERAS else range(count)
+    chosen = [rank * count // MAX_CAMERAS for rank in range(MAX_CAMERAS)] if count > MAX_CAMERAS else range(count)
     poses = turn @ cameras.camera_to_worlds.double().cpu()
     lenses = torch.stack([getattr(cameras, k).double() for k in ("fx", "fy", "cx", "cy", "widths", "heights")], -1)
     rows = []
@@ -144,7 +144,7 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
         max_megabytes: maximum size of the page, in millions of bytes.
 
     Raises:
-        ConfigError: if the limit is above LARGEST, or no Gaussian fits.
+        ConfigError: if the limit is above MAX_MEGABYTES, or no Gaussian fits.
     """
     check_size(max_megabytes)
     empty = page(b"", facts)
@@ -164,11 +164,11 @@ def check_size(max_megabytes: float) -> None:
         max_megabytes: the limit, in millions of bytes.
 
     Raises:
-        ConfigError: if it is not positive, or above LARGEST.
+        ConfigError: if it is not positive, or above MAX_MEGABYTES.
     """
-    if not 0 < max_megabytes <= LARGEST:
+    if not 0 < max_megabytes <= MAX_MEGABYTES:
         raise FlagError(
-            f"--max-megabytes is {max_megabytes:g}; a page has up to {LARGEST:g}, since phones refuse larger ones"
+            f"--max-megabytes is {max_megabytes:g}; a page has up to {MAX_MEGABYTES:g}, since phones refuse larger ones"
         )
 
 

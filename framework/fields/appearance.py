@@ -14,6 +14,8 @@ from nerfloom.base.optimised import Optimised
 
 AFFINE = 12
 """Length of an appearance vector that holds an affine transform of colours."""
+LIGHT_REASONS = {True: "light differs between the images", False: "the images are lit alike"}
+"""Reason for or against an appearance vector per image, by whether light, exposure or camera differ."""
 
 
 class Appearance(nn.Module):
@@ -27,7 +29,7 @@ class Appearance(nn.Module):
         size: number D of features of a vector.
         count: number of images.
         optimised: settings of the optimiser; those of the containing module if None.
-        mean_share: probability with which an image has the mean vector in a training step.
+        mean_share: probability that an image has the mean vector in a training step.
         held_out: what held-out images are evaluated with: the mean vector, or one that is fitted to the left half of
             each, and judged on its right half.
     """
@@ -57,7 +59,7 @@ class Appearance(nn.Module):
             (N, D) vectors.
         """
         if camera_indices is not None:
-            # Not `vectors[camera_indices]`: its gradient depends on the order in which threads add it up.
+            # Not `vectors[camera_indices]`: its gradient depends on the order of the threads' sums.
             return functional.embedding(camera_indices, self._own_or_mean())
         return (self.vectors.detach().mean(0) if self._shown is None else self._shown).expand(count, -1)
 

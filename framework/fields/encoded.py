@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.encodings.hash_grid import HashGrid
-from nerfloom.encodings.opening import Opening
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.base import MLP, Field
@@ -125,7 +125,7 @@ class EncodedField(BoxField):
             do not depend on the direction.
         unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: the images' appearance vectors, an input of the colour network; None without.
-        opening: bands of the viewing direction open one after the other (`Opening`) during this fraction of the
+        opening: bands of the viewing direction open one after the other (`OpenLevels`) during this fraction of the
             training budget; 0: all are open.
         ambient: number of further coordinates (`Points.ambient`) that the density network takes.
     """
@@ -146,7 +146,7 @@ class EncodedField(BoxField):
         self.direction_levels, self.num_features = direction_levels, num_features
         self.density_head = MLP(encoding.num_features + ambient, width, num_features, bias=False)
         inputs = num_features + direction_levels**2
-        self.direction_opening = Opening(direction_levels, 1, opening) if opening and direction_levels else None
+        self.direction_opening = OpenLevels(direction_levels, 1, opening) if opening and direction_levels else None
         self.appearance = appearance
         inputs += 0 if appearance is None else appearance.size
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")

@@ -16,7 +16,7 @@ from nerfloom.kernels.networks.mlp import MAX_WIDTH
 DENSITY_BIAS = -1.0
 """Added to the density before softplus, so that the scene is half transparent at first (Mip-NeRF, supplement)."""
 WIDENING = 1e-3
-"""Margin by which colours extend beyond 0 and 1, so that black and white are finite inputs (Mip-NeRF, supplement)."""
+"""Margin of colours beyond 0 and 1, so that black and white are finite inputs (Mip-NeRF, supplement)."""
 BOTTLENECK, COLOR_WIDTH = 256, 128
 """Maximum number of features that the colour network takes beside the direction, and of its hidden layer."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from nerfloom.encodings.opening import Opening
+from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.contraction import contract_to_unit
@@ -27,7 +27,7 @@ class NeRFField(Field):
             section 4); None for a static field.
         contracted: (2, 3) box; all of space is contracted around it into [-1, 1]^3, the range that suits the
             frequencies. None to encode scene coordinates.
-        opening: frequencies of positions and directions open one after the other (`Opening`) during this fraction of
+        opening: frequencies of positions and directions open one after the other (`OpenLevels`) during this fraction of
             the training budget; 0: all are open.
         dims: number of coordinates of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al.
             2020).
@@ -53,8 +53,8 @@ class NeRFField(Field):
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies
         self.time_frequencies = time_frequencies
-        self.opening = Opening(position_frequencies, 0, opening) if opening else None
-        self.direction_opening = Opening(direction_frequencies, 0, opening) if opening else None
+        self.opening = OpenLevels(position_frequencies, 0, opening) if opening else None
+        self.direction_opening = OpenLevels(direction_frequencies, 0, opening) if opening else None
         encoded = dims * (1 + 2 * position_frequencies) + (0 if time_frequencies is None else 1 + 2 * time_frequencies)
         self.before_skip = MLP(encoded, *[width] * skip, activation="relu")
         self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")
@@ -91,7 +91,7 @@ class NeRFField(Field):
         return self.color_head(self.feature_head(features), encoded).float()
 
 
-def opened_frequencies(x: Tensor, num_frequencies: int, opening: Opening | None) -> Tensor:
+def opened_frequencies(x: Tensor, num_frequencies: int, opening: OpenLevels | None) -> Tensor:
     """Return the frequency encoding (N, D + 2 D L) of vectors; closed frequencies are 0.
 
     Args:

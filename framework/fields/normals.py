@@ -24,7 +24,6 @@ def density_normals(field: Field, points: Points) -> Tensor:
     The field is evaluated once more. The result has no gradient.
 
     Args:
-        field: the field.
         points: N points.
     """
     parameters = [p for p in field.parameters() if p.requires_grad]

@@ -11,7 +11,7 @@ from nerfloom.geometry.limits import at_least
 
 
 def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distances at which rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
+    """Return the distances where rays enter and leave an axis-aligned box (slab method, Kay and Kajiya 1986).
 
     A ray parallel to a face is inside or outside that slab along its whole length; a ray that starts inside the box
     enters at 0. For a ray that misses the box, or only touches it, both distances are 0: an interval of length 0.
@@ -140,7 +140,7 @@ def contract_gaussians(means: Tensor, roots: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def contraction_scale(positions: Tensor) -> Tensor:
-    """Return the factors (...) by which the contraction scales lengths in the mean over directions.
+    """Return the mean factors (...), over directions, of the contraction's scaling of lengths.
 
     It is the cube root of the determinant of the derivative of `contract` at `positions` (..., 3): 1 inside the unit
     ball, and falling with |x|^(-4/3) outside.

@@ -11,7 +11,7 @@ for fisheye, it is the angle to the optical axis times the unit vector from the 
 
 (OpenCV's rational model; Kannala and Brandt 2006). The map is the gradient of a scalar function, so its Jacobian is
 symmetric; on a disk where the Jacobian is positive definite, the map is one to one. The largest such disk, whose radius
-is the lens's `reach`, is the domain in which each position has one ray, and a Newton iteration that stays in it cannot
+is the lens's `reach`, is the domain where each position has one ray, and a Newton iteration that stays in it cannot
 find a wrong root. Beyond the reach, polynomials fitted to a lens are meaningless: they fold the image over.
 """
 
@@ -42,12 +42,12 @@ _FISHEYE_INDICES = [0, 1, 4, 8]
 MAXIMUM_REACH = {"opencv": math.tan(math.radians(89.9)), "fisheye": math.pi}
 """Maximum of `reach`: opencv shows no direction at 90 degrees from the axis, and fisheye none beyond 180."""
 RADII = 4096
-"""Number of radii at which the Jacobian is tested to find the reach."""
-SMALLEST_DENOMINATOR = 1e-2
+"""Number of radii where the Jacobian is tested to find the reach."""
+MIN_DENOMINATOR = 1e-2
 """Minimum of D within the reach; where D approaches 0, positions go to infinity."""
-ITERATIONS = 60
+MAX_ITERATIONS = 60
 """Maximum number of Newton iterations. Four are usual; near the reach, where the Jacobian vanishes, more are needed."""
-SMALLEST_AREA = 1e-3
+MIN_AREA = 1e-3
 """Minimum determinant of the Jacobian for a pixel's cone; at the reach it is 0, and the cone's width infinite."""
 
 
@@ -152,7 +152,7 @@ def find_reach(coefficients: Tensor, maximum: float) -> Tensor:
     def one_to_one(radius: Tensor) -> Tensor:
         scale, slope, denominator = radial(radius.square(), coefficients[:, None])
         least = torch.minimum(scale, scale + 2 * radius.square() * slope)
-        return (denominator > SMALLEST_DENOMINATOR) & (least > 6 * coefficients[:, None, 2:4].norm(dim=-1) * radius)
+        return (denominator > MIN_DENOMINATOR) & (least > 6 * coefficients[:, None, 2:4].norm(dim=-1) * radius)
 
     angles = torch.linspace(0, 1, RADII, dtype=coefficients.dtype, device=coefficients.device) * math.atan(maximum)
     radii = angles.tan().expand(len(coefficients), RADII)
@@ -186,7 +186,7 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
     step_x, step_y = u * start, v * start
     possible = distance <= lenses.bounds[:, 1]
     tolerance = (1e-9 if u.dtype == torch.float64 else 1e-6) ** 2 * (1 + distance.square())
-    for _ in range(lenses.iterations or ITERATIONS):
+    for _ in range(lenses.iterations or MAX_ITERATIONS):
         at_x, at_y = x + step_x, y + step_y
         bent_u, bent_v, (uu, uv, vv) = distort(at_x, at_y, lenses.coefficients)
         off_u, off_v = bent_u - u, bent_v - v
@@ -214,10 +214,10 @@ def iterations_needed(u: Tensor, v: Tensor, lenses: Distortion) -> int:
         lenses: the R lenses, one for each point.
     """
     found = undistort(u, v, lenses)[2]
-    for count in range(1, ITERATIONS):
+    for count in range(1, MAX_ITERATIONS):
         if bool((undistort(u, v, replace(lenses, iterations=count))[2] | ~found).all()):
             return count + 1
-    return ITERATIONS
+    return MAX_ITERATIONS
 
 
 def unproject(model: str, x: Tensor, y: Tensor, lenses: Distortion | None) -> LensRays:
@@ -242,7 +242,7 @@ def unproject(model: str, x: Tensor, y: Tensor, lenses: Distortion | None) -> Le
     assert lenses is not None
     precise_x, precise_y, valid = undistort(x.to(lenses.reach), y.to(lenses.reach), lenses)
     uu, uv, vv = distort(precise_x, precise_y, lenses.coefficients)[2]
-    area = (uu * vv - uv * uv).clamp(min=SMALLEST_AREA)
+    area = (uu * vv - uv * uv).clamp(min=MIN_AREA)
     if model == "opencv":
         rays = _at_depth_1(precise_x, precise_y, area, valid)
     else:

@@ -32,7 +32,7 @@ class Pattern(NamedTuple):
     """Rotations and mirrorings of the pattern of points in N frustums."""
 
     turns: Tensor
-    """(N,) angle by which it is rotated around the axis."""
+    """(N,) angle of its rotation around the axis."""
     mirrors: Tensor
     """(N,) -1 where it is mirrored, 1 elsewhere."""
 

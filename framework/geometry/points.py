@@ -1,4 +1,4 @@
-"""Points at which a field is evaluated, with their size."""
+"""Points where a field is evaluated, with their size."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Frustums:
     directions: Tensor
     """(N, 3) unit direction of each cone's axis."""
     t_starts: Tensor
-    """(N,) distance from the apex at which the frustum starts."""
+    """(N,) distance from the apex where the frustum starts."""
     t_ends: Tensor
-    """(N,) distance from the apex at which the frustum ends."""
+    """(N,) distance from the apex where the frustum ends."""
     radii: Tensor
     """(N,) radius of the cone at distance 1."""
     ranks: Tensor | None = None
@@ -38,7 +38,7 @@ class Frustums:
 
 @dataclass(frozen=True)
 class Points:
-    """N points at which a field is evaluated."""
+    """N points where a field is evaluated."""
 
     positions: Tensor
     """(N, 3) scene coordinates, or (N, 4) points of an inverted sphere (`nerfloom.geometry.spheres`)."""
@@ -100,11 +100,11 @@ class Intervals(Protocol):
 
     @property
     def t(self) -> Tensor:
-        """(N,) distance at which the field is evaluated."""
+        """(N,) distance where the field is evaluated."""
 
 
 def sample_points(rays: Rays, samples: Samples, footprint: Footprint = "none") -> Points:
-    """Return the points at which a field is evaluated for samples.
+    """Return the points where a field is evaluated for samples.
 
     Args:
         rays: R rays; with `pixel_radii` if a footprint is computed.
@@ -126,7 +126,7 @@ def interval_points(
     footprint: Footprint,
     ranks: Tensor | None = None,
 ) -> Points:
-    """Return the points at which a field is evaluated for intervals.
+    """Return the points where a field is evaluated for intervals.
 
     Args:
         rays: R rays; with `pixel_radii` if a footprint is computed.
@@ -166,8 +166,8 @@ def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[T
     """Return the Gaussians of conical frustums: Mip-NeRF (Barron et al. 2021), equation 7, in its stable form.
 
     Args:
-        t_starts: (N,) distance at which each frustum starts.
-        t_ends: (N,) distance at which each frustum ends.
+        t_starts: (N,) distance where each frustum starts.
+        t_ends: (N,) distance where each frustum ends.
         radii: (N,) radius of the cone at distance 1.
 
     Returns:

@@ -24,9 +24,9 @@ class Rays:
     directions: Tensor
     """(R, 3) unit directions."""
     nears: Tensor = None  # type: ignore[assignment]
-    """(R,) distance at which sampling starts; 0 if not given."""
+    """(R,) distance where sampling starts; 0 if not given."""
     fars: Tensor = None  # type: ignore[assignment]
-    """(R,) distance at which sampling ends; if not given infinite, for samplers that end with a box."""
+    """(R,) distance where sampling ends; if not given infinite, for samplers that end with a box."""
     pixel_radii: Tensor | None = None
     """(R,) radius of the pixel's cone at distance 1 (Mip-NeRF, section 3.1)."""
     times: Tensor | None = None
@@ -111,7 +111,7 @@ class Samples:
     offsets: Tensor
     """(R + 1,) int64 index of each ray's first sample; the last entry is N."""
     points: Tensor | None = None
-    """(N,) distance at which the field is evaluated; if None, the middle of the interval."""
+    """(N,) distance where the field is evaluated; if None, the middle of the interval."""
     per_ray: int | None = None
     """S if every ray has exactly S samples."""
     owners: Tensor | None = None
@@ -133,7 +133,7 @@ class Samples:
     edges: Tensor | None = None
     """(R, S + 1) ends of the intervals in normalised distance, from samplers that use it."""
     proposals: tuple[Histogram, ...] = ()
-    """Histograms from which the samples were drawn, gradients attached, if the proposals are being trained."""
+    """Histograms that the samples were drawn from, gradients attached, if the proposals are being trained."""
 
     @classmethod
     def regular(cls, t_starts: Tensor, t_ends: Tensor, points: Tensor | None = None) -> Samples:
@@ -142,7 +142,7 @@ class Samples:
         Args:
             t_starts: (R, S) distance at the start of each interval.
             t_ends: (R, S) distance at the end of each interval.
-            points: (R, S) distance at which the field is evaluated; if None, the middle of the interval.
+            points: (R, S) distance where the field is evaluated; if None, the middle of the interval.
         """
         num_rays, per_ray = t_starts.shape
         offsets = torch.arange(num_rays + 1, device=t_starts.device) * per_ray
@@ -184,7 +184,7 @@ class Samples:
 
     @property
     def t(self) -> Tensor:
-        """(N,) distance at which the field is evaluated."""
+        """(N,) distance where the field is evaluated."""
         return (self.t_starts + self.t_ends) / 2 if self.points is None else self.points
 
     @property
@@ -203,7 +203,7 @@ class Samples:
         return values.reshape(self.num_rays, self.per_ray, *values.shape[1:])
 
     def positions(self, rays: Rays) -> Tensor:
-        """Return the positions (N, 3) on `rays` at which the field is evaluated."""
+        """Return the positions (N, 3) on `rays` where the field is evaluated."""
         return rays.points(self.ray_indices, self.t)
 
     def times(self, rays: Rays) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""Spheres: their intersection with rays, and the inverted sphere, in which all of space outside has a finite size.
+"""Spheres: their intersection with rays, and the inverted sphere, where all of space outside has a finite size.
 
 NeRF++ (Zhang et al. 2020), section 4: outside of the unit sphere, the point at distance r from its centre is (x', y',
 z', 1/r), where (x', y', z') is its direction from the centre, of length 1. With m the point of a ray that is nearest to
@@ -6,7 +6,7 @@ the centre, d its unit direction and s = 1/r, the ray's point beyond m at distan
 
     (x', y', z') = s m + sqrt(1 - s^2 |m|^2) d
 
-The paper instead rotates the point at which the ray leaves the unit sphere by the angle asin |m| - asin (s |m|). That
+The paper instead rotates the point where the ray leaves the unit sphere by the angle asin |m| - asin (s |m|). That
 is the same point, but the rotation has no axis if the ray passes through the centre. The formula here has no division,
 and at s = 0 it gives the direction of the ray.
 
@@ -40,7 +40,7 @@ def nearest_to_centre(origins: Tensor, directions: Tensor, sphere: Tensor) -> tu
 
 
 def intersect_sphere(origins: Tensor, directions: Tensor, sphere: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distances at which rays enter and leave a sphere.
+    """Return the distances where rays enter and leave a sphere.
 
     A ray that starts inside enters at 0. For a ray that misses the sphere, only touches it, or leaves it behind, both
     distances are 0: an interval of length 0.

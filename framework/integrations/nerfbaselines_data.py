@@ -33,7 +33,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 """Signs of a pose's columns that convert OpenCV's axes to OpenGL's."""
 FAR = 1000.0
-"""Distance at which an unbounded scene ends, scene units."""
+"""Distance where an unbounded scene ends, scene units."""
 BOUND_SHARE = 0.9
 """Near distance as a fraction of the smallest depth stated by the data set. That depth is a percentile; a few are
 smaller."""
@@ -152,9 +152,9 @@ class Frame:
     box: Tensor
     """(2, 3) corners of the region of interest, scene coordinates."""
     near: float
-    """Distance from a camera at which the scene starts, scene units."""
+    """Distance from a camera where the scene starts, scene units."""
     far: float
-    """Distance from a camera at which the scene ends, scene units."""
+    """Distance from a camera where the scene ends, scene units."""
     unbounded: bool
     """Whether there may be visible content outside `box`."""
 

@@ -61,7 +61,6 @@ def with_matching_background(config: TrainConfig, background: Tensor) -> TrainCo
     """Return the config, with a random training background if its fixed one differs from that of renders.
 
     Args:
-        config: the config.
         background: (3,) colour behind renders.
     """
     fixed = {"white": 1.0, "black": 0.0}.get(config.background)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from nerfloom.kernels.rows import gather_rows, joined, take_rows
 
-CLOSE, ALMOST_ZERO = 1e-4, 1e-6
+TOLERANCES = 1e-4, 1e-6
 """Relative and absolute tolerance of equal inputs, since torch's rounding depends on the batch size."""
 Compute = Callable[[], Tensor]
 Key = tuple[Any, ...]
@@ -144,11 +144,11 @@ def _sources(rows: Sequence[Tensor], results: Sequence[_Value | None]) -> tuple[
 
 def _equal(tensor: Tensor, other: Tensor) -> bool:
     """Return whether two tensors of the same shape are equal up to rounding errors; NaN equals NaN."""
-    return torch.equal(tensor, other) or torch.allclose(tensor, other, CLOSE, ALMOST_ZERO, equal_nan=True)
+    return torch.equal(tensor, other) or torch.allclose(tensor, other, *TOLERANCES, equal_nan=True)
 
 
 class _Thread(threading.local):
-    """The tape on which operations of this thread record results, or from which they take them."""
+    """The tape where operations of this thread record results, or find them."""
 
     tape: _Tape | _Replay | _Given | None = None
 

@@ -23,7 +23,7 @@ from nerfloom.base.errors import ConfigError
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 """True if Triton's interpreter runs the kernels on the CPU. Triton reads the variable when it is imported."""
-LEAST_CAPABILITY = (8, 0)
+MIN_CAPABILITY = (8, 0)
 """Minimum compute capability of NVIDIA's GPUs for Triton."""
 
 
@@ -58,8 +58,8 @@ def _problem() -> str | None:
     if not torch.cuda.is_available():
         return "this machine has no GPU usable by this PyTorch; TRITON_INTERPRET=1 runs the kernels on the CPU"
     capability = torch.cuda.get_device_capability()
-    if torch.version.hip is None and capability < LEAST_CAPABILITY:
-        return f"Triton needs a GPU of compute capability {'.'.join(map(str, LEAST_CAPABILITY))} or more, not " + (
+    if torch.version.hip is None and capability < MIN_CAPABILITY:
+        return f"Triton needs a GPU of compute capability {'.'.join(map(str, MIN_CAPABILITY))} or more, not " + (
             ".".join(map(str, capability))
         )
     return None

@@ -15,7 +15,7 @@ from nerfloom.base.decisions import Choice, Decision, fill
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.scene import Scene
 
-FEW, FEW_WITH_ALPHA = 12, 8
+MAX_FEW, MAX_FEW_WITH_ALPHA = 12, 8
 """Maximum number of training images that counts as few: in captures, and in images whose alpha marks empty space."""
 OCCLUSION = 0.01
 """Weight of the optical depth near cameras, as in FreeNeRF's settings."""
@@ -39,7 +39,7 @@ class FewImagesConfig(RayConfig):
     """Whether to use the defaults for few images in the settings below. auto: with up to 12 training images of a static
     scene, or 8 with an alpha channel."""
     open_levels_until: Auto[float] = AUTO
-    """Fraction of the budget in which the levels of the encoding open, from coarse to fine; 0 opens all at once. auto:
+    """Fraction of the budget for opening the encoding's levels, from coarse to fine; 0 opens all at once. auto:
     0.5 with few images for vanilla-nerf, otherwise 0."""
     unseen_loss_mult: float = 0.0
     """Weight of the roughness of depth in views between the training cameras, such as 0.1; 0 disables such views."""
@@ -48,7 +48,7 @@ class FewImagesConfig(RayConfig):
     occlusion_loss_mult: Auto[float] = AUTO
     """Weight of the optical depth right before cameras. auto: 0.01 with few images without alpha, otherwise 0."""
     occlusion_range: float = 1.2
-    """Length of rays that should be empty, relative to the distance at which the scene starts."""
+    """Length of rays that should be empty, relative to the distance where the scene starts."""
 
 
 ConfigT = TypeVar("ConfigT", bound=FewImagesConfig)
@@ -59,8 +59,7 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
 
     Args:
         config: the method's settings; open ones are filled in.
-        scene: properties of the scene.
-        open_until: fraction of the budget in which the method's encoding opens its levels if there are few images.
+        open_until: fraction of the budget for opening the levels of the method's encoding if there are few images.
 
     Returns:
         The settings, and the decisions made; no decisions if there are many images.
@@ -74,7 +73,7 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
         Choice("open_levels_until", open_until, "few images are explained by coarse shapes first"),
         Choice("occlusion_loss_mult", OCCLUSION * (not scene.has_alpha), "space right before a camera is empty"),
     )
-    count, most = scene.num_cameras, FEW_WITH_ALPHA if scene.has_alpha else FEW
+    count, most = scene.num_cameras, MAX_FEW_WITH_ALPHA if scene.has_alpha else MAX_FEW
     few = count <= most and not scene.moving and any(choice.value for choice in choices)
     reason = f"there are {count} training images, too few to rule out wrong geometry (else: --few-images False)"
     config, made = fill(config, Choice("few_images", few, reason, "regularisers for few images"))
@@ -88,7 +87,6 @@ def unseen_weight(config: FewImagesConfig, step: int) -> float:
     """Return the weight of unseen views in a step; it falls linearly at first, as in RegNeRF.
 
     Args:
-        config: the settings, decided.
         step: number of training steps done.
     """
     share = min(step / UNSEEN_STEPS, 1.0)

@@ -11,11 +11,11 @@ from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import distortion, ray_sum
 from nerfloom.kernels.histograms.spacing import to_disparity
 
-WIDTH = 3.0
+MAX_DEVIATIONS = 3.0
 """A ray should end within this many standard deviations of a known distance."""
-WRONG = 0.01
+WRONG_SHARE = 0.01
 """Assumed fraction of wrong points in a reconstruction."""
-SMALLEST_DEPTH, SMALLEST_OPACITY = 1e-6, 1e-6
+MIN_DEPTH, MIN_OPACITY = 1e-6, 1e-6
 """Minimum depth and opacity in divisions for inverse depths."""
 
 
@@ -108,8 +108,8 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
 def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
     """Return the mean optical depth () up to distances before which rays should be empty; 0 without rays.
 
-    With B the fraction of light stopped before that distance, a ray's term is -log((1 - B + e) / (1 + e)), e = `WRONG`.
-    This is the optical depth with an upper bound, so that a wall seen in all images remains.
+    A ray's term is -log((1 - B + e) / (1 + e)): B is the fraction of light stopped before that distance, e is
+    `WRONG_SHARE`. This is the optical depth with an upper bound, so that a wall seen in all images remains.
 
     Args:
         weights: (N,) weights of the samples of R rays.
@@ -118,7 +118,7 @@ def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
     """
     before = samples.t_ends < clear[samples.ray_indices]
     left = (1 - ray_sum(weights * before, samples)).clamp(min=0)
-    return -((left + WRONG) / (1 + WRONG)).log().sum() / max(len(left), 1)
+    return -((left + WRONG_SHARE) / (1 + WRONG_SHARE)).log().sum() / max(len(left), 1)
 
 
 def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviations: Tensor) -> Tensor:
@@ -126,14 +126,14 @@ def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviat
 
     With B the light stopped before the point, and H the light stopped at it, a ray's term is
 
-        -log((H + e (1 - B) + e^2) / (1 + e + e^2)),     e = `WRONG`
+        -log((H + e (1 - B) + e^2) / (1 + e + e^2)),     e = `WRONG_SHARE`
 
     The first summand is DS-NeRF's (Deng et al. 2022): a ray ends at its point. Its term is the optical depth before the
     point, with a gradient that does not vanish behind dense fog, plus the light missing at the point. The other
     summands allow for wrong points: with probability e the surface is somewhere behind and the space before is still
-    empty; with probability e^2 nothing is known. "At the point" means all intervals that overlap `WIDTH` standard
-    deviations around it, counted in full, so that no sample has to be narrower than the sampler makes it (Rematas et
-    al. 2022, Urban Radiance Fields, shrink the window by a schedule instead).
+    empty; with probability e^2 nothing is known. "At the point" means all intervals that overlap `MAX_DEVIATIONS`
+    standard deviations around it, counted in full, so that no sample has to be narrower than the sampler makes it
+    (Rematas et al. 2022, Urban Radiance Fields, shrink the window by a schedule instead).
 
     Args:
         weights: (N,) weights of the samples of R rays.
@@ -142,12 +142,12 @@ def distance_likelihood(weights: Tensor, samples: Samples, known: Tensor, deviat
         deviations: (R,) their standard deviations.
     """
     has_point = known > 0
-    first, last = known - WIDTH * deviations, known + WIDTH * deviations
+    first, last = known - MAX_DEVIATIONS * deviations, known + MAX_DEVIATIONS * deviations
     owners = samples.ray_indices
     before = samples.t_ends < first[owners]
     there = ~before & (samples.t_starts <= last[owners])
     stopped, hit = ray_sum(torch.stack([weights * before, weights * there], dim=-1), samples).unbind(-1)
-    likelihood = (hit + WRONG * (1 - stopped).clamp(min=0) + WRONG**2) / (1 + WRONG + WRONG**2)
+    likelihood = (hit + WRONG_SHARE * (1 - stopped).clamp(min=0) + WRONG_SHARE**2) / (1 + WRONG_SHARE + WRONG_SHARE**2)
     return -(likelihood.log() * has_point).sum() / has_point.sum().clamp(min=1)
 
 
@@ -198,10 +198,10 @@ def depth_roughness(weights: Tensor, samples: Samples, side: int) -> Tensor:
         side: rays along an edge of a patch.
     """
     opacity = ray_sum(weights, samples)
-    inverse = ray_sum(weights / samples.t.clamp(min=SMALLEST_DEPTH), samples) / opacity.clamp(min=SMALLEST_OPACITY)
+    inverse = ray_sum(weights / samples.t.clamp(min=MIN_DEPTH), samples) / opacity.clamp(min=MIN_OPACITY)
     values, opaque = inverse.view(-1, side, side), opacity.detach().view(-1, side, side)
-    mean = (opaque * values).sum((1, 2), keepdim=True) / opaque.sum((1, 2), keepdim=True).clamp(min=SMALLEST_OPACITY)
-    values = values / mean.detach().clamp(min=SMALLEST_DEPTH)
+    mean = (opaque * values).sum((1, 2), keepdim=True) / opaque.sum((1, 2), keepdim=True).clamp(min=MIN_OPACITY)
+    values = values / mean.detach().clamp(min=MIN_DEPTH)
     down = opaque[:, 1:] * opaque[:, :-1] * values.diff(dim=1).square()
     across = opaque[:, :, 1:] * opaque[:, :, :-1] * values.diff(dim=2).square()
     return (down.sum() + across.sum()) / max(down.numel(), 1)

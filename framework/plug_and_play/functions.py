@@ -21,7 +21,7 @@ SigmaFunction = Callable[..., Tensor]
 RgbFunction = Callable[..., tuple[Tensor, Tensor] | tuple[Tensor, Tensor, Mapping[str, Tensor]]]
 """Function (positions (N, 3), unit directions (N, 3)[, times (N,)]) -> rgb (N, 3), sigma or alpha (N,)[, further
 properties by name, each (N, ...)]."""
-UNIT = 1e-3
+UNIT_TOLERANCE = 1e-3
 """Maximum deviation of the length of a direction from 1."""
 
 
@@ -132,7 +132,7 @@ def check_rays(rays: Rays) -> None:
     lengths = torch.linalg.vector_norm(rays.directions.detach(), dim=-1)
     worst = int((lengths - 1).abs().nan_to_num(0).argmax())
     length = lengths[worst].item()
-    if abs(length - 1) > UNIT:
+    if abs(length - 1) > UNIT_TOLERANCE:
         raise ValueError(
             f"the direction of ray {worst} has length {length:.4g}; it must be 1, so that t is a distance: use "
             "torch.nn.functional.normalize(directions, dim=-1)"

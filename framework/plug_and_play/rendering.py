@@ -24,7 +24,7 @@ class Rendering:
     depth: Tensor
     """(R,) expected distance, the weighted mean of t; the far end of the ray if it is transparent."""
     median_depth: Tensor
-    """(R,) distance at which the transmittance falls to 0.5; the far end of the ray if it does not."""
+    """(R,) distance where the transmittance falls to 0.5; the far end of the ray if it does not."""
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
     weights: Tensor

@@ -19,10 +19,10 @@ from nerfloom.processing.worker import Report
 FIRST_PAIRS = 8
 """Number of pairs matched first, to estimate the total time; no part has fewer."""
 SECONDS_OF_A_PART = 5.0
-"""Interval, in seconds, at which matches are added to the database; stopping loses at most this much."""
-MOST_PAIRS = 1000
+"""Interval of adding matches to the database, seconds; stopping loses at most this much."""
+MAX_PAIRS = 1000
 """Maximum number of pairs in a part."""
-MANY = 10
+MIN_IMAGES_OF_CAMERA = 10
 """Minimum number of images of a camera for refining its principal point."""
 
 
@@ -138,7 +138,7 @@ def match_pairs(
             pycolmap.verify_matches(str(database), str(list_path))
         done += len(part)
         report(done)
-        size = round(min(max(SECONDS_OF_A_PART / (time.perf_counter() - start) * len(part), FIRST_PAIRS), MOST_PAIRS))
+        size = round(min(max(SECONDS_OF_A_PART / (time.perf_counter() - start) * len(part), FIRST_PAIRS), MAX_PAIRS))
 
 
 def reconstruct(report: Report, database: Path, images: Path, output: Path, flags: ColmapFlags) -> list[int]:
@@ -239,7 +239,7 @@ def read_model(report: Report, folder: Path) -> Model:
 def _refine(pycolmap: Any, model: Any) -> None:
     """Run a bundle adjustment with free principal points, if all cameras have enough images to determine them."""
     camera_ids = [model.images[number].camera_id for number in model.reg_image_ids()]
-    if min(camera_ids.count(camera) for camera in set(camera_ids)) < MANY:
+    if min(camera_ids.count(camera) for camera in set(camera_ids)) < MIN_IMAGES_OF_CAMERA:
         return
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True

@@ -15,9 +15,9 @@ from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
 from nerfloom.base.extras import install_command
 
-SIDE = 1000
+MAX_SIDE = 1000
 """Maximum side of the grey pictures used to judge frames, pixels."""
-_GREY = f"scale=min({SIDE}\\,iw):min({SIDE}\\,ih):force_original_aspect_ratio=decrease:flags=area,format=gray"
+_GREY = f"scale=min({MAX_SIDE}\\,iw):min({MAX_SIDE}\\,ih):force_original_aspect_ratio=decrease:flags=area,format=gray"
 
 R = TypeVar("R")
 
@@ -51,7 +51,7 @@ def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, lis
 
     Args:
         path: the video file.
-        look: function of an upright picture (H, W) uint8 with at most `SIDE` pixels a side.
+        look: function of an upright picture (H, W) uint8 with at most `MAX_SIDE` pixels a side.
 
     Returns:
         The times of the frames, seconds, in order, and the results.

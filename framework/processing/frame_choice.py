@@ -6,7 +6,7 @@ import numpy as np
 
 BLOCK = 16
 """Side of the squares whose mean brightness is compared between frames, pixels."""
-SAME = 0.003
+MAX_REPEAT_DIFFERENCE = 0.003
 """Maximum difference between repeated frames, as a fraction of their contrast. In videos encoded by x264 and MPEG-4,
 repeated frames differed by up to 0.0025, and frames moved by half a pixel by 0.004 or more."""
 
@@ -38,8 +38,8 @@ def blocks(picture: np.ndarray) -> np.ndarray:
 def different(frames: list[np.ndarray]) -> np.ndarray:
     """Return the indices of frames that differ from the last distinct frame, in ascending order.
 
-    A frame is a repeat if its blocks differ on average by at most `SAME` of the contrast. Encoders and players repeat
-    frames to keep a rate, and a camera that stands still repeats its view.
+    A frame is a repeat if its blocks differ on average by at most `MAX_REPEAT_DIFFERENCE` of the contrast.
+    Encoders and players repeat frames to keep a rate, and a camera that stands still repeats its view.
 
     Args:
         frames: `blocks` of each frame.
@@ -47,7 +47,7 @@ def different(frames: list[np.ndarray]) -> np.ndarray:
     kept: list[int] = []
     for number, frame in enumerate(frames):
         last = frames[kept[-1]] if kept else None
-        if last is None or np.abs(frame - last).mean() > SAME * last.std():
+        if last is None or np.abs(frame - last).mean() > MAX_REPEAT_DIFFERENCE * last.std():
             kept.append(number)
     return np.array(kept, np.int64)
 

@@ -162,7 +162,6 @@ def save(image: Image.Image, path: Path, options: dict[str, Any] | None = None) 
     """Write a JPEG of high quality, without alpha, or a PNG, depending on the path's suffix.
 
     Args:
-        image: the image.
         path: the file.
         options: further options for Pillow.
     """

@@ -14,7 +14,7 @@ from nerfloom.processing.matching import match, pairs_of
 from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
 from nerfloom.processing.summary import advice
 
-FEWEST_FEATURES = 15
+MIN_FEATURES = 15
 """Minimum number of features of an image that can be placed: COLMAP's minimum number of matches."""
 FEW_FEATURES = 100
 """An image with fewer features is probably dark, blurred or without texture."""
@@ -90,7 +90,7 @@ def _with_more_pairs(job: Job, names: list[str], sizes: list[int]) -> list[int]:
     first, again = job.work / "sparse", job.work / "again"
     placed = job.run(colmap.read_model, (first / "0",), "Reading the model").images if sizes else {}
     features = database.features(job.database)
-    left = [name for name in names if name not in placed and features.get(name, 0) >= FEWEST_FEATURES]
+    left = [name for name in names if name not in placed and features.get(name, 0) >= MIN_FEATURES]
     pairs = pairs_of(left, names, job)
     known, connected = database.pairs(job.database), database.connected(job.database)
     if known.issuperset(pairs):

@@ -24,7 +24,7 @@ def choose_matching(method: str, count: int, exhaustive_limit: int, ordered: boo
     Args:
         method: the user's choice, possibly auto.
         count: number of images.
-        exhaustive_limit: maximum number of images for which auto matches all pairs.
+        exhaustive_limit: maximum number of images whose pairs auto all matches.
         ordered: whether the images were taken one after the other, in the order of their names.
     """
     if method != "auto":

@@ -7,13 +7,13 @@ import numpy as np
 WITHOUT = 0.8
 """A capture has no parallax if a rotation explains more than this fraction of pairs. In two panoramas a rotation
 explained 99 % and 100 % of the pairs; in two captures by a walking person, 5 % and 8 %."""
-EXPLAINED = 0.003
+MAX_RESIDUAL = 0.003
 """Maximum median distance of matches after a rotation that explains them, as a fraction of the image's longer side."""
-MOVED = 0.02
+MIN_MOTION = 0.02
 """Minimum median motion of matches for a pair to count, as a fraction of the longer side."""
 FOCALS = np.geomspace(0.3, 5.0, 25)
 """Focal lengths tried, in units of the image's longer side."""
-PAIRS = 100
+MAX_PAIRS = 100
 """Maximum number of pairs examined."""
 NO_PARALLAX = (
     "the photographs have no parallax, as if the camera had turned on the spot (a panorama). Distances are unknown "
@@ -33,10 +33,10 @@ def share_that_turned(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
     Returns:
         From 0 to 1; 0 if no pair counts.
     """
-    telling = [(one, two) for one, two in pairs if np.median(np.linalg.norm(one - two, axis=1)) > MOVED]
+    telling = [(one, two) for one, two in pairs if np.median(np.linalg.norm(one - two, axis=1)) > MIN_MOTION]
     if not telling:
         return 0.0
-    shares = [np.mean([left_by_rotation(*pair, focal) <= EXPLAINED for pair in telling]) for focal in FOCALS]
+    shares = [np.mean([left_by_rotation(*pair, focal) <= MAX_RESIDUAL for pair in telling]) for focal in FOCALS]
     return float(max(shares))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +11,6 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
-from nerfloom.data.image_files import one_line
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
@@ -20,23 +18,6 @@ from nerfloom.processing.transforms import Frame, Lens, content, write
 
 UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
 """Errors raised if a number in a JSON file is missing or is something else."""
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read the JSON object in the file `path`.
-
-    Raises:
-        DataError: if the file is missing, is not JSON or does not hold an object.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"{path} does not exist") from error
-    except (ValueError, OSError, RecursionError) as error:
-        raise DataError(f"{path} is not readable JSON: {one_line(error)}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path} must contain a JSON object: names and values in braces")
-    return content
 
 
 def finite(value: Any) -> float:

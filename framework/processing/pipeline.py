@@ -12,11 +12,11 @@ from nerfloom.processing import colmap, contrast, database, features, mapping, m
 from nerfloom.processing.images import PreparedImage, prepare_all, write_masks
 from nerfloom.processing.job import Job
 from nerfloom.processing.output import FINISHED, ready
-from nerfloom.processing.parallax import NO_PARALLAX, PAIRS, WITHOUT, share_that_turned
+from nerfloom.processing.parallax import MAX_PAIRS, NO_PARALLAX, WITHOUT, share_that_turned
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.summary import Summary, lines
 
-FEWEST = 3
+MIN_IMAGES = 3
 """Minimum number of images for a reconstruction."""
 
 
@@ -36,8 +36,8 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     with job.timed("preparing"):
         prepared, unreadable = prepare_all(folder, sources, job.images)
         clear = contrast.for_features(folder, prepared, job.images, job.stretched)
-        if len(prepared) < FEWEST:
-            raise DataError(f"--data {flags.data}: {len(prepared)} usable images; at least {FEWEST} are needed")
+        if len(prepared) < MIN_IMAGES:
+            raise DataError(f"--data {flags.data}: {len(prepared)} usable images; at least {MIN_IMAGES} are needed")
         mask_of = write_masks(masks, prepared, output / "masks") if masks is not None else {}
     names = [image.name for image in prepared]
     features.extract(job, prepared, clear, output / "masks" if mask_of else None)
@@ -45,7 +45,7 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     with job.timed("matching"):
         pairs = matching.choose_pairs(rule, names, job)
     matching.match(job, pairs, len(names), matching.RULES[rule])
-    turned = share_that_turned(database.matches(job.database, PAIRS))
+    turned = share_that_turned(database.matches(job.database, MAX_PAIRS))
     if turned >= WITHOUT:
         say(f"warning: {NO_PARALLAX}")
     sizes = mapping.reconstruct(job, names, rule, turned)

@@ -9,8 +9,9 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.json_files import read_object
 from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import UNUSABLE, evenly_spaced, finite, read_json, undistorted_lens, write_folder
+from nerfloom.processing.phone import UNUSABLE, evenly_spaced, finite, undistorted_lens, write_folder
 from nerfloom.processing.transforms import Lens
 
 Z_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
@@ -38,7 +39,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
         if not path.is_file():
             without_camera += 1
             continue
-        camera = read_json(path)
+        camera = read_object(path)
         if blur_score_of(camera, path, min_blur_score) < min_blur_score:
             blurred += 1
             continue

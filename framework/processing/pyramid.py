@@ -37,7 +37,6 @@ def reduced(image: Image.Image, factor: int) -> Image.Image:
     """Return an image reduced by an integer factor, with colours weighted by alpha, and at least one pixel large.
 
     Args:
-        image: the image.
         factor: side of a block, pixels.
     """
     width, height = max(image.width // factor, 1), max(image.height // factor, 1)

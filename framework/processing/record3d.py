@@ -9,8 +9,9 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.json_files import read_object
 from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import UNUSABLE, evenly_spaced, read_json, undistorted_lens, write_folder
+from nerfloom.processing.phone import UNUSABLE, evenly_spaced, undistorted_lens, write_folder
 from nerfloom.processing.transforms import Lens
 
 
@@ -30,7 +31,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
     """
     root = find_root(export)
     path = root / "metadata.json"
-    metadata = read_json(path)
+    metadata = read_object(path)
     poses = poses_of(metadata, path)
     numbered = {int(name.stem): name for name in find_images(root / "rgb") if name.stem.isdecimal()}
     usable = [number for number in sorted(numbered) if number < len(poses)]

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import PurePath
 
-NEXT = 10
+MAX_STEP = 10
 """Maximum difference between the numbers of neighbours, since a few photographs may have been deleted."""
-MOST = 0.8
+MIN_CONSECUTIVE = 0.8
 """Minimum fraction of neighbours with consecutive numbers."""
 _NUMBER = re.compile(r"\d+")
 _TIME = re.compile(r"(19|20)\d{6}[_-]?\d{6}")
@@ -23,14 +23,14 @@ def is_sequence(names: Sequence[PurePath]) -> bool:
         names: the names in natural order.
     """
     follows = [_follows(first, second) for first, second in pairwise(names)]
-    return bool(follows) and sum(follows) >= MOST * len(follows)
+    return bool(follows) and sum(follows) >= MIN_CONSECUTIVE * len(follows)
 
 
 def _follows(first: PurePath, second: PurePath) -> bool:
     if _TIME.search(first.stem) and _TIME.search(second.stem):
         return True
     one, two = _numbered(first), _numbered(second)
-    return one is not None and two is not None and one[0] == two[0] and 0 < two[1] - one[1] <= NEXT
+    return one is not None and two is not None and one[0] == two[0] and 0 < two[1] - one[1] <= MAX_STEP
 
 
 def _numbered(path: PurePath) -> tuple[str, int] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from nerfloom.base.errors import ConfigError, FlagError
 
@@ -26,6 +26,8 @@ class OutputFlags:
     """Replace the output of an earlier run in --output-dir; other files there are kept."""
     num_downscales: int = 3
     """Number of folders of reduced images: 3 writes images_2, images_4 and images_8."""
+    can_resume: ClassVar[bool] = False
+    """Whether a stopped run can go on where it stopped."""
 
     def check(self) -> None:
         """Check the values.
@@ -49,13 +51,13 @@ class ColmapFlags(OutputFlags):
     """Which images are matched. auto: for videos and numbered photographs, neighbours and loops, and more if some
     images remain; for others, all pairs up to --exhaustive-limit images, then retrieval."""
     exhaustive_limit: int = 150
-    """Maximum number of images for which auto matches all pairs, or all pairs with unregistered images."""
+    """Maximum number of images for auto to match all pairs, or all pairs with unregistered images."""
     num_neighbors: int = 30
     """Number of similar images that retrieval matches with each image."""
     sequential_overlap: int = 10
     """Number of following images that sequential matching matches with each, besides those 16, 32, ... further on."""
     max_image_size: int = 1600
-    """Longer side, in pixels, at which features are extracted."""
+    """Longer side of images for extracting features, pixels."""
     max_num_features: int = 8192
     """Maximum number of features of an image."""
     refine_intrinsics: bool = False
@@ -71,6 +73,7 @@ class ColmapFlags(OutputFlags):
     """Continue a stopped run: features and matches in --output-dir are kept."""
     verbose: bool = False
     """Show COLMAP's output instead of writing it to OUTPUT_DIR/colmap/log.txt."""
+    can_resume = True
 
     def check(self) -> None:
         super().check()

@@ -7,7 +7,7 @@ from typing import Any
 
 from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
 
-ENOUGH = 0.8
+MIN_REGISTERED = 0.8
 """Advice is given if a smaller fraction of images is registered."""
 
 
@@ -55,7 +55,7 @@ def lines(summary: Summary) -> list[str]:
         messages.append(f"left out: {len(summary.other_models)} unconnected models, with {sizes} images")
     if summary.turned >= WITHOUT:
         messages.append(f"warning: {NO_PARALLAX}")
-    if share < ENOUGH:
+    if share < MIN_REGISTERED:
         messages.append(f"few images were registered. {advice(summary.matching)}")
     return messages
 

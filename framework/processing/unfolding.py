@@ -1,4 +1,4 @@
-"""Repair of reconstructions folded by a repeated pattern (`nerfloom.scene.folds`).
+"""Repair of reconstructions folded by a repeated pattern (`nerfloom.scene.folded_poses`).
 
 A repeated pattern connects photographs of opposite sides. Neighbours in a sequence do show the same side, so
 photographs are first placed by matches between neighbours only. A second reconstruction corrects the drift, with
@@ -20,13 +20,13 @@ from nerfloom.base.console import say
 from nerfloom.data.image_files import read_image
 from nerfloom.processing.colmap import Model
 from nerfloom.processing.database import PAIR_BASE
-from nerfloom.scene.folds import angle_between, folds, in_order, thumbnail
+from nerfloom.scene.folded_poses import angle_between, folded_neighbours, in_order, thumbnail
 
-NEXT = 3
+NEIGHBOURS = 3
 """Number of following photographs that count as neighbours."""
-SAME_WAY = 50.0
+MAX_ANGLE_ALIKE = 50.0
 """Maximum angle between cameras that look the same way, degrees; less than any detected fold."""
-ENOUGH = 0.9
+MIN_PLACED_SHARE = 0.9
 """Minimum number of photographs placed without the fold, relative to the number with it."""
 
 Reconstruct = Callable[[Path, Path], "tuple[Model | None, list[int]]"]
@@ -67,7 +67,7 @@ def folded_pairs(model: Model, thumbnails: dict[str, np.ndarray]) -> list[tuple[
     """
     names = list(model.images)
     ahead = np.array([_ahead(model, name) for name in names]).reshape(-1, 3)
-    pairs = folds(names, ahead, np.array([thumbnails[name] for name in names]).reshape(len(names), -1))
+    pairs = folded_neighbours(names, ahead, np.array([thumbnails[name] for name in names]).reshape(len(names), -1))
     return [(names[i], names[j]) for i, j in pairs]
 
 
@@ -96,20 +96,20 @@ def unfold(
     )
     names, best, used = sorted(thumbnails), None, 0
     names = [names[index] for index in in_order(names)]
-    near = {(names[i], names[j]) for i in range(len(names)) for j in range(i + 1, min(i + 1 + NEXT, len(names)))}
+    near = {(names[i], names[j]) for i in range(len(names)) for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(names)))}
     allowed = near
     for stage in ("neighbours", "unfolded"):
         matches, folder = work / f"{stage}.db", work / stage
         _copy_with(database, matches, allowed)
         made, sizes = reconstruct(matches, folder)
-        if made is None or len(made.images) < ENOUGH * len(model.images) or folded_pairs(made, thumbnails):
+        if made is None or len(made.images) < MIN_PLACED_SHARE * len(model.images) or folded_pairs(made, thumbnails):
             break
         best, used = Unfolded(made, matches, folder, sizes), len(allowed)
         allowed = near | {
             (first, second)
             for index, first in enumerate(made.images)
             for second in list(made.images)[index + 1 :]
-            if angle_between(_ahead(made, first), _ahead(made, second)) <= SAME_WAY
+            if angle_between(_ahead(made, first), _ahead(made, second)) <= MAX_ANGLE_ALIKE
         }
     if best is None:
         say(

@@ -14,15 +14,15 @@ from typing import Any
 
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError, NerfloomError
-from nerfloom.processing.estimate import about
+from nerfloom.base.meter import time_text
 
 Report = Callable[[int], None]
 """Function that the child calls with the number of finished units; with 0 at the beginning, after imports."""
-FEW = 4
+MIN_FINISHED = 4
 """Minimum number of finished units for an estimate of the total time."""
-SOON = 1.0
+MIN_SECONDS = 1.0
 """Minimum seconds before an estimate of the total time."""
-SHORT = 10.0
+MIN_REPORTED_SECONDS = 10.0
 """Shorter estimates, in seconds, are not reported."""
 
 
@@ -114,10 +114,10 @@ def _estimated(numbers: Iterator[int | None], title: str, total: int, unit: str)
             first = time.monotonic(), done
         elif done and first is not None and not said:
             seconds, count = time.monotonic() - first[0], done - first[1]
-            if count >= FEW and seconds > SOON:
+            if count >= MIN_FINISHED and seconds > MIN_SECONDS:
                 said = True
-                if seconds / count * total > SHORT:
-                    say(f"{title}: {about(seconds / count * total)} for {total:,} {unit}")
+                if seconds / count * total > MIN_REPORTED_SECONDS:
+                    say(f"{title}: about {time_text(seconds / count * total)} for {total:,} {unit}")
 
 
 def _units(numbers: Iterator[int | None], total: int) -> Iterator[int]:

@@ -18,7 +18,6 @@ from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, volume_renderer
 from nerfloom.samplers.background import BackgroundConfig, foreground_sphere
 from nerfloom.samplers.base import Sampler
-from nerfloom.samplers.choice import HierarchicalConfig
 from nerfloom.samplers.hierarchical import HierarchicalSampler
 from nerfloom.samplers.uniform import LAST_INTERVAL, UniformSampler
 
@@ -123,7 +122,6 @@ def background_renderer(
     of samples. Otherwise it is sampled uniformly in 1/r.
 
     Args:
-        config: the settings, decided.
         scene: properties of the whole scene, not of its foreground.
         make_field: creates a field for the outside, from settings and scene.
         renderer: renders the inside; if None, that of `volume_renderer`.
@@ -132,7 +130,7 @@ def background_renderer(
     if config.background_model != "sphere":
         return renderer
     sampler: Sampler = UniformSampler(config.num_background_samples)
-    if isinstance(config, HierarchicalConfig) and str(config.sampler) == "hierarchical":
+    if str(config.sampler) == "hierarchical":
         coarse = make_field(config, scene)
         sampler = HierarchicalSampler(coarse, config.num_coarse_samples, config.num_fine_samples)
     field = make_field(config, scene)

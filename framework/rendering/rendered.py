@@ -22,7 +22,7 @@ class Pixels:
     depth: Tensor
     """(P,) expected distance along the ray, scene units; the far end of the ray if it is transparent."""
     median_depth: Tensor
-    """(P,) distance at which the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
+    """(P,) distance where the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
     accumulation: Tensor
     """(P,) opacity."""
     extras: Mapping[str, Tensor] = field(default_factory=dict)
@@ -38,7 +38,7 @@ class Rendered:
     depth: Tensor
     """(R,) expected distance, the weighted mean of t, scene units; the far end of the ray if it is transparent."""
     median_depth: Tensor
-    """(R,) distance at which the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
+    """(R,) distance where the transmittance falls to 0.5, scene units; the far end of the ray if it does not."""
     accumulation: Tensor
     """(R,) opacity, the sum of the weights."""
     num_samples: int | Tensor
@@ -107,7 +107,7 @@ class Picture:
     depth: Tensor
     """(H, W) expected distance along the ray, scene units."""
     median_depth: Tensor
-    """(H, W) distance along the ray at which the transmittance falls to 0.5, scene units."""
+    """(H, W) distance along the ray where the transmittance falls to 0.5, scene units."""
     accumulation: Tensor
     """(H, W) opacity."""
     extras: Mapping[str, Tensor] = field(default_factory=dict)

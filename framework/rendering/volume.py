@@ -30,8 +30,8 @@ class VolumeRenderer(Renderer):
     Subclasses can override `shade`, which computes colours and weights of samples, or `render`, which calls `shade`.
 
     Args:
-        unit_length: distance from the camera up to which gradients are scaled down in training, by squared distance,
-            scene units; None for no scaling.
+        unit_length: within this distance from the camera, scene units, gradients are scaled down in training by
+            squared distance; None for no scaling.
         thin: samples below this fraction of the mean gradient are thinned in training on the CPU; 0 for none.
     """
 
@@ -71,7 +71,7 @@ def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
 
 
 def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
-    """Return the distance from cameras up to which gradients are scaled, scene units; None if they are not."""
+    """Return the distance from cameras where the scaling of gradients ends, scene units; None for no scaling."""
     return half_edge(scene.box) if config.gradient_scaling else None
 
 

@@ -1,1 +1,1 @@
-"""Samplers choose the positions on rays at which a field is evaluated. Each file has one sampler."""
+"""Samplers choose the positions on rays where a field is evaluated. Each file has one sampler."""

@@ -48,7 +48,6 @@ def decide_background(
 
     Args:
         config: the method's settings; the background and the sampler are filled in if they are open.
-        scene: properties of the scene.
         suits: the method's default background if the scene may extend beyond the box. Contraction is not used with
             hierarchical sampling, which samples rays in uncontracted space.
         bounded: the sampler for bounded scenes; if None, that of `sampler_choice`.

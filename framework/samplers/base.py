@@ -15,7 +15,7 @@ from nerfloom.geometry.rays import Rays, Samples
 
 
 class Sampler(nn.Module, ABC):
-    """Base class of samplers, which choose the positions along rays at which a field is evaluated.
+    """Base class of samplers, which choose the positions along rays where a field is evaluated.
 
     Learnt values of a sampler are parameters; its other state is in buffers.
     """

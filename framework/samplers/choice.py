@@ -18,18 +18,18 @@ from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import Field
 from nerfloom.fields.encoded import DensityField
 from nerfloom.samplers.base import Sampler
-from nerfloom.samplers.hierarchical import LEAST_COARSE, HierarchicalSampler
+from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
+from nerfloom.samplers.motion import vertices_in_time
 from nerfloom.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
 from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
-from nerfloom.scene.motion import MotionConfig, vertices_in_time
 
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 PROPOSAL_SAMPLES, NERF_SAMPLES = (128, 64), 32
 """Default intervals per ray of each proposal, and samples per ray; fewer if the training time is short."""
-FITTED_SECONDS, FEWEST_SAMPLES = 150.0, 12
+MIN_SAMPLES_SECONDS, MIN_SAMPLES = 150.0, 12
 """Up to this training time, in seconds on two CPU threads, `samples_choices` uses the fewest samples per ray."""
-MOST_PROPOSALS = 8
+MAX_PROPOSALS = 8
 """Maximum number of proposals."""
 COARSEST_MOVING, MOVING_FEATURES = 64, 8
 """Spatial vertices per axis of the first proposal of a moving scene (each further proposal has twice as many), and
@@ -89,8 +89,8 @@ class SamplingConfig(RayConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.num_proposal_samples is not None and not 1 <= len(self.num_proposal_samples) <= MOST_PROPOSALS:
-            raise ConfigError(f"--num-proposal-samples takes 1 to {MOST_PROPOSALS} numbers, such as 128 64")
+        if self.num_proposal_samples is not None and not 1 <= len(self.num_proposal_samples) <= MAX_PROPOSALS:
+            raise ConfigError(f"--num-proposal-samples takes 1 to {MAX_PROPOSALS} numbers, such as 128 64")
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class HierarchicalConfig(SamplingConfig):
     """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as in NeRF."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_coarse_samples": (LEAST_COARSE, 2**14),
+        "num_coarse_samples": (MIN_COARSE, 2**14),
         "num_fine_samples": (1, 2**14),
     }
     """Minimum and maximum of these settings."""
@@ -110,6 +110,7 @@ class HierarchicalConfig(SamplingConfig):
     """Stratified samples per ray for the coarse field (hierarchical)."""
     num_fine_samples: int = 128
     """Further samples per ray for the fine field, drawn from the coarse field's weights (hierarchical)."""
+    bounded_sampler = "hierarchical"
 
 
 SamplingConfigT = TypeVar("SamplingConfigT", bound=SamplingConfig)
@@ -119,12 +120,10 @@ def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
     """Return the sampler that `--sampler auto` selects.
 
     Args:
-        config: the method's settings.
         unbounded: whether the scene may extend beyond the box.
     """
-    bounded = "hierarchical" if isinstance(config, HierarchicalConfig) else "occupancy"
     reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
-    return Choice("sampler", "proposal" if unbounded else bounded, reason)
+    return Choice("sampler", "proposal" if unbounded else config.bounded_sampler, reason)
 
 
 def decide_sampler(config: SamplingConfigT, scene: Scene) -> tuple[SamplingConfigT, list[Decision]]:
@@ -166,7 +165,7 @@ def samples_choices(config: SamplingConfig, unlimited: tuple[int, ...] = PROPOSA
     """
     seconds, proposals, count, suits = _seconds(config), unlimited, NERF_SAMPLES, "there is time for it"
     if seconds < math.inf:
-        count = min(4 * round(FEWEST_SAMPLES / 4 * max(seconds / FITTED_SECONDS, 1.0) ** 0.5), NERF_SAMPLES)
+        count = min(4 * round(MIN_SAMPLES / 4 * max(seconds / MIN_SAMPLES_SECONDS, 1.0) ** 0.5), NERF_SAMPLES)
         proposals, suits = (4 * count - 16, 2 * count - 8), "that suits the time"
     return (
         Choice("num_proposal_samples", proposals, suits, "samples of proposals", " and ".join(map(str, proposals))),
@@ -215,8 +214,6 @@ def make_sampler(
     """Return the sampler that the settings select.
 
     Args:
-        config: the settings, decided.
-        scene: properties of the scene.
         make_coarse: creates the coarse field of `--sampler hierarchical`; it returns None if the field is its own
             coarse field. None if the method has no coarse level.
         proposals: density fields of `--sampler proposal`. If None, they are hash grids, or planes in space and time for
@@ -238,11 +235,10 @@ def _sampler(
     proposals: Sequence[Field] | None,
     learn_every: int,
 ) -> Sampler:
-    sees_time = scene.moving and isinstance(config, MotionConfig)
     if config.sampler == "proposal":
         count = range(len(config.num_proposal_samples))
         resolutions = tuple(COARSEST_PROPOSAL << level for level in count)
-        if proposals is None and sees_time:
+        if proposals is None and scene.moving and config.learns_motion:
             proposals = [_moving_proposal(scene, COARSEST_MOVING << level) for level in count]
         return ProposalSampler(
             scene.box,
@@ -253,7 +249,7 @@ def _sampler(
             fields=proposals,
             learn_every=learn_every,
         )
-    if isinstance(config, HierarchicalConfig) and str(config.sampler) == "hierarchical":
+    if str(config.sampler) == "hierarchical":
         if make_coarse is None:
             raise ConfigError("--sampler hierarchical: this method has no coarse field")
         return HierarchicalSampler(make_coarse(), config.num_coarse_samples, config.num_fine_samples)
@@ -268,7 +264,7 @@ def _sampler(
         moving=scene.moving,
         levels=levels,
         endless=not scene.has_alpha and scene.unbounded,
-        slices=config.time_slices if isinstance(config, MotionConfig) and sees_time and levels == 1 else 1,
+        slices=config.time_slices if scene.moving and levels == 1 else 1,
         eval_step_scale=config.eval_step_scale,
     )
 

@@ -14,9 +14,9 @@ from nerfloom.kernels.compositing.alpha import alpha_depth
 from nerfloom.kernels.march.fixed_slots import Placed, fill, longest_ray, reach
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves import Wave
-from nerfloom.samplers.sample_capacity import Room
+from nerfloom.samplers.sample_capacity import SampleCapacity
 
-SHORTEST = 1e-10
+MIN_LENGTH = 1e-10
 """Divisor for the optical depth of an empty slot, scene units."""
 
 
@@ -30,13 +30,13 @@ class Steps(NamedTuple):
     number: int
     """Number of steps along the diagonal of the box."""
     shift: Tensor | None
-    """(R,) fraction of a step by which the first step starts before the box; None for 0."""
+    """(R,) fraction of the first step that is before the box; None for 0."""
 
 
 def sample_into_slots(
     rays: Rays,
     steps: Steps,
-    room: Room,
+    capacity: SampleCapacity,
     evaluate: Callable[[Wave], tuple[Tensor, Tensor]],
     surface: HasAlpha | None,
     early_stop: float,
@@ -45,28 +45,28 @@ def sample_into_slots(
     """Return samples in occupied cells, up to the early stop, without waiting for the device.
 
     The density is evaluated at all candidates, and again, with gradient, at those that light reaches. The sizes that
-    the step needed are recorded in `room`.
+    the step needed are recorded in `capacity`.
 
     Args:
         rays: R rays, R > 0.
         steps: the steps along them.
-        room: numbers of slots.
+        capacity: numbers of slots.
         evaluate: density or opacity, and features, of intervals.
         surface: the field, if it has opacities.
         early_stop: transmittance below which the rest of a ray is dropped.
         usual: target number of samples per step; None without a target.
     """
-    count, sizes = len(rays), room.of(len(rays), usual)
+    count, sizes = len(rays), capacity.of(len(rays), usual)
     with torch.no_grad():
         found = fill(rays, *steps, (sizes.runs, sizes.candidates))
         placed = found.placed
         stopping = evaluate(_wave(rays, placed))[0]
         if surface is not None:  # the density that gives the same opacity in each interval
-            stopping = alpha_depth(stopping) / (placed.t_ends - placed.t_starts).clamp(min=SHORTEST)
+            stopping = alpha_depth(stopping) / (placed.t_ends - placed.t_starts).clamp(min=MIN_LENGTH)
         reached = reach(placed, stopping, early_stop, steps.number)
         kept = placed.first(reached, sizes.kept)
         slots, filled = kept.slots, kept.slots.counts.sum()
-        room.note(count, (found.runs, found.candidates, reached.sum()), found.left_out + slots.left_out)
+        capacity.note(count, (found.runs, found.candidates, reached.sum()), found.left_out + slots.left_out)
     wave, longest = _wave(rays, kept), longest_ray(slots, steps.number)
     stopping, features = evaluate(wave)
     if surface is not None:

@@ -16,7 +16,7 @@ from nerfloom.kernels.histograms.inverse_cdf import inverse_cdf, uniform_variate
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.uniform import samples_from_points, stratified_points
 
-LEAST_COARSE = 3
+MIN_COARSE = 3
 """Minimum number of stratified samples per ray; fine samples are drawn from the weights between first and last."""
 PADDING = 0.01
 """Added to the blurred weights of intervals, so that every interval can be drawn: Mip-NeRF, equation 18."""
@@ -45,8 +45,8 @@ class HierarchicalSampler(Sampler):
 
     def __init__(self, coarse: Field | None, num_coarse: int = 64, num_fine: int = 128) -> None:
         super().__init__()
-        if num_coarse < LEAST_COARSE:
-            raise ValueError(f"{num_coarse} stratified samples are too few; at least {LEAST_COARSE} are needed")
+        if num_coarse < MIN_COARSE:
+            raise ValueError(f"{num_coarse} stratified samples are too few; at least {MIN_COARSE} are needed")
         self.coarse, self.num_coarse, self.num_fine = coarse, num_coarse, num_fine
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:

@@ -12,7 +12,7 @@ from nerfloom.kernels.images.silhouettes import Photograph, pixels_under_balls
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 
-LEAST = 2**14
+MIN_PIXELS = 2**14
 """Minimum number of pixels of a view; for smaller views the search takes as long as tracing all rays."""
 
 
@@ -20,13 +20,12 @@ def pixels_in_view(sampler: Sampler, view: View) -> Tensor | None:
     """Return the pixels of a view whose rays may meet an occupied cell, with a margin around them.
 
     Args:
-        sampler: the sampler.
         view: the view, on the sampler's device.
 
     Returns:
         (height, width) bool; None if unknown: for other samplers, unbounded grids, lens distortion, and small views.
     """
-    camera, small = view.camera, view.height * view.width < LEAST
+    camera, small = view.camera, view.height * view.width < MIN_PIXELS
     if type(sampler) is not OccupancySampler or sampler.levels > 1 or sampler.endless:
         return None
     if small or type(camera) is not Cameras or camera.model != "pinhole":

@@ -64,7 +64,6 @@ def make_foreground_sampler(
     """Return the sampler that the settings select, for the scene's foreground.
 
     Args:
-        config: the settings, decided.
         scene: properties of the whole scene, not of its foreground.
         make_coarse: creates the coarse field of `--sampler hierarchical`, as in `make_sampler`.
     """

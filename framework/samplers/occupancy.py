@@ -34,23 +34,23 @@ from nerfloom.kernels.traced.trace import trace
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.cells import beside, densities_over_time, places
 from nerfloom.samplers.fixed import Steps, attached, sample_into_slots
-from nerfloom.samplers.sample_capacity import Room
+from nerfloom.samplers.sample_capacity import SampleCapacity
 
 MAX_CELLS = 512
 """Maximum number of cells along an axis; the state of 512^3 cells takes 0.8 GB."""
 MAX_LEVELS = 16
 """Maximum number of nested boxes."""
-FARTHEST = 1e10
+ENDLESS_FAR = 1e10
 """Far end of the last sample of an endless ray, scene units."""
 WARM_UP_STEPS = 256
 """Number of training steps during which cells are updated in a fixed shuffled order."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, CELLS_A_TIME, MOVING_DECAY = 4, 6, 0.95
-"""Number of times at which a cell of a moving scene is evaluated in each update. With time slices there is one for
+"""Number of evaluations of a cell of a moving scene in each update. With time slices there is one for
 every `CELLS_A_TIME` cells that matter may cross in a slice, up to this maximum. `MOVING_DECAY` replaces the decay
 without slices, because an occupied time may be rare."""
-SHARE, SHARE_OF_SLICES = 64, 512
+CELLS_PER_DRAW, CELLS_PER_DRAW_OF_SLICES = 64, 512
 """One in this many of all cells is drawn in each update after warm-up, without and with time slices. With slices there
 are more cells, and a smaller fraction is occupied."""
 PASSES, PASSES_OF_SLICES = 4, 1
@@ -125,7 +125,7 @@ class OccupancySampler(Sampler):
             )
         self.resolution, self.levels, self.endless, self.slices = resolution, levels, endless, slices
         self.step_size, self.num_steps = (box[1] - box[0]).norm().item() / num_steps, num_steps
-        self.room = Room(math.ceil(most_steps(num_steps) / RUN), most_steps(num_steps))
+        self.capacity = SampleCapacity(math.ceil(most_steps(num_steps) / RUN), most_steps(num_steps))
         self.always_fixed = False
         """Whether training steps use a fixed number of samples on the CPU too, for tests and counts."""
         self.early_stop = early_stop
@@ -218,7 +218,7 @@ class OccupancySampler(Sampler):
 
         if self.is_fixed(rays):
             steps = Steps(self.occupancy, self.step_size, self.num_steps, self._shift(rays, jitter))
-            return sample_into_slots(rays, steps, self.room, evaluate, surface, stop, self.samples_per_step)
+            return sample_into_slots(rays, steps, self.capacity, evaluate, surface, stop, self.samples_per_step)
         marched = self.begin(rays, jitter, stop)
         if isinstance(field, HasGridDensity) and not self.endless:
             known = field.grid_density()
@@ -259,10 +259,10 @@ class OccupancySampler(Sampler):
         return self.training and len(rays) > 0 and self._has_fixed_sizes
 
     def step_kind(self, step: int) -> StepKind:
-        return StepKind(self.room.per_ray) if self._has_fixed_sizes else super().step_kind(step)
+        return StepKind(self.capacity.per_ray) if self._has_fixed_sizes else super().step_kind(step)
 
     def read_counts(self) -> None:
-        self.room.read()
+        self.capacity.read()
 
     def begin(self, rays: Rays, jitter: bool, early_stop: float) -> March:
         """Return a march positioned before its first wave.
@@ -376,7 +376,7 @@ class OccupancySampler(Sampler):
         is 30 times smaller with the neighbours than without (benchmarks/quadrature.py). A cell that is drawn twice is
         evaluated twice, which does no harm.
         """
-        device, share = self.occupied.device, SHARE if self.slices == 1 else SHARE_OF_SLICES
+        device, share = self.occupied.device, CELLS_PER_DRAW if self.slices == 1 else CELLS_PER_DRAW_OF_SLICES
         num_kept, kept = self.kept()
         third = max(len(self.occupied) // share, 1)
         anywhere = torch.randint(max(num_kept, 1), (math.ceil(num_kept / share),), device=device)
@@ -393,7 +393,7 @@ class OccupancySampler(Sampler):
 
 
 def _opened(samples: Samples, rays: Tensor) -> Samples:
-    """Return samples with unchanged positions in which the last sample of each of `rays` (K,) ends at `FARTHEST`."""
+    """Return samples with unchanged positions; the last sample of each of `rays` (K,) ends at `ENDLESS_FAR`."""
     ends = samples.t_ends.clone()
-    ends[samples.offsets[rays + 1] - 1] = FARTHEST
+    ends[samples.offsets[rays + 1] - 1] = ENDLESS_FAR
     return replace(samples, t_ends=ends, points=samples.t)

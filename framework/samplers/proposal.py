@@ -40,7 +40,7 @@ PADDING = 0.01
 """Sum of the padding added to the weights of a ray, so that every interval can be drawn."""
 ALWAYS_LEARN_UNTIL, LEARN_EVERY = 256, 4
 """Step until which the proposals learn in every step, and the number of steps between updates afterwards."""
-FARTHEST = 1e10
+ENDLESS_FAR = 1e10
 """Far end of the last interval of an endless ray, scene units."""
 
 
@@ -52,7 +52,7 @@ class ProposalSampler(Sampler):
         counts: intervals per ray of each proposal, followed by the number of samples per ray.
         resolutions: cells along an axis at the finest level of each proposal's hash grid.
         unbounded: whether the scene extends beyond the box.
-        endless: whether the last interval ends at `FARTHEST`, so that any density there makes the ray opaque. For
+        endless: whether the last interval ends at `ENDLESS_FAR`, so that any density there makes the ray opaque. For
             images without an alpha channel.
         log2_table_size: maximum number of entries per level of the proposals' hash grids, as a power of two.
         num_levels: levels of the proposals' hash grids.
@@ -113,7 +113,7 @@ class ProposalSampler(Sampler):
         return fields + fields[-1:] * (len(self.counts) - 1 - len(fields))
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
-        """Return the samples of the last level. In steps in which proposals learn, their gradients are attached."""
+        """Return the samples of the last level. While proposals learn, their gradients are attached."""
         learning = self.learning and self.training and torch.is_grad_enabled()
         nears, fars = self._ends(rays)
         samples = propose(
@@ -132,7 +132,7 @@ class ProposalSampler(Sampler):
         if field.footprint in ("gaussian", "frustum"):  # before the last interval becomes endless
             samples = samples.evaluated(*field.density(sample_points(rays, samples, field.footprint)))
         ends = samples.padded(samples.t_ends).clone()
-        ends[:, -1] = FARTHEST
+        ends[:, -1] = ENDLESS_FAR
         return replace(samples, t_ends=ends.view(-1))
 
     def update(self, step: int, density: DensityFunction) -> None:
@@ -152,7 +152,7 @@ class ProposalSampler(Sampler):
         return interlevel_loss(samples, weights, self.blurs) if samples.proposals else None
 
     def _ends(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Return the distances (R,) at which sampling starts and ends; in a bounded scene, within the box."""
+        """Return the distances (R,) where sampling starts and ends; in a bounded scene, within the box."""
         if self.unbounded:
             return rays.nears, rays.fars
         enter, leave = intersect_box(rays.origins.detach(), rays.directions.detach(), self.box)

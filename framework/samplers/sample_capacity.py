@@ -15,11 +15,11 @@ from torch import Tensor
 
 HEADROOM = 1.3
 """New capacity, relative to the largest need since the last reading."""
-LEAST, MOST = 1.08, 2.0
+MIN_HEADROOM, MAX_HEADROOM = 1.08, 2.0
 """The capacity grows below the first and shrinks above the second of these ratios of capacity to need."""
-PIECE, LIMIT = 256, 2**21
+SLOTS_MULTIPLE, MAX_SLOTS = 256, 2**21
 """Numbers of slots are multiples of the first and at most the second."""
-MOST_KEPT = 4
+MAX_KEPT = 4
 """Maximum number of kept samples, relative to the target number per step."""
 
 
@@ -34,7 +34,7 @@ class Sizes(NamedTuple):
     """For steps that light reaches."""
 
 
-class Room:
+class SampleCapacity:
     """Capacity for the steps of a march.
 
     Args:
@@ -56,10 +56,11 @@ class Room:
         Args:
             rays: number of rays.
             usual: target number of samples per step. It bounds the kept samples, also when a resumed run has no counts
-                yet. None for no bound but `LIMIT`.
+                yet. None for no bound but `MAX_SLOTS`.
         """
-        runs, candidates, kept = (min(PIECE * math.ceil(each * rays / PIECE), LIMIT) for each in self.per_ray)
-        return Sizes(runs, candidates, kept if usual is None else min(kept, MOST_KEPT * max(usual, PIECE)))
+        needed = (SLOTS_MULTIPLE * math.ceil(each * rays / SLOTS_MULTIPLE) for each in self.per_ray)
+        runs, candidates, kept = (min(number, MAX_SLOTS) for number in needed)
+        return Sizes(runs, candidates, kept if usual is None else min(kept, MAX_KEPT * max(usual, SLOTS_MULTIPLE)))
 
     def note(self, rays: int, needed: tuple[Tensor, Tensor, Tensor], left_out: Tensor) -> None:
         """Record on the device what a step needed, without waiting.
@@ -92,4 +93,4 @@ class Room:
 def _enough(given: float, needed: float) -> float:
     """Return the capacity per ray for the largest need, `needed`; `given` if that still fits."""
     least = max(needed, 1.0)  # a step without samples may be followed by one with some
-    return given if LEAST * least <= given <= MOST * least else HEADROOM * least
+    return given if MIN_HEADROOM * least <= given <= MAX_HEADROOM * least else HEADROOM * least

@@ -19,15 +19,15 @@ from nerfloom.cameras.poses import nearest_point
 from nerfloom.kernels.native import torch_on_one_thread
 
 REACH = 3.0
-"""Half the side of the cube around the point that cameras look at which is assumed to hold all matter, relative to the
+"""Half the side of the cube that is assumed to hold all matter, around the point that cameras look at, relative to the
 largest distance of a camera from that point. A box that reaches the cube's faces counts as unknown."""
-SAME = 1e-9
-"""Distance by which rounding may put a vertex outside a plane, relative to the distance of the farthest camera."""
-BEYOND = (2.0, 0.1)
-"""Tolerance by which matter may extend beyond the box in an image, in pixels and as a fraction of the matter's size:
+ROUNDING = 1e-9
+"""Tolerated distance of a vertex outside a plane, from rounding, relative to the distance of the farthest camera."""
+TOLERANCE = (2.0, 0.1)
+"""Tolerated extent of matter beyond the box in an image, in pixels and as a fraction of the matter's size:
 pixels at its edge count as fully opaque, and poses are not exact."""
 
-LARGER = 0.25
+MIN_SHARE_LARGER = 0.25
 """Matter is larger than the images if at least this fraction of images have matter at opposite borders."""
 
 
@@ -49,13 +49,13 @@ def enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | N
 
 
 def is_larger(opaque: Sequence[Tensor]) -> bool:
-    """Return whether matter is larger than the images: it touches opposite borders in a fraction `LARGER` of them.
+    """Return whether matter is larger than the images: in `MIN_SHARE_LARGER` of them it touches opposite borders.
 
     Args:
         opaque: for each image, the pixels (H, W) bool that are not fully transparent.
     """
     across = [bool(mask[:, 0].any() & mask[:, -1].any() | mask[0].any() & mask[-1].any()) for mask in opaque]
-    return sum(across) >= LARGER * len(across)
+    return sum(across) >= MIN_SHARE_LARGER * len(across)
 
 
 def _enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | None) -> Tensor | None:
@@ -74,11 +74,11 @@ def _enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | 
     poses = torch.cat([poses[:, :, :3], (origins - middle)[..., None] / unit], -1)  # keeps rounding relative
     limits = poses.new_tensor([[-REACH] * 3, [REACH] * 3]) if within is None else (within.double() - middle) / unit
     vertices = _vertices(*_planes(poses, extents, ends, limits))
-    if not len(vertices) or (within is None and bool((vertices.abs() > REACH * (1 - SAME)).any())):
+    if not len(vertices) or (within is None and bool((vertices.abs() > REACH * (1 - ROUNDING)).any())):
         return None
     box = torch.stack([vertices.amin(0), vertices.amax(0)])
     pixels = 1 / torch.stack([cameras.fx, cameras.fy]).amin(0)[[index for index, _ in found]].double()
-    slack = BEYOND[0] * pixels[:, None] + BEYOND[1] * (extents[:, 1] - extents[:, 0])
+    slack = TOLERANCE[0] * pixels[:, None] + TOLERANCE[1] * (extents[:, 1] - extents[:, 0])
     certain = torch.stack([extents[:, 0] + slack, extents[:, 1] - slack], 1)
     return box * unit + middle if _explains(box, poses, certain, ends) else None
 
@@ -133,13 +133,13 @@ def _planes(poses: Tensor, extents: Tensor, ends: Tensor, box: Tensor) -> tuple[
 def _vertices(normals: Tensor, offsets: Tensor) -> Tensor:
     """Return the vertices (V, 3) of the polytope normal . x <= offset, from the lines where two planes meet.
 
-    The polytope is enlarged by `SAME`, so that rounding excludes nothing.
+    The polytope is enlarged by `ROUNDING`, so that rounding excludes nothing.
     """
-    offsets = offsets + SAME
+    offsets = offsets + ROUNDING
     a, b = torch.combinations(torch.arange(len(normals))).unbind(1)
     along = torch.linalg.cross(normals[a], normals[b])
     size = along.norm(dim=-1, keepdim=True)
-    crossing = size[:, 0] > SAME  # the others are parallel
+    crossing = size[:, 0] > ROUNDING  # the others are parallel
     a, b, along, size = a[crossing], b[crossing], along[crossing], size[crossing]
     along = along / size
     first = offsets[a, None] * torch.linalg.cross(normals[b], along) + offsets[b, None] * torch.linalg.cross(
@@ -148,9 +148,9 @@ def _vertices(normals: Tensor, offsets: Tensor) -> Tensor:
     start = first / size
     slopes, rooms = along @ normals.T, offsets - start @ normals.T
     ends = rooms / slopes
-    last = torch.where(slopes > SAME, ends, torch.inf).amin(1)
-    begin = torch.where(slopes < -SAME, ends, -torch.inf).amax(1)
-    parallel = ((slopes.abs() > SAME) | (rooms >= -SAME)).all(1)
+    last = torch.where(slopes > ROUNDING, ends, torch.inf).amin(1)
+    begin = torch.where(slopes < -ROUNDING, ends, -torch.inf).amax(1)
+    parallel = ((slopes.abs() > ROUNDING) | (rooms >= -ROUNDING)).all(1)
     left = parallel & (begin <= last)
     return torch.cat([start[left] + t[left, None] * along[left] for t in (begin, last)])
 

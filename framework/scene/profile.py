@@ -7,7 +7,7 @@ from typing import Any
 
 from nerfloom.base.decisions import Decision
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.light import light_spread
+from nerfloom.data.light_spread import light_spread
 
 
 @dataclass(frozen=True)

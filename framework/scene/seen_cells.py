@@ -13,9 +13,9 @@ from nerfloom.cameras.cameras import Cameras
 
 BLOCK = 4
 """Cells along an edge of the cubes that are tested together."""
-AROUND = 4
-"""Distance, in radii of a cube, within which a camera is assumed to see it in any viewing direction."""
-MARGIN = 2.0
+SURELY_SEEN_DISTANCE = 4
+"""A camera within this distance, in radii of a cube, is assumed to see it in any viewing direction."""
+MIN_MARGIN = 2.0
 """Minimum factor for a cube's radius in the image; objects off the image centre appear larger."""
 
 
@@ -27,7 +27,7 @@ def seen_cells(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int) 
 
     Args:
         cameras: M cameras.
-        nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
+        nearest: (M,) distance of each camera that its image shows to be empty, scene units.
         box: (2, 3) minimum and maximum corner.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
 
@@ -53,11 +53,11 @@ def _shows(cameras: Cameras, index: int, centers: Tensor, radius: float, nearest
     reach = _margin(cameras, index) * focal * radius / (distances - radius).clamp(min=radius)
     across = (columns > -reach) & (columns < cameras.widths[index] + reach)
     inside = ahead & across & (rows > -reach) & (rows < cameras.heights[index] + reach)
-    return (inside | (distances < AROUND * radius)) & (distances + radius > nearest)
+    return (inside | (distances < SURELY_SEEN_DISTANCE * radius)) & (distances + radius > nearest)
 
 
 def _margin(cameras: Cameras, index: int) -> float:
-    """Return how much larger a small ball appears in a corner of the image than in its centre, at least `MARGIN`.
+    """Return how much larger a small ball appears in a corner of the image than in its centre, at least `MIN_MARGIN`.
 
     The factor is 1 + tan(a)^2 at the angle a from the axis, along the line to the centre.
     """
@@ -66,4 +66,4 @@ def _margin(cameras: Cameras, index: int) -> float:
         float(torch.maximum(middle, size - middle)) / float(focal)
         for middle, size, focal in ((one.cx, one.widths, one.fx), (one.cy, one.heights, one.fy))
     )
-    return max(MARGIN, 1 + across**2 + down**2)
+    return max(MIN_MARGIN, 1 + across**2 + down**2)

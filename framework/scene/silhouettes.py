@@ -18,9 +18,9 @@ from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.geometry.bounds import cell_corners
 from nerfloom.kernels.images.silhouettes import Photograph, hold_balls, opaque_sums, pixels_near_balls
 
-COARSEST = 8
+MAX_CUBE = 8
 """Maximum side of the cubes tested first, cells."""
-WITNESSES = 3
+MIN_WITNESSES = 3
 """Number of images (or all, if fewer) that must show matter in the direction of a cell for it to be occupied in a
 moving scene. Without this, many cells remain that no image has in its frame at that moment."""
 KEPT_COUNTS = 48
@@ -125,11 +125,11 @@ def held_cells(
     `silhouettes`, `box` and `resolution` are as in `visual_hull`.
 
     Args:
-        margins: for each image, the distance around a cell that must be shown to be empty as well; also, `WITNESSES` of
-            the images must show matter in the cell's direction. None for a static scene, without either.
+        margins: for each image, the distance around a cell that must be shown to be empty as well; also,
+            `MIN_WITNESSES` of the images must show matter in the cell's direction. None for a static scene.
         known: (n^3,) bool, cells that need not be tested; None for none.
     """
-    size = min(COARSEST, 1 << (resolution - 1).bit_length())
+    size = min(MAX_CUBE, 1 << (resolution - 1).bit_length())
     count = -(-resolution // size)
     cubes = torch.cartesian_prod(*[torch.arange(count, device=box.device)] * 3) * size
     while True:
@@ -171,14 +171,14 @@ def held_balls(
 
 
 def _whole_cubes(cells: Tensor, resolution: int, size: int) -> Tensor:
-    """Return the cubes, `size` cells wide and counted along each axis, in which all of `cells` (n^3,) bool are True."""
+    """Return the cubes, `size` cells wide and counted along each axis, where all of `cells` (n^3,) bool are True."""
     count = resolution // size
     return cells.view(count, size, count, size, count, size).all(5).all(3).all(1)
 
 
 def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor, reach: Sequence[float]) -> Tensor:
-    """Return the balls (N,) in whose direction `WITNESSES` of `images` (all, if fewer) show matter."""
-    wanted = min(WITNESSES, len(images))
+    """Return the balls (N,) in whose direction `MIN_WITNESSES` of `images` (all, if fewer) show matter."""
+    wanted = min(MIN_WITNESSES, len(images))
     count = torch.zeros(len(centers), dtype=torch.int32, device=centers.device)
     for image, radius in zip(images, reach, strict=True):
         enough = count >= wanted

@@ -15,22 +15,22 @@ import torch
 from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.data.travel import Travel
+from nerfloom.data.motion_bound import MotionBound
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.scene.moving_hulls import nearest
 from nerfloom.scene.silhouettes import Silhouettes, held_balls
 
-LEAST_IMAGES, LEAST_TIMES = 24, 8
+MIN_IMAGES, MIN_TIMES = 24, 8
 """Minimum number of images, and of distinct times; with fewer, no speed is estimated."""
-SLOWEST = 0.25
+MIN_SPEED = 0.25
 """First speed tried, in longest edges of the box per unit of time. Lower speeds save little."""
-FASTER = 2**0.5
+SPEED_RATIO = 2**0.5
 """Ratio of consecutive speeds tried."""
-SAFETY = 2**0.5
+SAFETY_FACTOR = 2**0.5
 """Ratio of the speed used to the speed found. Pixels, balls and matter have a size, which makes the latter too low."""
-AROUND = 2
-"""Number of times, before and after that of an image with an unexplained ray, at which the speed is raised."""
-MOST_RAYS = 2**15
+RAISED_TIMES = 2
+"""The speed is raised at this number of times before, and after, that of an image with an unexplained ray."""
+MAX_RAYS = 2**15
 """Maximum number of rays tested, spread evenly over all images."""
 BALLS = 128
 """Number of balls in a row as long as the box's diagonal."""
@@ -65,8 +65,8 @@ class _Rays:
 
 
 @torch.no_grad()
-def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | None:
-    """Return how far matter may move, including `SAFETY`; None if there are too few images or times.
+def motion_bound(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> MotionBound | None:
+    """Return how far matter may move, including `SAFETY_FACTOR`; None if there are too few images or times.
 
     Args:
         silhouettes: silhouettes of the M training images.
@@ -78,30 +78,30 @@ def travel_of(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Travel | 
     taken = times.cpu()[images].double()
     images, taken = [images[i] for i in taken.argsort(stable=True)], taken.sort(stable=True).values
     knots, which = taken.unique(return_inverse=True)
-    if len(images) < LEAST_IMAGES or len(knots) < LEAST_TIMES:
+    if len(images) < MIN_IMAGES or len(knots) < MIN_TIMES:
         return None
     left = _rays_to_explain(silhouettes, images, box)
     spacing = float((box[1] - box[0]).norm()) / BALLS
-    speeds = torch.full_like(knots, SLOWEST * float((box[1] - box[0]).max()))
+    speeds = torch.full_like(knots, MIN_SPEED * float((box[1] - box[0]).max()))
     gaps = knots.diff()
     enough = float((box[1] - box[0]).norm()) / torch.minimum(torch.cat([gaps[:1], gaps]), torch.cat([gaps, gaps[-1:]]))
     while True:
-        travelled = Travel.of(knots, speeds).at(taken)
+        travelled = MotionBound.of(knots, speeds).at(taken)
         too_slow = torch.zeros_like(speeds, dtype=torch.bool)
         for number, rays in enumerate(left):
             left[number] = rays = rays[~_explained(silhouettes, images, number, rays, travelled, spacing)]
             if len(rays):
                 middle = int(which[number])
-                too_slow[max(middle - AROUND, 0) : middle + AROUND + 1] = True
+                too_slow[max(middle - RAISED_TIMES, 0) : middle + RAISED_TIMES + 1] = True
         too_slow &= speeds < enough  # beyond this speed matter may be anywhere; motion does not explain the rest
         if not bool(too_slow.any()):
-            return Travel.of(knots, SAFETY * speeds)
-        speeds = torch.where(too_slow, FASTER * speeds, speeds)
+            return MotionBound.of(knots, SAFETY_FACTOR * speeds)
+        speeds = torch.where(too_slow, SPEED_RATIO * speeds, speeds)
 
 
 def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tensor) -> list[_Rays]:
     """Return the rays of each image that must meet matter."""
-    most, found = max(MOST_RAYS // len(images), 1), []
+    most, found = max(MAX_RAYS // len(images), 1), []
     cameras: Cameras = silhouettes.dataset.cameras
     for image in images:
         pixels = _edges(silhouettes, image).view(-1).nonzero().squeeze(-1)

@@ -19,7 +19,7 @@ HEADROOM = 1.3
 """Ratio of the capacity to the maximum number of entries that an image needed."""
 FADED = 0.95
 """Factor of the known maximum at each reading, unless a newer image needs more."""
-PIECE = 4096
+ENTRIES_MULTIPLE = 4096
 """Capacities are multiples of this number of entries."""
 
 
@@ -43,7 +43,7 @@ class Capacity:
         """
         if not devices.runs_ahead(records.device) or not len(records) or pixels > self._pixels:
             return None
-        return PIECE * math.ceil(HEADROOM * self._per_gaussian * len(records) / PIECE)
+        return ENTRIES_MULTIPLE * math.ceil(HEADROOM * self._per_gaussian * len(records) / ENTRIES_MULTIPLE)
 
     def note(self, records: Tensor, pixels: int, lists: TileLists) -> None:
         """Record on the device the number of entries that an image needed, without synchronising.

@@ -21,13 +21,13 @@ from nerfloom.splats.strategy import Change, Strategy
 GRADIENT = 8e-4
 """Gaussians with a larger mean gradient of the image position are cloned or split; images have a longer side of 2
 units."""
-LARGE = 0.01
+MAX_CLONED_SIZE = 0.01
 """Largest standard deviation, in scene extents, of a Gaussian that is cloned; a larger one is split."""
-TRANSPARENT = 0.005
+MAX_DEAD_OPACITY = 0.005
 """Gaussians at or below this opacity are dropped."""
 CHILDREN, SHRUNK = 2, 1.6
 """Number of Gaussians that replace a split one, and the divisor of its standard deviations."""
-RESET = 0.01
+MAX_RESET_OPACITY = 0.01
 """Maximum opacity after a reset. Gaussians that no image needs stay transparent and are dropped."""
 
 
@@ -113,7 +113,7 @@ class DensityControl(Strategy):
         if step % self.steps_per_reset != self.steps_per_reset - 1:
             return {}
         self.gradients.take(len(gaussians))
-        return {"logits": gaussians.logits.clamp(max=math.log(RESET / (1 - RESET)))}
+        return {"logits": gaussians.logits.clamp(max=math.log(MAX_RESET_OPACITY / (1 - MAX_RESET_OPACITY)))}
 
     def grow(self, gaussians: Gaussians, most: int, extent: float) -> Change | None:
         return grown(gaussians, self.gradients.take(len(gaussians)), most, extent)
@@ -142,13 +142,13 @@ def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> 
     Returns:
         The change; None if nothing changes.
     """
-    alive = (torch.sigmoid(gaussians.logits) > TRANSPARENT) & gaussians.finite()
+    alive = (torch.sigmoid(gaussians.logits) > MAX_DEAD_OPACITY) & gaussians.finite()
     wanting = alive & (gradients > GRADIENT)
-    room = max(most - int(alive.sum()), 0)
-    if int(wanting.sum()) > room:
-        chosen = torch.where(wanting, gradients, -1).topk(room).indices
+    left = max(most - int(alive.sum()), 0)
+    if int(wanting.sum()) > left:
+        chosen = torch.where(wanting, gradients, -1).topk(left).indices
         wanting = torch.zeros_like(wanting).index_fill_(0, chosen, True) & wanting
-    large = gaussians.log_scales.exp().amax(-1) > LARGE * extent
+    large = gaussians.log_scales.exp().amax(-1) > MAX_CLONED_SIZE * extent
     split, cloned = wanting & large, wanting & ~large
     kept = (alive & ~split).nonzero()[:, 0]
     if len(kept) == len(gaussians) and not bool(cloned.any()):

@@ -27,11 +27,7 @@ FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 
 
 def smallest_depth(scene: Scene) -> float:
-    """Return the depth, scene units, below which the centres of Gaussians are not drawn.
-
-    Args:
-        scene: the scene.
-    """
+    """Return the depth, scene units, below which the centres of Gaussians are not drawn."""
     return max(0.2 * scene.near, 1e-3)
 
 
@@ -45,7 +41,7 @@ def splat_camera(
         near: Gaussians at a smaller depth are not drawn, scene units.
         look: the settings of drawing.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
-        reduced: factor by which the image is smaller than the camera's.
+        reduced: ratio of the camera's image size to the drawn one's.
 
     Raises:
         ConfigError: for a camera model that is not among `DRAWN`.
@@ -93,7 +89,6 @@ def draw_colors(
         camera: the whole image.
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
-        rasteriser: the rasteriser.
     """
     return every(rasteriser.draw(rasteriser.project(gaussians, camera), camera, background).image, stride)
 
@@ -111,7 +106,6 @@ def draw_view(
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
         far: depth of empty pixels, scene units.
-        rasteriser: the rasteriser.
     """
     shown = rasteriser.project(gaussians, camera)
     image, through, median = rasteriser.draw(shown, camera, background, CHANNELS["normals"], median=True)

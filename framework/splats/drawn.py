@@ -1,25 +1,92 @@
-"""Gaussians that can be rendered but not trained, such as those of a file."""
+"""Renderables whose pictures are drawings of Gaussians, and fixed Gaussians, such as those of a file."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from dataclasses import replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
+from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.renderable import Renderable
 from nerfloom.rendering.outputs import NORMALS, Output
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.drawing import DRAWN, draw_view, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
-from nerfloom.splats.rasteriser import RASTERISER
-from nerfloom.splats.redrawn import Redrawn
+from nerfloom.splats.prepared_gaussians import PreparedGaussians
+from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
 
 
-class DrawnGaussians(Renderable):
+class DrawsGaussians(Renderable):
+    """A renderable whose pictures are drawings of Gaussians."""
+
+    cameras: ClassVar[tuple[str, ...] | None] = DRAWN
+    rasteriser: ClassVar[Rasteriser] = RASTERISER
+    """The rasteriser."""
+    _prepared: PreparedGaussians | None = None
+    """The Gaussians of the last picture; set to None where they change."""
+
+    @abstractmethod
+    def gaussians(self, time: float | None = None) -> Gaussians:
+        """Return the Gaussians at a time, without gradient.
+
+        Args:
+            time: in [0, 1]; None for a still scene.
+        """
+
+    @abstractmethod
+    def look(self) -> Look:
+        """Return the settings of drawing."""
+
+    def lit(self, rgb: Tensor, index: int | None) -> Tensor:
+        """Return colours (..., 3) with the appearance of an image; unchanged by default.
+
+        Args:
+            rgb: (..., 3) drawn colours.
+            index: number of a training image; None for the current appearance.
+        """
+        return rgb
+
+    def camera(self, camera: Cameras) -> SplatCamera:
+        """Return the camera of a view outside of training; by default with its own pose.
+
+        Args:
+            camera: one camera.
+        """
+        return splat_camera(camera, smallest_depth(self.scene), self.look())
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Return the normals, the shortest axes of Gaussians (`Picture.extras`)."""
+        return (NORMALS,)
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        return self.render_gaussians(self.gaussians(view.time), view, background)
+
+    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
+        """Render the given Gaussians, such as a part of its own.
+
+        Args:
+            gaussians: Gaussians in the frame of the scene, at the time of the view.
+            view, background: as in `render_view`.
+        """
+        camera = self.camera(view.camera)
+        picture = draw_view(gaussians, camera, view.stride, background, self.scene.far, self.rasteriser)
+        return replace(picture, rgb=self.lit(picture.rgb, None))
+
+    def render_rgb(self, view: View, background: Tensor) -> Tensor:
+        if self._prepared is None or self._prepared.time != view.time:
+            self._prepared = PreparedGaussians(self.gaussians(view.time), self.rasteriser, view.time)
+        return self.lit(self._prepared.colors(self.camera(view.camera), view.stride, background), None)
+
+
+class DrawnGaussians(DrawsGaussians):
     """A renderable of fixed Gaussians.
 
     Args:
@@ -28,41 +95,16 @@ class DrawnGaussians(Renderable):
         scene: the scene that defines their frame.
     """
 
-    cameras: ClassVar[tuple[str, ...] | None] = DRAWN
-
     def __init__(self, gaussians: Gaussians, look: Look, scene: Scene) -> None:
-        self.scene = scene
-        self._look, self._redrawn = look, Redrawn(gaussians, RASTERISER)
+        self.scene, self._gaussians, self._look = scene, gaussians, look
 
     @property
     def device(self) -> torch.device:
-        return self._redrawn.gaussians.means.device
-
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        return (NORMALS,)
+        return self._gaussians.means.device
 
     def gaussians(self, time: float | None = None) -> Gaussians:
         """Return the Gaussians, which are the same at any `time`."""
-        return self._redrawn.gaussians
+        return self._gaussians
 
     def look(self) -> Look:
-        """Return the settings of drawing."""
         return self._look
-
-    def render_view(self, view: View, background: Tensor) -> Picture:
-        return self.render_gaussians(self.gaussians(), view, background)
-
-    def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
-        """Render the given Gaussians, such as a part of its own.
-
-        Args:
-            gaussians: Gaussians in the frame of the scene.
-            view, background: as in `render_view`.
-        """
-        camera = splat_camera(view.camera, smallest_depth(self.scene), self._look)
-        return draw_view(gaussians, camera, view.stride, background, self.scene.far)
-
-    def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        camera = splat_camera(view.camera, smallest_depth(self.scene), self._look)
-        return self._redrawn.colors(camera, view.stride, background)

@@ -20,7 +20,7 @@ from nerfloom.splats.spz import BITS, encoded, rounded_harmonics
 
 COARSER_BITS = (4, 3)
 """Bits of harmonics in SPZ files if `BITS` are too many."""
-SAMPLE = 1 << 16
+MAX_SAMPLE = 1 << 16
 """Maximum number of Gaussians used to estimate sizes and errors."""
 DOUBT = 1.05
 """A choice is not tried if its estimated size exceeds the limit by more than this ratio."""
@@ -59,7 +59,7 @@ def fitted_spz(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.
     """
-    sample = gaussians[:: -(-len(gaussians) // SAMPLE) or 1]
+    sample = gaussians[:: -(-len(gaussians) // MAX_SAMPLE) or 1]
     choices = [(degree, bits) for degree in range(1, gaussians.degree + 1) for bits in (BITS, COARSER_BITS)]
     choices = [(0, BITS), *choices]
     for degree, bits in sorted(choices, key=lambda choice: colour_error(sample, *choice)):

@@ -9,10 +9,10 @@ from nerfloom.splats.gaussians import MAX_DEGREE
 USUAL_STEPS = 30_000
 """Number of steps that the learning rates of 3D Gaussian Splatting are made for."""
 
-MOST_MOVES = 16
+MAX_MOVES = 16
 """Maximum number of changes planned for a run. With more, a capture of 2,000 steps got half again as many Gaussians and
 no better images."""
-FEWEST_STEPS, MOST_STEPS = 20, 100
+MIN_STEPS, MAX_STEPS = 20, 100
 """Minimum and maximum number of steps between two changes of the number of Gaussians."""
 
 
@@ -36,8 +36,8 @@ def steps_per_move(steps: float, first: int, most: int, per_doubling: float) -> 
         per_doubling: approximate number of changes that double the number (`Strategy.changes_per_doubling`).
     """
     doublings = math.log2(max(most / max(first, 1), 1.0))
-    moves = min(max(per_doubling * doublings, 1.0), MOST_MOVES)
-    return int(min(max(steps / moves, FEWEST_STEPS), MOST_STEPS))
+    moves = min(max(per_doubling * doublings, 1.0), MAX_MOVES)
+    return int(min(max(steps / moves, MIN_STEPS), MAX_STEPS))
 
 
 def open_degree(progress: float) -> int:

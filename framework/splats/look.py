@@ -20,7 +20,7 @@ from nerfloom.kernels.splats.project import BLUR
 
 Sort = Literal["distance", "depth"]
 """Sort key of Gaussians: distance from the camera, or depth along its optical axis."""
-LEAST_BLUR, MOST_BLUR = 1e-3, 10.0
+MIN_BLUR, MAX_BLUR = 1e-3, 10.0
 """Range of the blur. Without blur, a flat Gaussian seen edge-on has no area."""
 
 
@@ -48,11 +48,7 @@ ELSEWHERE = Look(sort="depth")
 
 
 def comments(look: Look) -> list[str]:
-    """Return the comments of a file that state the settings of drawing.
-
-    Args:
-        look: the settings.
-    """
+    """Return the comments of a file that state the settings of drawing."""
     blur = [] if look.blur == BLUR else [f"SplatBlur: {look.blur:g}"]
     return [f"SplatRenderMode: {'mip' if look.antialiased else 'default'}", *blur, f"SplatSort: {look.sort}"]
 
@@ -111,4 +107,4 @@ def _blur(text: str) -> float | None:
         value = float(text)
     except ValueError:
         return None
-    return value if math.isfinite(value) and LEAST_BLUR <= value <= MOST_BLUR else None
+    return value if math.isfinite(value) and MIN_BLUR <= value <= MAX_BLUR else None

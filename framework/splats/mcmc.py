@@ -20,7 +20,7 @@ DEAD = 0.005
 """Opacity at or below which a Gaussian counts as dead."""
 GROWTH = 1.05
 """Growth factor of the number of Gaussians at each change, up to the maximum number."""
-MOST_COPIES = 51
+MAX_COPIES = 51
 """Maximum number of copies of a Gaussian in one change."""
 NOISE_SHARPNESS, NOISE_FROM = 100.0, 0.005
 """Steepness of the sigmoid that reduces noise with opacity, and the opacity at its midpoint."""
@@ -54,7 +54,7 @@ def moved(gaussians: Gaussians, added: int) -> Change | None:
     weight = torch.where(alive, opacity, 0).cumsum(0)
     draws = (torch.arange(wanted, device=weight.device) + torch.rand(wanted, device=weight.device)) / wanted
     sources = torch.searchsorted(weight, draws * weight[-1]).clamp(max=len(weight) - 1)
-    copies = torch.bincount(sources, minlength=len(gaussians)).clamp(max=MOST_COPIES - 1)
+    copies = torch.bincount(sources, minlength=len(gaussians)).clamp(max=MAX_COPIES - 1)
     chosen = copies.nonzero()[:, 0]
     count = copies[chosen] + 1
     logits, log_scales = shared(gaussians.logits[chosen], gaussians.log_scales[chosen], count)
@@ -72,7 +72,7 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
     Args:
         logits: (K,) opacity before the sigmoid.
         log_scales: (K, 3).
-        counts: (K,) int64 n, number of copies, at most MOST_COPIES.
+        counts: (K,) int64 n, number of copies, at most MAX_COPIES.
 
     Returns:
         (K,) logits and (K, 3) logarithms of scales of each copy.

@@ -35,8 +35,8 @@ from nerfloom.splats.compressed_ply import is_compressed, read_compressed
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
 from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
 
-SURE = 16.0
-"""Finite logit for an opacity of 1; -SURE for 0. Other programs write infinite logits."""
+MAX_LOGIT = 16.0
+"""Finite logit for an opacity of 1; -MAX_LOGIT for 0. Other programs write infinite logits."""
 TERMS = {0: 0, 9: 3, 24: 8, 45: 15, 72: 24}
 """Number of coefficients per channel, by the number of properties f_rest."""
 FILTER = "filter_3d"
@@ -98,7 +98,7 @@ def read_ply(file: Path) -> Splats:
     """Read Gaussians from a PLY file: ascii, binary or compressed, with properties in any order.
 
     Gaussians with parameters that are not finite, or with a zero rotation, are removed, with a message on the terminal.
-    An infinite opacity, which other programs write for opaque Gaussians, becomes `SURE`. Degree 4 is dropped.
+    An infinite opacity, which other programs write for opaque Gaussians, becomes `MAX_LOGIT`. Degree 4 is dropped.
     Centres in double precision stay so.
 
     Args:
@@ -134,7 +134,7 @@ def smoothed(gaussians: Gaussians, filters: Tensor) -> Gaussians:
     return replace(
         gaussians,
         log_scales=(larger.log() / 2).to(gaussians.log_scales),
-        logits=torch.logit(opacity).clamp(-SURE, SURE).to(gaussians.logits),
+        logits=torch.logit(opacity).clamp(-MAX_LOGIT, MAX_LOGIT).to(gaussians.logits),
     )
 
 
@@ -188,7 +188,7 @@ def _together(columns: Sequence[np.ndarray], kind: type = np.float32) -> Tensor:
 
 
 def _finite_logits(logits: Tensor) -> Tensor:
-    return torch.where(logits.isinf(), SURE * logits.sign(), logits)
+    return torch.where(logits.isinf(), MAX_LOGIT * logits.sign(), logits)
 
 
 def usable(gaussians: Gaussians, file: Path) -> Gaussians:

@@ -12,10 +12,10 @@ from nerfloom.base.pace import Pace, StepTimes
 
 REDUCED_SHARE = 0.4
 """Share of the budget for reduced images if there are enough steps at full size."""
-ENOUGH_STEPS, SHARE_POWER, LEAST_WHOLE = 700, 0.7, 0.1
+MIN_STEPS_FULL_SIZE, SHARE_POWER, MIN_WHOLE_SHARE = 700, 0.7, 0.1
 """Number of full-size steps that counts as enough; exponent of the full-size share as a function of the number of
 steps; minimum full-size share."""
-LEAST_SIDE = 150
+MIN_SIDE = 150
 """Minimum side of a square with the area of a reduced image, pixels."""
 QUICKER = 3.0
 """Assumed ratio of step times with full and half-size images, until both are measured."""
@@ -44,17 +44,17 @@ def share_for(steps: float) -> float:
     Args:
         steps: number of steps at full size that fit into the whole budget.
     """
-    whole = (1 - REDUCED_SHARE) * min(steps / ENOUGH_STEPS, 1.0) ** SHARE_POWER
-    return 1 - max(whole, LEAST_WHOLE)
+    whole = (1 - REDUCED_SHARE) * min(steps / MIN_STEPS_FULL_SIZE, 1.0) ** SHARE_POWER
+    return 1 - max(whole, MIN_WHOLE_SHARE)
 
 
 def most_octaves(pixels: float) -> int:
-    """Return the maximum number of halvings: at least 1, and more while the side stays above `LEAST_SIDE`.
+    """Return the maximum number of halvings: at least 1, and more while the side stays above `MIN_SIDE`.
 
     Args:
         pixels: number of pixels of the whole image.
     """
-    return max(int(math.log2(max(math.sqrt(pixels) / LEAST_SIDE, 1.0))), 1)
+    return max(int(math.log2(max(math.sqrt(pixels) / MIN_SIDE, 1.0))), 1)
 
 
 class ImageSizes:

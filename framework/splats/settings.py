@@ -12,15 +12,15 @@ from nerfloom.base.device import device_kind, relative_speed
 from nerfloom.base.processes import processes
 from nerfloom.data.scene import Scene
 from nerfloom.splats.gaussians import MAX_DEGREE
-from nerfloom.splats.learning import MOST_STEPS, number_for, rate_factor
-from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, OURS, Look, Sort
+from nerfloom.splats.learning import MAX_STEPS, number_for, rate_factor
+from nerfloom.splats.look import MAX_BLUR, MIN_BLUR, OURS, Look, Sort
 from nerfloom.splats.resolution import REDUCED_SHARE
 
 PIXELS_PER_SECOND = 25 * 400 * 400
 """Approximate number of pixels that training draws per second on two cores."""
-MOST_STEPS_PER_SECOND = 100
+MAX_STEPS_PER_SECOND = 100
 """Maximum training speed assumed for small images."""
-MOST_GAUSSIANS, MOST_RATE = 1_000_000, 8.0
+MAX_GAUSSIANS, MAX_RATE = 1_000_000, 8.0
 """Largest number of Gaussians and largest factor of learning rates that a budget chooses."""
 LARGE_IMAGE = 250_000
 """Number of pixels above which training begins with reduced images."""
@@ -42,7 +42,7 @@ class SplattingConfig(
 
     RANGES: ClassVar[dict[str, Range]] = {
         "degree": (0, MAX_DEGREE),
-        "blur": (LEAST_BLUR, MOST_BLUR),
+        "blur": (MIN_BLUR, MAX_BLUR),
         "num_gaussians": (1, 10_000_000),
         "start_gaussians": (1, 10_000_000),
         "field_steps": (1, math.inf),
@@ -125,10 +125,10 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
         The settings, and a record of each that was filled in.
     """
     pixels = scene.image_pixels or scene.image_size**2
-    speed = min(PIXELS_PER_SECOND / pixels, MOST_STEPS_PER_SECOND)  # steps a second of two threads
+    speed = min(PIXELS_PER_SECOND / pixels, MAX_STEPS_PER_SECOND)  # steps a second of two threads
     seconds = min(config.max_seconds or math.inf, (config.max_num_iterations or math.inf) / speed)
     usual = relative_speed(config.machine) if device_kind(config.machine) == "cpu" else 1.0
-    count, factor = number_for(seconds, MOST_GAUSSIANS), rate_factor(usual * speed * seconds, MOST_RATE)
+    count, factor = number_for(seconds, MAX_GAUSSIANS), rate_factor(usual * speed * seconds, MAX_RATE)
     why = "that suits the time"
     config, made = fill(config, Choice("num_gaussians", count, why, "Gaussians", f"up to {count:,}"))
     large = pixels > LARGE_IMAGE
@@ -144,7 +144,7 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
         Choice("paced", paced, PACED_WORDS[paced], "sizes by measured steps"),
         Choice("reduced_until", REDUCED_SHARE if large else 0.0, detail, "share of the budget with reduced images"),
         Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
-        Choice("steps_per_move", MOST_STEPS, "the paper has it so", "steps between changes of the number"),
+        Choice("steps_per_move", MAX_STEPS, "the paper has it so", "steps between changes of the number"),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
     )
     return config, made + more

@@ -26,7 +26,7 @@ from nerfloom.splats.ply import usable
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 """Layout of one Gaussian."""
-SMALLEST = 1e-30
+MIN_DEVIATION = 1e-30
 """Standard deviation that replaces 0, so that the logarithm is finite."""
 
 
@@ -54,7 +54,7 @@ def read_splat(file: Path) -> Gaussians:
     rows = np.frombuffer(content, ROW)
     scales = rows["scale"].astype(np.float64)
     with np.errstate(invalid="ignore"):  # values that are negative or not finite are removed below
-        log_scales = np.log(np.where(scales == 0, SMALLEST, scales))
+        log_scales = np.log(np.where(scales == 0, MIN_DEVIATION, scales))
     color = rows["color"].astype(np.float64)
     opacity = color[:, 3].clip(0.25, 254.75) / 255
     gaussians = Gaussians(

@@ -39,7 +39,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
@@ -50,7 +49,7 @@ from nerfloom.splats.transform import quaternion_product
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, number of Gaussians, degree, fractional bits, flags, 0."""
-MOST = 10_000_000
+MAX_GAUSSIANS = 10_000_000
 """Maximum number of Gaussians, as in Niantic's library."""
 BITS = (5, 4)
 """Bits of harmonics of degree 1, and of higher degrees, as in Niantic's library."""
@@ -60,34 +59,17 @@ STEPS = 16
 """Minimum number of position steps per standard deviation of a typical Gaussian, if the range allows it."""
 SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 """Factors of harmonics of degrees 1 to 3 when y and z change sign."""
-RATIO = 1032
+MAX_RATIO = 1032
 """Maximum ratio of sizes before and after compression by gzip."""
 FLAT = 3.0
 """Logarithm of the ratio of the largest to the smallest size that is not reported as clipped; smaller sizes are
 invisible."""
 ANTIALIASED = 1
 """Bit of the header's flags."""
-FCOMMENT, COMMENT_START, LONGEST_COMMENT = 16, 10, 1000
+FCOMMENT, COMMENT_START, MAX_COMMENT_LENGTH = 16, 10, 1000
 """In the gzip header: the flags with only a comment, the offset of the comment, and its maximum length, bytes."""
-SURPLUS = 1 << 24
+MAX_SURPLUS = 1 << 24
 """Maximum number of bytes after the last array, for extensions of the format."""
-
-
-def write_spz(file: Path, gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> None:
-    """Write Gaussians to an SPZ file of version 2.
-
-    Args:
-        file: path of the file.
-        gaussians: N Gaussians on the CPU.
-        bits: as in `encoded`.
-        look: the settings of drawing.
-
-    Raises:
-        ConfigError: if the format cannot hold them.
-        OSError: if the file cannot be written.
-    """
-    content = encoded(gaussians, bits, look)
-    write_atomically(file, lambda stream: stream.write(content))
 
 
 def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS) -> bytes:
@@ -105,8 +87,8 @@ def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OUR
     Raises:
         ConfigError: if the format cannot hold them.
     """
-    if len(gaussians) > MOST:
-        raise ConfigError(f"an SPZ file holds {MOST:,} Gaussians, and these are {len(gaussians):,}: write a PLY file")
+    if len(gaussians) > MAX_GAUSSIANS:
+        raise ConfigError(f"an SPZ file holds {MAX_GAUSSIANS:,} Gaussians, not {len(gaussians):,}: write a PLY file")
     fraction = fractional_bits(gaussians)
     fixed = np.rint(gaussians.means.double().numpy() * np.array([1, -1, -1]) * 2.0**fraction).astype("<i4")
     rotations, log_scales = _largest_real_part(gaussians.rotations, gaussians.log_scales)
@@ -135,7 +117,7 @@ def _commented(packed: bytes, comment: str) -> bytes:
 
 def _comment(packed: bytes) -> list[str]:
     """Return the lines of the comment at the start of a gzip file; none if its header has other parts."""
-    text, end, _ = packed[COMMENT_START : COMMENT_START + LONGEST_COMMENT].partition(b"\0")
+    text, end, _ = packed[COMMENT_START : COMMENT_START + MAX_COMMENT_LENGTH].partition(b"\0")
     return text.decode("latin-1").splitlines() if end and packed[3] == FCOMMENT else []
 
 
@@ -273,7 +255,7 @@ def read_spz(file: Path) -> Splats:
 def _look(file: Path, flags: int) -> Look:
     """Return the settings of drawing from the flags and the comment."""
     with file.open("rb") as stream:
-        lines = _comment(stream.read(COMMENT_START + LONGEST_COMMENT))
+        lines = _comment(stream.read(COMMENT_START + MAX_COMMENT_LENGTH))
     return replace(look_of(lines, file, ELSEWHERE), antialiased=bool(flags & ANTIALIASED))
 
 
@@ -297,7 +279,7 @@ def _unpacked(file: Path) -> tuple[int, int, int, int, int, np.ndarray]:
             version, count, degree, fraction, flags = _checked_header(file, start)
             needed = count * sum(_sizes(version, (degree + 1) ** 2 - 1))
             size = file.stat().st_size
-            if needed > RATIO * size:
+            if needed > MAX_RATIO * size:
                 raise DataError(f"{file} is truncated: {count:,} Gaussians have more than its {size:,} bytes")
             content = stream.read(needed)
             if len(content) < needed:
@@ -305,7 +287,7 @@ def _unpacked(file: Path) -> tuple[int, int, int, int, int, np.ndarray]:
             surplus = 0
             while more := stream.read(1 << 16):  # to its end, where the checksum is
                 surplus += len(more)
-                if surplus > SURPLUS:
+                if surplus > MAX_SURPLUS:
                     raise DataError(f"{file} has too much behind its {count:,} Gaussians; export it again")
     except (gzip.BadGzipFile, zlib.error) as error:
         raise DataError(f"{file} is damaged, or not an SPZ file: copy or export it again") from error
@@ -324,10 +306,10 @@ def _checked_header(file: Path, start: bytes) -> tuple[int, int, int, int, int]:
     _, version, count, degree, fraction, flags, _ = HEADER.unpack(start)
     if version not in (2, 3):
         raise DataError(f"{file} is SPZ of version {version}; versions 2 and 3 can be read: convert it")
-    if degree > 4 or fraction > 30 or count > MOST:
+    if degree > 4 or fraction > 30 or count > MAX_GAUSSIANS:
         raise DataError(
             f"{file} is damaged: its header states {count:,} Gaussians of degree {degree} with {fraction} fractional"
-            f" bits, and the format has up to {MOST:,}, 4 and 30; export it again"
+            f" bits, and the format has up to {MAX_GAUSSIANS:,}, 4 and 30; export it again"
         )
     return version, count, degree, fraction, flags
 

@@ -22,9 +22,9 @@ OPACITY = 0.1
 """Initial opacity."""
 HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
-FEW = 1_000
+MAX_MEASURED = 1_000
 """Maximum number of Gaussians used to find distances from the cameras."""
-NARROW = 0.5
+MIN_WIDE_RATIO = 0.5
 """Ratio of image width to distance, 28 degrees, below which a lens counts as long."""
 PLACES = {
     "points": "at the points of a reconstruction",
@@ -183,8 +183,8 @@ def scene_size(scene: Scene, means: Tensor | None = None, cameras: Cameras | Non
         return float((scene.box[1] - scene.box[0]).norm()) / 2
     centers = scene.camera_to_worlds[:, :, 3]
     if means is not None and len(means):
-        some = means[:: -(-len(means) // FEW)]
-        width = 1.0 if cameras is None else min(float((cameras.widths / cameras.fx).median()) / NARROW, 1.0)
+        some = means[:: -(-len(means) // MAX_MEASURED)]
+        width = 1.0 if cameras is None else min(float((cameras.widths / cameras.fx).median()) / MIN_WIDE_RATIO, 1.0)
         return 1.3 * width * float(torch.cdist(some, centers.to(some)).median()) or 1.0
     return 1.1 * float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
 

@@ -94,7 +94,6 @@ def as_rows(columns: Columns, gaussians: Gaussians, extent: Tensor | float = 1.0
     """Return the parameters of N Gaussians as rows of columns: the inverse of `as_gaussians`.
 
     Args:
-        columns: the columns.
         gaussians: N Gaussians. A column that they lack is 0.
         extent: size of the scene, scene units.
 
@@ -115,7 +114,6 @@ def row_changes(columns: Columns, kept: Tensor, fresh: Gaussians, extent: Tensor
     """Return the changes of columns that keep some Gaussians and append others.
 
     Args:
-        columns: the columns.
         kept: (K,) int64 indices of the Gaussians that stay.
         fresh: the new Gaussians.
         extent: size of the scene, scene units.

@@ -11,7 +11,7 @@ from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_r
 from nerfloom.splats.gaussians import Gaussians
 
 DIRECTIONS = 64
-"""Number of directions at which harmonics are compared; 16 unknowns need at least 16."""
+"""Number of directions where harmonics are compared; 16 unknowns need at least 16."""
 TOLERANCE = 1e-4
 """Maximum deviation of a rotation's R R^T from the identity."""
 

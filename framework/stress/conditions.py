@@ -20,13 +20,13 @@ from nerfloom.stress.scenes import Views, ball_views
 from nerfloom.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice
 from nerfloom.testing.ball import RADIUS
 
-ALLOWED = 2.0
+MAX_LOSS = 2.0
 """Default maximum loss of PSNR, dB; compare the loss of `another-seed`."""
-ALLOWED_OF_OTHER_PICTURES = 5.0
+MAX_LOSS_OF_OTHER_PICTURES = 5.0
 """Maximum loss of PSNR, dB, if the test views show more or less of the ball than those of the plain run.
 
 If test views are easier than the plain ones (all white, black or transparent), or show the same part of the ball (4
-degrees), the maximum is `ALLOWED`.
+degrees), the maximum is `MAX_LOSS`.
 """
 
 A_THIRD = "a third of the steps teach nothing, as they should"
@@ -61,7 +61,7 @@ class Condition:
     """Number of rays per step; None for the method's."""
     spoil: Spoil | None = None
     """Change of every third batch; None without."""
-    allowed: float = ALLOWED
+    allowed: float = MAX_LOSS
     """Maximum loss of PSNR against the plain run, dB; with more, the outcome is degraded."""
     reason: str | None = None
     """Reason why more may be lost; None without."""
@@ -113,7 +113,7 @@ CONDITIONS = (
         "one-pixel-images",
         "photographs of one pixel",
         _both(one_pixel),
-        allowed=ALLOWED_OF_OTHER_PICTURES,
+        allowed=MAX_LOSS_OF_OTHER_PICTURES,
         reason="there are only a dozen pixels, each the mean of an image whose centre its ray sees",
     ),
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
@@ -128,7 +128,7 @@ CONDITIONS = (
         "field-of-view-170",
         "images 170 degrees wide, from inside: from outside, hardly any pixel would see the ball",
         lambda _: ball_views(170.0, RADIUS / 2),
-        allowed=ALLOWED_OF_OTHER_PICTURES,
+        allowed=MAX_LOSS_OF_OTHER_PICTURES,
         reason="a pixel in the middle spans over 40 degrees",
         ball_only=True,
     ),
@@ -136,11 +136,11 @@ CONDITIONS = (
         "inside",
         "cameras inside the object, which fills all pictures",
         lambda _: ball_views(90.0, RADIUS / 2),
-        allowed=ALLOWED_OF_OTHER_PICTURES,
+        allowed=MAX_LOSS_OF_OTHER_PICTURES,
         reason="matter right before the cameras explains a few photographs as well as walls do",
         ball_only=True,
     ),
-    # -- units and origin: see `variants.moved` for the two ways in which formats place a scene
+    # -- units and origin: see `variants.moved` for the two ways that formats place a scene
     Condition("scale-1e-6", "a scene a million times smaller, not placed", _moved(1e-6), reason=UNIT),
     Condition("scale-1e6", "a scene a million times larger, not placed", _moved(1e6), reason=UNIT),
     Condition("shift-1e4", "a scene 10,000 units off along each axis, not placed", _moved(shift=1e4), reason=FAR_OFF),

@@ -29,13 +29,13 @@ HALF_SIZE = 1.5
 """Half the edge of the ball's box, scene units. Every ray within FIELD_OF_VIEW meets the box."""
 FIELD_OF_VIEW, SIZE = 30.0, 24
 """Angle of view of the ball's images, degrees, and their width and height, pixels."""
-SHARE = 0.7
+BALL_SHARE = 0.7
 """Diameter of the ball in an image from outside, as a fraction of the image's width."""
 NUM_TRAIN, NUM_TEST = 12, 4
 """Number of training and of test images."""
 LONGER_SIDE = 48
 """Minimum longer side of a data set's reduced images, pixels; the reduction factor is an integer."""
-NEAREST = 0.02
+MIN_NEAR = 0.02
 """Minimum near distance, scene units, for cameras inside the box."""
 RAYS_PER_PIXEL = 16
 """Rays per pixel of the ball's images; pixels are means over their area."""
@@ -68,7 +68,7 @@ def ball_views(field_of_view: float = FIELD_OF_VIEW, distance: float | None = No
     Args:
         field_of_view: angle of view of the images, degrees.
         distance: distance of the cameras from the ball's centre, which they look at; less than RADIUS is inside. If
-            None, the distance at which the ball takes SHARE of the images' width.
+            None, the distance where the ball takes BALL_SHARE of the images' width.
     """
     radius = distance_for(field_of_view) if distance is None else distance
     train, test = (radius * directions(count, turn) for count, turn in ((NUM_TRAIN, 0.0), (NUM_TEST, 1.0)))
@@ -76,8 +76,8 @@ def ball_views(field_of_view: float = FIELD_OF_VIEW, distance: float | None = No
 
 
 def distance_for(field_of_view: float) -> float:
-    """Return the distance at which the ball takes SHARE of an image's width; `field_of_view` is in degrees."""
-    return RADIUS / math.sin(math.atan(SHARE * math.tan(math.radians(field_of_view) / 2)))
+    """Return the distance where the ball takes BALL_SHARE of an image's width; `field_of_view` is in degrees."""
+    return RADIUS / math.sin(math.atan(BALL_SHARE * math.tan(math.radians(field_of_view) / 2)))
 
 
 def directions(count: int, turn: float = 0.0) -> Tensor:
@@ -101,7 +101,7 @@ def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
     distance, reach = float(positions.norm(dim=-1).max()), HALF_SIZE * 3**0.5
     scene = Scene(
         box=torch.tensor([[-HALF_SIZE] * 3, [HALF_SIZE] * 3]),
-        near=max(distance - reach, NEAREST),
+        near=max(distance - reach, MIN_NEAR),
         far=distance + reach,
         num_cameras=len(cameras),
         has_alpha=pixels.shape[1] == 4,

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RayConfig, TrainConfig, from_plain
+from nerfloom.base.config import TrainConfig, from_plain
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import NerfloomError
 from nerfloom.data.dataset import Dataset
@@ -32,7 +32,7 @@ from nerfloom.training.run import Run
 from nerfloom.training.signals import Stopped
 from nerfloom.training.trainer import Trainer
 
-MOST_RAYS, MOST_SAMPLES = 512, 2**14
+MAX_RAYS, MAX_SAMPLES = 512, 2**14
 """Maximum number of rays and of samples per step, so that a large network does hundreds of steps in a minute."""
 NEVER = 10**9
 """Steps or seconds between checkpoints, more than in any run."""
@@ -96,7 +96,6 @@ def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Tri
     """Train and evaluate a run under a condition; errors become part of the result.
 
     Args:
-        condition: the condition.
         run: the method and its settings; its folder is not used.
         views: the plain images.
         budget: length of the run.
@@ -131,7 +130,6 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     """Return the settings of a short run, with small steps and no files but the last checkpoint.
 
     Args:
-        config: the run's settings.
         budget: length of the run.
         method: the method; it fills in the number of samples per step and the learning rate if they are open.
         scene: properties of the plain images.
@@ -147,14 +145,11 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
     )
     decided = method.decided(config, scene)[0]
     config = replace(config, learning_rate=decided.learning_rate)
-    if not isinstance(config, RayConfig):
+    if method.model.batches != "pixels":
         return config
-    samples = decided.samples_per_batch
-    return replace(
-        config,
-        num_rays_per_batch=min(config.num_rays_per_batch, MOST_RAYS),
-        samples_per_batch=None if samples is None else min(samples, MOST_SAMPLES),
-    )
+    rays, samples = min(decided.num_rays_per_batch, MAX_RAYS), decided.samples_per_batch
+    sizes = {"num_rays_per_batch": rays, "samples_per_batch": None if samples is None else min(samples, MAX_SAMPLES)}
+    return replace(config, **sizes)
 
 
 def blank_psnr(model: Model[Any], test: Dataset) -> float:

@@ -17,7 +17,7 @@ from nerfloom.training.run import Run
 Outcome = Literal["pass", "degraded", "refused", "fail", "not applicable"]
 """Outcome of a run. refused: it ended with a clear error, which is as good as a result. not applicable: there was no
 run, because the condition changes nothing in what the method does."""
-LEAST_LEARNT = 3.0
+MIN_LEARNT = 3.0
 """Minimum PSNR of the plain run above that of empty images, dB; with a lower one, every run would pass."""
 
 
@@ -112,7 +112,7 @@ def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdi
 
 def _weaknesses(condition: Condition, trial: Trial, lost: float | None) -> list[str]:
     weaknesses = []
-    if condition is PLAIN and trial.learnt is not None and trial.learnt < LEAST_LEARNT:
+    if condition is PLAIN and trial.learnt is not None and trial.learnt < MIN_LEARNT:
         weaknesses.append(f"only {trial.learnt:.1f} dB better than empty images: too little for comparisons")
     if lost is not None and lost > condition.allowed:
         weaknesses.append(condition.reason or f"unexpected: at most {condition.allowed:g} dB may be lost")

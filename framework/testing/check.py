@@ -12,7 +12,7 @@ from nerfloom.method import Method
 from nerfloom.ray_model import RayModel
 from nerfloom.testing import declaration, learning, rendering, storage
 from nerfloom.testing.finding import Finding
-from nerfloom.testing.trial_run import Subject
+from nerfloom.testing.method_under_test import MethodUnderTest
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Check:
 
     name: str
     """Name of the check in findings."""
-    run: Callable[[Subject], str]
+    run: Callable[[MethodUnderTest], str]
     """Function that returns a line for people; it raises Fault, or any error of the method, if the check fails."""
     needs: tuple[str, ...] = ()
     """Names of checks that must pass before this one, if they are run."""
@@ -51,7 +51,7 @@ CHECKS = (
     Check("nan rays", rendering.check_nan_rays, ("chunks",), rays_only=True),
     Check("checkpoint", storage.check_checkpoint, ("training",)),
 )
-"""All checks, in the order in which they run."""
+"""All checks, in the order of running."""
 
 
 def check_method(method: Method, name: str = "the method", config: TrainConfig | None = None) -> list[Finding]:
@@ -60,7 +60,6 @@ def check_method(method: Method, name: str = "the method", config: TrainConfig |
     On the CPU it takes seconds for small models, so give a config with few layers, levels or cells.
 
     Args:
-        method: the method.
         name: the method's name in messages.
         config: settings for the check; the method's defaults if None.
 
@@ -68,7 +67,7 @@ def check_method(method: Method, name: str = "the method", config: TrainConfig |
         A finding for each of `CHECKS` that was run. Checks that depend on a failed check are omitted. An error raised
         by the method becomes a finding.
     """
-    subject, findings = Subject(method, name, config), dict[str, Finding]()
+    subject, findings = MethodUnderTest(method, name, config), dict[str, Finding]()
     casts_rays = isinstance(method.model, type) and issubclass(method.model, RayModel)
     checks = [check for check in CHECKS if casts_rays or not check.rays_only]
     names = {check.name for check in checks}
@@ -79,7 +78,7 @@ def check_method(method: Method, name: str = "the method", config: TrainConfig |
     return list(findings.values())
 
 
-def _finding(check: Check, subject: Subject) -> Finding:
+def _finding(check: Check, subject: MethodUnderTest) -> Finding:
     try:
         return Finding(check.name, True, check.run(subject))
     except Exception as error:
@@ -90,7 +89,6 @@ def assert_method(method: Method, name: str = "the method", config: TrainConfig 
     """Check a method in a test.
 
     Args:
-        method: the method.
         name: the method's name in messages.
         config: settings for the check; the method's defaults if None.
 

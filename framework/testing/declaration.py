@@ -13,10 +13,10 @@ import yaml
 
 from nerfloom.base.config import TrainConfig, from_plain, to_plain
 from nerfloom.testing.finding import Fault
-from nerfloom.testing.trial_run import Subject
+from nerfloom.testing.method_under_test import MethodUnderTest
 
 
-def check_config(subject: Subject) -> str:
+def check_config(subject: MethodUnderTest) -> str:
     """Check that the settings of `subject` are a frozen dataclass derived from TrainConfig, and survive config.yml."""
     config = subject.config
     kind = type(config)
@@ -38,7 +38,7 @@ def check_config(subject: Subject) -> str:
     return f"{len(fields(config))} settings survive config.yml"
 
 
-def check_summary(subject: Subject) -> str:
+def check_summary(subject: MethodUnderTest) -> str:
     """Check that the module of `subject` has a docstring, whose first line is the method's summary."""
     module = type(subject.method.config).__module__
     docstring = getattr(sys.modules.get(module), "__doc__", None) or ""

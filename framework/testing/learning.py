@@ -16,23 +16,23 @@ from torch import Tensor
 from nerfloom.model import Loss
 from nerfloom.ray_model import RayModel
 from nerfloom.testing.finding import Fault
+from nerfloom.testing.method_under_test import STEPS, Learner, MethodUnderTest
 from nerfloom.testing.rendering import require_rendered
-from nerfloom.testing.trial_run import STEPS, Learner, Subject
 from nerfloom.training.optim import first_non_finite
 
 FIRST_STEPS = 3
 """Number of steps whose gradients are checked."""
 GRADIENT_STEPS = 40
-"""Number of steps within which each parameter must have a gradient; proposals have one only where they are too low."""
+"""Each parameter must have a gradient within this number of steps; proposals have one only where they are too low."""
 REPEATED_STEPS = 2
 """Number of steps after which two models are compared."""
 RAYS_PER_PIXEL = 4
 """Rays per pixel of the second checked batch."""
-LEARNT = 0.8
+MAX_ERROR_RATIO = 0.8
 """Maximum error after STEPS steps, as a fraction of the initial one."""
 
 
-def check_loss(subject: Subject) -> str:
+def check_loss(subject: MethodUnderTest) -> str:
     """Check that the loss of `subject` is finite named scalars with a gradient, with one and several rays per pixel."""
 
     def look(learner: Learner) -> None:
@@ -61,7 +61,7 @@ def _require_loss(loss: Loss, batch: Any, of: str) -> None:
         raise Fault(f"no loss{of} has a gradient; is something detached, or computed under torch.no_grad()?")
 
 
-def check_groups(subject: Subject) -> str:
+def check_groups(subject: MethodUnderTest) -> str:
     """Check that the `groups` of `subject` have every parameter exactly once."""
 
     def look(learner: Learner) -> None:
@@ -81,7 +81,7 @@ def check_groups(subject: Subject) -> str:
     return "every parameter is in one group"
 
 
-def check_gradients(subject: Subject) -> str:
+def check_gradients(subject: MethodUnderTest) -> str:
     """Check that parameters of `subject` and their gradients are finite in the first steps."""
 
     def look(learner: Learner) -> None:
@@ -95,7 +95,7 @@ def check_gradients(subject: Subject) -> str:
     return "finite in the first steps"
 
 
-def check_unused(subject: Subject) -> str:
+def check_unused(subject: MethodUnderTest) -> str:
     """Check that parameters of `subject` that require a gradient have one within GRADIENT_STEPS steps."""
 
     def look(learner: Learner) -> None:
@@ -129,7 +129,7 @@ def _names(names: list[str]) -> str:
     return f"{some} {'is' if len(names) == 1 else 'are'}"
 
 
-def check_repetition(subject: Subject) -> str:
+def check_repetition(subject: MethodUnderTest) -> str:
     """Check that training `subject` is reproducible: the same seed gives the same bits."""
     learners = [subject.learner(), subject.learner()]
     for learner in learners:
@@ -156,7 +156,7 @@ def require_same(one: Learner, other: Learner, when: str, remedy: str) -> None:
         raise Fault(f"{when}, {_names(different)} different; {remedy}")
 
 
-def check_training(subject: Subject) -> str:
+def check_training(subject: MethodUnderTest) -> str:
     """Check that training `subject` for STEPS steps raises no error and that the loss stays finite."""
     history = subject.trained.history
     bad = [step for step, loss in enumerate(history) if not math.isfinite(loss)]
@@ -165,11 +165,11 @@ def check_training(subject: Subject) -> str:
     return f"{STEPS} steps"
 
 
-def check_learning(subject: Subject) -> str:
+def check_learning(subject: MethodUnderTest) -> str:
     """Check that training `subject` for STEPS steps reduces the squared error of images."""
     before, after = subject.learner().error(), subject.trained.error()
     change = f"from {before:.3g} to {after:.3g} in {STEPS} steps"
-    if not after < LEARNT * before:
+    if not after < MAX_ERROR_RATIO * before:
         raise Fault(
             f"the squared error goes {change}; check the loss's sign and the learning rates, or give a config with a "
             "smaller model and a higher --learning-rate"
@@ -177,7 +177,7 @@ def check_learning(subject: Subject) -> str:
     return f"the squared error falls {change}"
 
 
-def check_nan_colors(subject: Subject) -> str:
+def check_nan_colors(subject: MethodUnderTest) -> str:
     """Check that a NaN in an image makes the loss of `subject` NaN, so that the trainer drops the step."""
     learner = subject.learner()
     batch = learner.batch()
@@ -189,7 +189,7 @@ def check_nan_colors(subject: Subject) -> str:
     return "a NaN in a photograph makes the loss NaN, and the trainer drops the step"
 
 
-def check_bfloat16(subject: Subject) -> str:
+def check_bfloat16(subject: MethodUnderTest) -> str:
     """Check that a step of `subject` under bfloat16 autocast works, with finite float32 colours and losses."""
 
     def look(learner: Learner) -> None:

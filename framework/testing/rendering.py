@@ -19,7 +19,7 @@ from nerfloom.rendering.rendered import Rendered
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.testing.finding import Fault
-from nerfloom.testing.trial_run import STRIDE, Learner, Subject
+from nerfloom.testing.method_under_test import STRIDE, Learner, MethodUnderTest
 
 TOLERANCE = 1e-3
 """Maximum difference of colours and opacities that should be equal."""
@@ -27,7 +27,7 @@ CHUNK = 100
 """Number of rays per part when an image is rendered in parts."""
 
 
-def check_build(subject: Subject) -> str:
+def check_build(subject: MethodUnderTest) -> str:
     """Check that `subject` builds a Model with parameters on each scene."""
 
     model = subject.method.model
@@ -42,7 +42,7 @@ def check_build(subject: Subject) -> str:
     return f"on {', on '.join(subject.scenes)}"
 
 
-def check_render(subject: Subject) -> str:
+def check_render(subject: MethodUnderTest) -> str:
     """Check that `subject` renders every field of Rendered with its shape and finite values."""
 
     def look(learner: Learner) -> None:
@@ -97,7 +97,7 @@ def _require(value: Tensor, shape: tuple[int, ...], what: str) -> None:
         raise Fault(f"{what} has a value that is not finite (NaN or infinity)")
 
 
-def check_view(subject: Subject) -> str:
+def check_view(subject: MethodUnderTest) -> str:
     """Check that `subject` renders every field of Picture with its shape and finite values."""
 
     def look(learner: Learner) -> None:
@@ -122,7 +122,7 @@ def check_view(subject: Subject) -> str:
     return "every field of Picture has its shape and is finite"
 
 
-def check_few_rays(subject: Subject) -> str:
+def check_few_rays(subject: MethodUnderTest) -> str:
     """Check that `subject` renders 0 rays and 1 ray."""
 
     def look(learner: Learner) -> None:
@@ -141,7 +141,7 @@ def check_few_rays(subject: Subject) -> str:
     return "0 rays and 1 ray are rendered"
 
 
-def check_background(subject: Subject) -> str:
+def check_background(subject: MethodUnderTest) -> str:
     """Check that `subject` shows the background where rays are not opaque, and where they miss the box."""
     learner = subject.learner()
     if not isinstance(learner.model, RayModel):
@@ -182,7 +182,7 @@ def _ends_at_the_box(model: Model) -> bool:
     return any(grid.levels == 1 for grid in grids) or any(not sampler.unbounded for sampler in proposals)
 
 
-def check_evaluation(subject: Subject) -> str:
+def check_evaluation(subject: MethodUnderTest) -> str:
     """Check that rendering `subject` in evaluation is deterministic."""
     learner = subject.trained
     first, second = (learner.picture(seed=seed).rgb for seed in (1, 2))
@@ -194,7 +194,7 @@ def check_evaluation(subject: Subject) -> str:
     return "a picture is the same each time"
 
 
-def check_chunks(subject: Subject) -> str:
+def check_chunks(subject: MethodUnderTest) -> str:
     """Check that a ray's colour from `subject` does not depend on the other rays of a batch."""
     learner = subject.trained
     view = learner.view()
@@ -211,7 +211,7 @@ def check_chunks(subject: Subject) -> str:
     return f"{len(view.rays)} rays at once and {CHUNK} at a time give the same picture"
 
 
-def check_nan_rays(subject: Subject) -> str:
+def check_nan_rays(subject: MethodUnderTest) -> str:
     """Check that a non-finite ray does not change the colours of other rays of `subject`."""
     learner = subject.trained
     view = learner.view()

@@ -9,12 +9,12 @@ import torch
 
 from nerfloom.testing.finding import Fault
 from nerfloom.testing.learning import require_same
-from nerfloom.testing.trial_run import SEED, Learner, Subject
+from nerfloom.testing.method_under_test import SEED, Learner, MethodUnderTest
 from nerfloom.training.checkpoint import load_checkpoint, save_checkpoint
 from nerfloom.training.trained import restore_model
 
 
-def check_checkpoint(subject: Subject) -> str:
+def check_checkpoint(subject: MethodUnderTest) -> str:
     """Check that a model of `subject` loaded from a checkpoint renders and trains like the saved one, to the bit."""
     trained, loaded = subject.trained, subject.learner(seed=SEED + 1)
     _load_saved(trained, loaded)

@@ -7,7 +7,7 @@ import math
 from nerfloom.base.config import RayConfig
 from nerfloom.base.pace import Pace
 
-SMALLEST_BATCH, LARGEST_BATCH = 64, 2**17
+MIN_BATCH, MAX_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples or on time."""
 BATCH_CHANGES = 1.2
 """With CUDA graphs, resize batches only beyond this factor: a graph has a fixed size."""
@@ -44,7 +44,7 @@ class BatchSize:
             return
         if self._measured is None:
             self._measured = pace
-            self._most = self.config.num_rays_per_batch if self.recorded else SMALLEST_BATCH
+            self._most = self.config.num_rays_per_batch if self.recorded else MIN_BATCH
         elif pace.step - self._measured.step >= pace.steps_per_read and pace.seconds > self._measured.seconds:
             found = self._drawn / (pace.seconds - self._measured.seconds)
             known = found if self._rays_per_second is None else self._rays_per_second
@@ -61,9 +61,9 @@ class BatchSize:
         """
         if samples is None:
             given = self.config.num_rays_per_batch
-            wanted = min(max(round(self._most), min(SMALLEST_BATCH, given)), given)
+            wanted = min(max(round(self._most), min(MIN_BATCH, given)), given)
         else:
-            wanted = min(max(round(samples / max(samples_per_ray, 0.1)), SMALLEST_BATCH), LARGEST_BATCH)
+            wanted = min(max(round(samples / max(samples_per_ray, 0.1)), MIN_BATCH), MAX_BATCH)
         if not self.recorded or not wanted / BATCH_CHANGES <= self._last <= wanted * BATCH_CHANGES:
             self._last = wanted
         self._drawn += self._last

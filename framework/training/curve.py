@@ -22,21 +22,21 @@ from nerfloom.renderable import Renderable
 from nerfloom.training.progress import StepReport
 from nerfloom.training.run import finite_or_null
 
-FEW = 3
+MAX_IMAGES = 3
 """Maximum number of images that are evaluated between evaluations of all images."""
-SHARE = 0.05
+MAX_TIME_SHARE = 0.05
 """Maximum time of these evaluations, as a fraction of the seconds of training."""
-MARGIN = 0.8
+PLANNED_SHARE = 0.8
 """Fraction of that time to plan with; the next evaluation's time is estimated from the last one's."""
-SPACING = 1.15
+MIN_SPACING = 1.15
 """Minimum ratio of the training times at consecutive evaluations."""
 NUM_LOOKS = 10
 """Number of evaluations per run that the pixel stride is chosen for."""
 PICTURE_SPEED = 2.0
 """Ratio of rays per second in rendering and in training, assumed before the first evaluation. Measured: 2 to 7."""
-MOST_PIXELS = 2**14
+MAX_PIXELS = 2**14
 """Maximum number of evaluated pixels per image; more would add little precision."""
-LEAST_SIDE = 16
+MIN_SIDE = 16
 """Minimum number of evaluated pixels along the shorter side of an image; SSIM needs 11."""
 
 Entry: TypeAlias = (
@@ -94,18 +94,18 @@ def num_rays(sizes: Sequence[tuple[int, int]], stride: int, rays_per_pixel: int)
 
 
 def pixel_stride(sizes: Sequence[tuple[int, int]], rays_per_pixel: int, rays: float) -> int:
-    """Return the smallest stride at which images together take at most about a given number of rays.
+    """Return the smallest stride for at most about a given number of rays in all images together.
 
-    No image then has more than MOST_PIXELS pixels, and no shorter side less than LEAST_SIDE pixels.
+    No image then has more than MAX_PIXELS pixels, and no shorter side less than MIN_SIDE pixels.
 
     Args:
         sizes: (height, width) of each image, pixels.
         rays_per_pixel: rays per rendered pixel.
         rays: maximum number of rays of all images together.
     """
-    largest = max(min(map(min, sizes)) // LEAST_SIDE, 1)
+    largest = max(min(map(min, sizes)) // MIN_SIDE, 1)
     most = max(height * width for height, width in sizes)
-    allowed = min(rays / rays_per_pixel / len(sizes), MOST_PIXELS)
+    allowed = min(rays / rays_per_pixel / len(sizes), MAX_PIXELS)
     return min(math.ceil(math.sqrt(most / allowed)), largest) if allowed > 0 else largest
 
 
@@ -119,9 +119,9 @@ def is_due(points: Sequence[Point], seconds: float, cost: float, *, last: bool =
         last: whether training ends here.
     """
     spent = sum(point.evaluation_seconds or 0.0 for point in points)
-    if spent + cost > MARGIN * SHARE * seconds:
+    if spent + cost > PLANNED_SHARE * MAX_TIME_SHARE * seconds:
         return False
-    return last or not points or seconds >= SPACING * points[-1].seconds
+    return last or not points or seconds >= MIN_SPACING * points[-1].seconds
 
 
 class FewImages:
@@ -136,7 +136,8 @@ class FewImages:
     def __init__(self, dataset: Dataset, limit: int | None, rays_per_pixel: int) -> None:
         views = views_to_judge(dataset)
         self._dataset, self._rays_per_pixel = dataset, rays_per_pixel
-        self._views = [views[index] for index in spread(len(views), FEW if limit is None else min(limit, FEW))]
+        few = MAX_IMAGES if limit is None else min(limit, MAX_IMAGES)
+        self._views = [views[index] for index in spread(len(views), few)]
         cameras = dataset.cameras
         self._sizes = [(int(cameras.heights[view]), int(cameras.widths[view])) for view in self._views]
 
@@ -152,7 +153,7 @@ class FewImages:
         Returns:
             The evaluation; None if none is due.
         """
-        if not self._views or (looks and not last and report.seconds < SPACING * looks[-1][0]):
+        if not self._views or (looks and not last and report.seconds < MIN_SPACING * looks[-1][0]):
             return None
         points = [Point(*entry) for entry in looks]
         stride, cost = self._plan(points, report)
@@ -179,7 +180,7 @@ class FewImages:
         if len(points) > 1:
             return stride, cost
         rate = num_rays(self._sizes, stride, self._rays_per_pixel) / max(cost, 1e-6)
-        allowed = MARGIN * SHARE * report.seconds / report.progress / NUM_LOOKS
+        allowed = PLANNED_SHARE * MAX_TIME_SHARE * report.seconds / report.progress / NUM_LOOKS
         stride = pixel_stride(self._sizes, self._rays_per_pixel, rate * allowed)
         return stride, num_rays(self._sizes, stride, self._rays_per_pixel) / rate
 

@@ -40,10 +40,10 @@ bits differ, since the order of sums on a GPU varies; a step with another draw, 
 whole size."""
 LOSS_TOLERANCE = 0.01
 """Maximum difference between the losses of both, relative to the ordinary step's."""
-TESTED = 0, 64
+REPLAYS_BEFORE_TESTS = 0, 64
 """Numbers of replays before each test of a graph. In 64 steps an occupancy grid has been updated at least four times,
 learning rates have changed, and other tensors may have moved."""
-MOST_KINDS = 4
+MAX_KINDS = 4
 """Maximum number of kinds of steps whose graphs are kept, most recent first; each graph holds memory."""
 WAITED = "called a synchronizing CUDA operation"
 """Part of torch's warning where Python waits for the GPU."""
@@ -195,7 +195,7 @@ class StepGraphs(Generic[T]):
             ConfigError: if steps must be captured and this one cannot be.
         """
         kept = self._kinds[kind.of] = self._kinds.pop(kind.of, _Kind())  # the most recent kind is the last
-        if len(self._kinds) > MOST_KINDS:
+        if len(self._kinds) > MAX_KINDS:
             self._kinds.pop(next(iter(self._kinds)))
         if kept.recorded is None:
             seed()
@@ -209,7 +209,7 @@ class StepGraphs(Generic[T]):
                 self._give_up(f"a step waits for the GPU ({waited})")
             return result
         result, repeat = kept.recorded
-        if kept.passed < len(TESTED) and kept.repeated >= TESTED[kept.passed]:
+        if kept.passed < len(REPLAYS_BEFORE_TESTS) and kept.repeated >= REPLAYS_BEFORE_TESTS[kept.passed]:
             return self._test(kept, seed, step)
         seed()
         repeat()
@@ -324,7 +324,6 @@ def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple
     """Return the kind of a whole training step, including the draw of its batch.
 
     Args:
-        model: the model to train.
         source: source of the batches.
         step: number of training steps done.
         batch: the requested sizes of the batch.
@@ -333,7 +332,7 @@ def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple
         return StepKind(varies="several processes exchange their gradients")
     if source.varies is not None:
         return StepKind(varies=source.varies)
-    if type(model).after_step is not Model.after_step:
+    if model.resizes:
         return StepKind(varies="the number of parameters changes")
     own = model.step_kind(step)
     return StepKind((*batch, *own.of), own.varies)

@@ -32,7 +32,6 @@ class HeldOut:
     """Evaluations of held-out images between steps. Their time does not count as training.
 
     Args:
-        config: the settings, decided.
         model: the model in training.
         dataset: the held-out images, or a few of them; None for no evaluation.
         folder: folder of the learning curve; None to write none.

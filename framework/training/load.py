@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from nerfloom.base.config import RaysPerPixel
 from nerfloom.base.errors import ConfigError
-from nerfloom.splats.alone import Axis
 from nerfloom.splats.files import is_splat_file
+from nerfloom.splats.placement import Axis
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.splat_files import DataFormat, load_splats
 from nerfloom.training.trained import load_trained

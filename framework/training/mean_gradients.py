@@ -14,7 +14,7 @@ from nerfloom.base.errors import LostProcessError
 from nerfloom.base.processes import add_up, gathered, processes
 from nerfloom.training.optim import Adam
 
-LARGE = 2**18
+MIN_SEPARATE_SIZE = 2**18
 """Minimum number of elements of a gradient that is summed separately."""
 
 
@@ -45,7 +45,7 @@ def mean_gradients(optimizer: Adam, finite: bool | Tensor) -> bool | Tensor:
     if any(len({*column} - {0}) > 1 for column in sizes):
         raise LostProcessError("the processes' models differ in size; they need the same packages, CPUs and GPUs")
     gradients = [optimizer.gradient(p) for p, column in zip(parameters, sizes, strict=True) if any(column)]
-    apart = [gradient for gradient in gradients if gradient.numel() >= LARGE and gradient.is_contiguous()]
+    apart = [gradient for gradient in gradients if gradient.numel() >= MIN_SEPARATE_SIZE and gradient.is_contiguous()]
     for gradient in apart:
         add_up(gradient.div_(count))
     _mean_together([gradient for gradient in gradients if all(gradient is not other for other in apart)], count)

@@ -291,7 +291,6 @@ def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress:
 
     Args:
         optimizer: the optimiser; each group has its initial learning rate as `initial_lr`.
-        config: the run's settings.
         step: number of training steps done.
         progress: fraction of the budget spent, 0 to 1.
     """
@@ -305,7 +304,6 @@ def first_non_finite(model: Model, optimizer: Adam) -> str | None:
     """Return the name of the first parameter with non-finite values or gradients; None if there is none.
 
     Args:
-        model: the model.
         optimizer: the optimiser of its parameters.
 
     Returns:

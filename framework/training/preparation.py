@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Decision
 from nerfloom.base.errors import ConfigError
@@ -25,26 +25,23 @@ from nerfloom.model import LearnsMotion, Model
 from nerfloom.ray_model import RayModel
 from nerfloom.renderable import HasAppearance, RefinesPoses, RendersFromImages, parts
 from nerfloom.samplers.base import SkipsCells
-from nerfloom.samplers.choice import SamplingConfig
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.scene.folds import angle_between, folds, thumbnail
-from nerfloom.scene.motion import MotionConfig
+from nerfloom.scene.folded_poses import angle_between, folded_neighbours, thumbnail
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
 from nerfloom.scene.profile import SceneProfile
 from nerfloom.scene.seen_cells import seen_cells
 from nerfloom.scene.silhouettes import Silhouettes, pixels_near, visual_hull
-from nerfloom.scene.speed import LEAST_IMAGES, LEAST_TIMES, travel_of
+from nerfloom.scene.speed import MIN_IMAGES, MIN_TIMES, motion_bound
 from nerfloom.training.ray_starts import nearest_shown, starts_checked
 from nerfloom.training.speed import with_speed
 
 
-def decided(method: Method, config: TrainConfig, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
+def decided(method: Method, config: Any, dataset: Dataset) -> tuple[Dataset, TrainConfig, list[Decision]]:
     """Decide the settings that a method leaves to the data, and the box of a moving scene.
 
     A method that learns motion and samples with an occupancy grid gets the smallest box that the silhouettes allow.
 
     Args:
-        method: the method.
         config: the run's settings.
         dataset: the training images.
 
@@ -60,24 +57,23 @@ def decided(method: Method, config: TrainConfig, dataset: Dataset) -> tuple[Data
     made = measured + made
     settings, made = starts_checked(config, settings, made, dataset)
     times = dataset.times
-    if times is None or not isinstance(settings, SamplingConfig) or str(settings.sampler) != "occupancy":
-        return dataset, settings, made
-    smaller = isinstance(settings, MotionConfig) and settings.smallest_box
-    if not (smaller or settings.silhouette_cells) or dataset.scene.unbounded or _no_silhouettes(dataset) is not None:
+    looks = settings.sampler == "occupancy" and (settings.smallest_box or settings.silhouette_cells)
+    if times is None or not looks or dataset.scene.unbounded or _no_silhouettes(dataset) is not None:
         return dataset, settings, made
     silhouettes, old = Silhouettes.of(dataset), dataset.scene.box.cpu()
-    dataset = replace(dataset, travel=travel_of(silhouettes, old, times))
-    if dataset.travel is None:
+    bound = motion_bound(silhouettes, old, times)
+    if bound is None:
         return dataset, settings, made
-    edges = (
-        f"at most {dataset.travel.fastest / float((old[1] - old[0]).max()):.2g} of the box's longest edge in all time"
-    )
+    dataset = replace(dataset, motion_bound=bound)
+    edges = f"at most {bound.fastest / float((old[1] - old[0]).max()):.2g} of the box's longest edge in all time"
     found = [Decision("motion", edges, "slower matter could not be where alpha shows some")]
-    if smaller:
-        box = moving_box(silhouettes, old, times, dataset.travel)
+    if settings.smallest_box:
+        box = moving_box(silhouettes, old, times, bound)
         share = float(((box[1] - box[0]) / (old[1] - old[0])).prod())
         shorter = float((box[1] - box[0]).norm() / (old[1] - old[0]).norm())
-        config = _with_steps_as_long(config, method.config, settings, shorter)
+        default: Any = method.config
+        if config.num_steps == default.num_steps:  # the steps stay as long
+            config = replace(config, num_steps=max(round(settings.num_steps * shorter), 1))
         dataset = replace(dataset, scene=replace(dataset.scene, box=box.to(dataset.device)))
         settings, made = method.decided(config, dataset.scene)
         made = measured + made
@@ -98,16 +94,6 @@ def _check_cameras(method: str, drawn: tuple[str, ...] | None, dataset: Dataset)
         )
 
 
-def _with_steps_as_long(config: TrainConfig, default: TrainConfig, decided: TrainConfig, shorter: float) -> TrainConfig:
-    """Scale the `decided` number of steps by `shorter`, unless `config` differs from the `default`."""
-    assert isinstance(config, SamplingConfig)
-    assert isinstance(default, SamplingConfig)
-    assert isinstance(decided, SamplingConfig)
-    if config.num_steps != default.num_steps:
-        return config
-    return replace(config, num_steps=max(round(decided.num_steps * shorter), 1))
-
-
 def profile_of(
     method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, decided: Sequence[Decision]
 ) -> SceneProfile:
@@ -115,8 +101,6 @@ def profile_of(
 
     Args:
         method: the method's name.
-        config: the run's settings.
-        model: the model to train.
         dataset: the training images.
         decided: decisions of the method.
     """
@@ -127,12 +111,12 @@ def profile_of(
     if config.background == "auto":
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
-    if isinstance(config, SamplingConfig) and config.silhouette_cells and parts(model, SkipsCells):
+    if config.silhouette_cells and parts(model, SkipsCells):
         obstacle = _no_hull(dataset)
         outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
         decisions.append(Decision("silhouettes", choice, obstacle or "alpha shows them"))
-    if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:
+    if isinstance(model, RayModel) and model.covisible_space is not None:
         where = f"where at least {config.rays_shared_by} photographs look"
         reason = "what one shows could be at any distance (else: --rays-shared-by 0)"
         decisions.append(Decision("rays start", where, reason))
@@ -156,7 +140,7 @@ def _warning_of_folds(dataset: Dataset) -> list[Decision]:
     """Return a warning if a repeated structure seems to have folded the reconstruction."""
     ahead = -dataset.cameras.camera_to_worlds[:, :, 2].cpu().numpy()
     thumbnails = np.stack([thumbnail(dataset.image(index).cpu().numpy()) for index in range(len(dataset))])
-    pairs = folds(dataset.names, ahead, thumbnails)
+    pairs = folded_neighbours(dataset.names, ahead, thumbnails)
     if not pairs:
         return []
     first, second = pairs[0]
@@ -173,7 +157,6 @@ def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None)
     """Give the images to a model that renders from images: the training set, and source images of held-out scenes.
 
     Args:
-        model: any model.
         train_set: the training images.
         eval_set: the held-out images; None if there are none.
     """
@@ -187,7 +170,6 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
     """Empty the cells of the occupancy grids that silhouettes exclude or that no training image shows.
 
     Args:
-        config: the run's settings.
         model: the model, whose samplers hold the grids.
         dataset: the training images.
         fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
@@ -196,26 +178,23 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
         The data set, without pixels whose rays meet emptied cells only.
     """
     dataset = skip_by_silhouettes(config, model, dataset, fresh)
-    if dataset.travel is not None:
+    if dataset.motion_bound is not None:
         for sampler in parts(model, OccupancySampler):
-            sampler.expect_motion(dataset.travel.in_a_slice(sampler.slices))
+            sampler.expect_motion(dataset.motion_bound.in_a_slice(sampler.slices))
     if fresh:
         skip_unseen(config, model, dataset)
-        if isinstance(config, RayConfig) and isinstance(model, RayModel) and model.shared_space is not None:
-            model.shared_space.leave_out(dataset.cameras, nearest_shown(dataset), config.rays_shared_by)
+        if isinstance(model, RayModel) and model.covisible_space is not None:
+            model.covisible_space.exclude(dataset.cameras, nearest_shown(dataset), config.rays_shared_by)
     return dataset
 
 
 def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> None:
     """Empty the cells of nested boxes that no training image shows, or only in front of everything it shows.
 
-    Args:
-        config: the run's settings.
-        model: the model, whose samplers hold the grids.
-        dataset: the training images.
+    `config`, `model` and `dataset` are as in `skip_empty`.
     """
     nested = [sampler for sampler in parts(model, SkipsCells) if sampler.levels > 1]
-    if not nested or not isinstance(config, SamplingConfig) or not config.seen_cells:
+    if not nested or not config.seen_cells:
         return
     cameras, nearest = dataset.cameras, nearest_shown(dataset)
     for sampler in nested:
@@ -227,19 +206,10 @@ def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> Non
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
     """Empty the cells of the occupancy grids that are outside the images' silhouettes.
 
-    Args:
-        config: the run's settings.
-        model: the model, whose samplers hold the grids.
-        dataset: the training images.
-        fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
-
-    Returns:
-        The data set, without pixels whose rays meet emptied cells only.
+    `config`, `model`, `dataset`, `fresh` and the result are as in `skip_empty`.
     """
     samplers = parts(model, SkipsCells)
-    if not samplers or not isinstance(config, SamplingConfig) or not config.silhouette_cells:
-        return dataset
-    if _no_hull(dataset) is not None:
+    if not samplers or not config.silhouette_cells or _no_hull(dataset) is not None:
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
@@ -262,16 +232,16 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
 
 def _hull(silhouettes: Silhouettes, sampler: SkipsCells, dataset: Dataset) -> Tensor:
     """Return the cells of `sampler` that the `silhouettes` of `dataset` do not exclude."""
-    boxes, n, times, travel = (
+    boxes, n, times, bound = (
         nested_boxes(sampler.box.cpu(), sampler.levels),
         sampler.resolution,
         dataset.times,
-        dataset.travel,
+        dataset.motion_bound,
     )
-    if times is None or travel is None:
+    if times is None or bound is None:
         hulls = [visual_hull(silhouettes, box, n) for box in boxes]
     else:
-        hulls = [moving_hulls(silhouettes, box, n, times, travel, sampler.slices) for box in boxes]
+        hulls = [moving_hulls(silhouettes, box, n, times, bound, sampler.slices) for box in boxes]
     return torch.cat(hulls).to(sampler.box.device)
 
 
@@ -288,9 +258,9 @@ def _no_silhouettes(dataset: Dataset) -> str | None:
 def _no_hull(dataset: Dataset) -> str | None:
     """Return why the images' alpha cannot empty cells; None if it can."""
     obstacle = _no_silhouettes(dataset)
-    if obstacle is not None or dataset.times is None or dataset.travel is not None:
+    if obstacle is not None or dataset.times is None or dataset.motion_bound is not None:
         return obstacle
     if dataset.scene.unbounded:
         return "the speed of motion can only be found in a bounded scene"
     few = f"{len(dataset)} images at {len(dataset.times.unique())} times"
-    return f"{few} are too few to tell how fast something moves: it takes {LEAST_IMAGES} at {LEAST_TIMES} times"
+    return f"{few} are too few to tell how fast something moves: it takes {MIN_IMAGES} at {MIN_TIMES} times"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.decisions import Decision, is_open
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.cameras.cameras import Cameras
@@ -15,23 +16,22 @@ from nerfloom.cameras.poses import looked_at
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.free_space import before_points
 from nerfloom.method import SHARED_BY
-from nerfloom.samplers.choice import SamplingConfig
-from nerfloom.scene.shared_space import SharedSpace, share_cut_off
+from nerfloom.scene.covisible_space import CovisibleSpace, share_cut_off
 
-MOST_CUT_OFF = 0.002
+MAX_CUT_OFF = 0.002
 """Maximum fraction of a reconstruction's points that late ray starts may cut off."""
-LATEST, MOST_LATE = 0.8, 0.02
+NEAREST_CONTENT, MAX_LATE = 0.8, 0.02
 """Without points: assumed distance of the nearest content, as a fraction of the distance to the point that all cameras
 look at, and the maximum fraction of rays that may start behind it."""
 TESTED_RAYS = 20_000
 """Number of tested rays."""
-UNKNOWN = "no points say whether anything is cut off"
+NOTHING_TO_TEST = "no points say whether anything is cut off"
 """Reason to start at the near plane if nothing can be tested."""
 
 
 def starts_checked(
-    config: TrainConfig, settings: TrainConfig, made: list[Decision], dataset: Dataset
-) -> tuple[TrainConfig, list[Decision]]:
+    config: TrainConfig, settings: Any, made: list[Decision], dataset: Dataset
+) -> tuple[Any, list[Decision]]:
     """Let rays start at the near plane if late starts would cut off content.
 
     The cells are coarse if cameras stand close together right in front of the scene. In LLFF's fern they cut off 9 % of
@@ -40,7 +40,6 @@ def starts_checked(
     before it.
 
     Args:
-        config: the run's settings.
         settings: the same settings after the method's decisions.
         made: the method's decisions.
         dataset: the training images.
@@ -48,13 +47,10 @@ def starts_checked(
     Returns:
         The settings and the decisions.
     """
-    if not isinstance(config, RayConfig) or not is_open(config.rays_shared_by) or not isinstance(settings, RayConfig):
+    scene, chosen = dataset.scene, is_open(config.rays_shared_by) and settings.rays_shared_by
+    if not chosen or not scene.unbounded or scene.warped or settings.sampler == "occupancy":
         return settings, made
-    scene = dataset.scene
-    in_boxes = isinstance(settings, SamplingConfig) and str(settings.sampler) == "occupancy"
-    if not scene.unbounded or scene.warped or in_boxes or not settings.rays_shared_by:
-        return settings, made
-    reason = _why_not(dataset, settings.rays_shared_by)
+    reason = _why_not(dataset, chosen)
     if reason is None:
         return settings, made
     started = Decision("rays start", "at their near ends", f"{reason} (else: --rays-shared-by {SHARED_BY})")
@@ -62,7 +58,7 @@ def starts_checked(
 
 
 def nearest_shown(dataset: Dataset) -> Tensor:
-    """Return the distance (M,) from each camera up to which its image shows nothing, according to its points.
+    """Return the distance (M,) from each camera that its image shows to be empty, according to its points.
 
     Args:
         dataset: M training images.
@@ -72,10 +68,10 @@ def nearest_shown(dataset: Dataset) -> Tensor:
 
 
 @torch.no_grad()
-def share_late(space: SharedSpace, cameras: Cameras, near: float, far: float) -> float | None:
+def share_late(space: CovisibleSpace, cameras: Cameras, near: float, far: float) -> float | None:
     """Return the fraction of the pixels' rays that start close to the point that all cameras look at, or behind it.
 
-    Close means beyond `LATEST` of the distance to the point nearest to all optical axes.
+    Close means beyond `NEAREST_CONTENT` of the distance to the point nearest to all optical axes.
 
     Args:
         space: cells where no ray starts.
@@ -90,26 +86,26 @@ def share_late(space: SharedSpace, cameras: Cameras, near: float, far: float) ->
         return None
     pixels = evenly_spaced(int(cameras.offsets[-1]), TESTED_RAYS).to(cameras.fx.device)
     rays = cameras.pixel_rays(pixels, near, far)
-    return share_cut_off(space, rays, LATEST * (rays.origins - target.to(rays.origins)).norm(dim=-1))
+    return share_cut_off(space, rays, NEAREST_CONTENT * (rays.origins - target.to(rays.origins)).norm(dim=-1))
 
 
 def _why_not(dataset: Dataset, least: int) -> str | None:
     """Return why rays should not start where `least` images look; None if they should."""
     scene, cameras, known = dataset.scene, dataset.cameras, dataset.sparse_depth
     if known is None and (scene.moving or scene.num_scenes > 1):
-        return UNKNOWN
-    space = SharedSpace(scene.box).to(dataset.device)
-    space.leave_out(cameras, nearest_shown(dataset), least)
+        return NOTHING_TO_TEST
+    space = CovisibleSpace(scene.box).to(dataset.device)
+    space.exclude(cameras, nearest_shown(dataset), least)
     if known is not None:
         some = known[evenly_spaced(len(known), TESTED_RAYS).to(known.pixels.device)]
         cut = share_cut_off(space, cameras.pixel_rays(some.pixels, scene.near, scene.far), some.distances)
         reason = f"{100 * cut:.2g} % of the points lie before the space that {least} photographs show"
-        return None if cut <= MOST_CUT_OFF else reason
+        return None if cut <= MAX_CUT_OFF else reason
     late = share_late(space, cameras, scene.near, scene.far)
     if late is None:
-        return f"the photographs look apart, and {UNKNOWN}"
+        return f"the photographs look apart, and {NOTHING_TO_TEST}"
     reason = (
         f"{100 * late:.2g} % of the rays reach space that {least} photographs show only close to the point that all "
         "cameras look at, or behind it"
     )
-    return None if late <= MOST_LATE else reason
+    return None if late <= MAX_LATE else reason

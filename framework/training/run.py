@@ -43,7 +43,7 @@ from nerfloom.training.run_path import CONFIG, config_file
 
 TRANSFORMS = "dataparser_transforms.json"
 """Name of the placement in a run's folder."""
-PLACED_ALIKE = 1e-3
+PLACEMENT_TOLERANCE = 1e-3
 """Tolerated distance between two placements of a camera, relative to the furthest camera's distance from the origin."""
 
 
@@ -93,7 +93,7 @@ class Run:
             say(f"warning: {error}; the placement of the data is not checked")
             return parsed
         moved = _moved(parsed, then)
-        if moved >= PLACED_ALIKE and any(field.name == "placement" for field in dataclasses.fields(self.parser)):  # type: ignore[arg-type]
+        if moved >= PLACEMENT_TOLERANCE and any(field.name == "placement" for field in dataclasses.fields(self.parser)):  # type: ignore[arg-type]
             say(
                 f"{self.config.data}: images or settings have changed since {self.folder} was trained; cameras keep "
                 "their placement, but other images may be held out"
@@ -101,7 +101,7 @@ class Run:
             parser = dataclasses.replace(self.parser, placement=file)  # type: ignore[type-var]
             parsed = parser.parse(self.config.data, split)
             moved = _moved(parsed, then)
-        if not moved < PLACED_ALIKE:
+        if not moved < PLACEMENT_TOLERANCE:
             raise DataError(
                 f"{self.config.data}: cameras have moved since {self.folder} was trained, by up to "
                 f"{100 * moved:.2g} % of their distance from the origin: images were added or removed, or the "
@@ -122,7 +122,6 @@ def run_folder(method: str, config: TrainConfig) -> Path:
 
     Args:
         method: the method's name.
-        config: the run's settings.
     """
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
     timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
@@ -230,7 +229,6 @@ def write_transforms(run: Run, dataset: Dataset) -> None:
     """Write dataparser_transforms.json in nerfstudio's format.
 
     Args:
-        run: the run.
         dataset: its data set, with the transform from the input's frame to the scene's.
     """
     content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 PROBE_RAYS, WARM_UP_RAYS = 1024, 64
 """Numbers of random training rays for measuring the savings, and for the warm-up before."""
-LEAST_TOLD = 0.005
+MIN_REPORTED = 0.005
 """Minimum skipped fraction to print."""
-LEAST_FASTER = 1.1
+MIN_SPEEDUP = 1.1
 """Minimum speed-up of rendering to print."""
 
 
@@ -50,8 +50,8 @@ class Rung:
 
 
 def lines(rungs: list[Rung]) -> list[str]:
-    """Return the descriptions as lines of text, without `rungs` that skipped less than LEAST_TOLD."""
-    descriptions = [f"  {rung.says}" for rung in rungs if rung.skipped >= LEAST_TOLD]
+    """Return the descriptions as lines of text, without `rungs` that skipped less than MIN_REPORTED."""
+    descriptions = [f"  {rung.says}" for rung in rungs if rung.skipped >= MIN_REPORTED]
     return ["left out:", *descriptions] if descriptions else []
 
 
@@ -62,9 +62,9 @@ def skip_report(trainer: Trainer) -> list[Rung]:
     samplers = parts(model, SkipsCells)
     if samplers and isinstance(model, RayModel):
         rungs += _sampling_rungs(trainer, model, samplers)
-    rooms = [sampler.room for sampler in parts(model, OccupancySampler)]
-    if (rays := sum(room.rays for room in rooms)) > 0:
-        share = sum(room.left_out for room in rooms) / rays
+    capacities = [sampler.capacity for sampler in parts(model, OccupancySampler)]
+    if (rays := sum(capacity.rays for capacity in capacities)) > 0:
+        share = sum(capacity.left_out for capacity in capacities) / rays
         says = f"rays of batches, dropped because the sample buffer was full: {share:.1%}"
         rungs.append(Rung("rays of batches, buffer full", share, None, "no switch", says))
     splats = getattr(model, "capacity", None)
@@ -133,7 +133,7 @@ def _along_rays(place: str, before: int, after: int, faster: float) -> str:
     """Return a line about skipped samples of the probe's rays."""
     skipped = 1 - after / max(before, 1)
     a_ray = f"{after / PROBE_RAYS:.1f} a ray instead of {before / PROBE_RAYS:.1f}"
-    speed = f"; renders {faster:.1f} x as fast" if faster >= LEAST_FASTER else ""
+    speed = f"; renders {faster:.1f} x as fast" if faster >= MIN_SPEEDUP else ""
     return f"{place}: {skipped:.0%} of samples, {a_ray}{speed}"
 
 

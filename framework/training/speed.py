@@ -19,21 +19,21 @@ from nerfloom.geometry.points import Points
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 SAMPLES = 2**14
 """Number of samples in the timed step."""
-REFERENCE = 11.6e-3
+REFERENCE_SECONDS = 11.6e-3
 """Seconds of this step on the machine that settings were tuned on: two idle cores of an AMD EPYC (Zen 4) with
 AVX-512."""
-MEASURED_FOR = 0.25
+MEASURING_SECONDS = 0.25
 """Duration of the measurement, seconds."""
-LEAST_BUDGET = 10.0
+MIN_BUDGET = 10.0
 """Minimum seconds of training for a measurement."""
-USUAL = 1.4
+SPEED_TOLERANCE = 1.4
 """Ignore a measured speed within this factor of the expected one, so that equal runs decide alike."""
 
 
 def with_speed(config: ConfigT) -> tuple[ConfigT, list[Decision]]:
     """Return settings with the speed of this machine.
 
-    It is measured if settings depend on it: in one process, on a CPU, with a budget of at least `LEAST_BUDGET` seconds.
+    It is measured if settings depend on it: in one process, on a CPU, with a budget of at least `MIN_BUDGET` seconds.
 
     Args:
         config: a method's settings; a configured speed stays.
@@ -42,11 +42,11 @@ def with_speed(config: ConfigT) -> tuple[ConfigT, list[Decision]]:
         The settings, and a decision if the speed differs from the expected one.
     """
     machine = config.machine
-    fixed = (config.max_seconds or 0.0) < LEAST_BUDGET or machine.speed is not None or processes().count > 1
+    fixed = (config.max_seconds or 0.0) < MIN_BUDGET or machine.speed is not None or processes().count > 1
     if fixed or device_kind(machine) != "cpu":
         return config, []
-    usual, found = relative_speed(machine), REFERENCE / step_seconds()
-    if usual / USUAL < found < usual * USUAL:
+    usual, found = relative_speed(machine), REFERENCE_SECONDS / step_seconds()
+    if usual / SPEED_TOLERANCE < found < usual * SPEED_TOLERANCE:
         return config, []
     found = float(f"{found:.2g}")
     return replace(config, machine=replace(machine, speed=found)), [
@@ -63,7 +63,7 @@ def step_seconds() -> float:
         points = Points(torch.rand(SAMPLES, 3))
         directions = torch.nn.functional.normalize(torch.randn(SAMPLES, 3), dim=-1)
     steps, start = -1, time.perf_counter()
-    while steps < 1 or time.perf_counter() - start < MEASURED_FOR:
+    while steps < 1 or time.perf_counter() - start < MEASURING_SECONDS:
         density, features = field.density(points)
         colors = field.color(features, directions)
         (density.mean() + colors.mean()).backward()

@@ -20,10 +20,10 @@ from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.local_origin import local_origin, rounding
 from nerfloom.registry import load_dataparser
-from nerfloom.splats.alone import Axis, placed_alone
 from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.placement import Axis, placed_gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.loaded import Loaded
@@ -57,7 +57,7 @@ def load_splats(
     say(f"{file}: {look.words()}")
     machine, offset = MachineConfig(device_type=device_type), read_offset(file)
     if data is None and data_format is None:
-        source, (about, scene) = None, placed_alone(gaussians, up or "z")
+        source, (about, scene) = None, placed_gaussians(gaussians, up or "z")
         if up is None:
             say("without photographs, z is assumed to point up (else: --up=-y, as in many captures, or --data DIR)")
         placed = transformed(gaussians, *about.similarity())

@@ -39,7 +39,6 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
     Several processes take the step together, each with its own batch; all use the mean gradient.
 
     Args:
-        model: the model to train.
         optimizer: the optimiser of all its parameters.
         batch: pixels or views, as the model's loss takes them.
         step: number of training steps done.
@@ -52,11 +51,7 @@ def train_step(model: Model[Any], optimizer: Adam, batch: Any, step: int, progre
 def schedule(model: Model[Any], optimizer: Adam, step: int, progress: float) -> None:
     """Set learning rates and the model's schedules for a step.
 
-    Args:
-        model: the model to train.
-        optimizer: the optimiser of all its parameters.
-        step: number of training steps done.
-        progress: fraction of the budget spent, 0 to 1.
+    `model`, `optimizer`, `step` and `progress` are as in `train_step`.
     """
     set_learning_rate(optimizer, model.config, step, progress)
     _before(model, step, progress, model.uses_bfloat16)
@@ -65,14 +60,8 @@ def schedule(model: Model[Any], optimizer: Adam, step: int, progress: float) -> 
 def learn(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: float) -> StepResult:
     """Take the rest of a training step, after `schedule`: forward, backward, Adam.
 
-    If steps can be replayed (`Model.step_kind`), this depends only on the values of tensors.
-
-    Args:
-        model: the model to train.
-        optimizer: the optimiser of all its parameters.
-        batch: pixels or views, as the model's loss takes them.
-        step: number of training steps done.
-        progress: fraction of the budget spent, 0 to 1.
+    If steps can be replayed (`Model.step_kind`), this depends only on the values of tensors. `model`, `optimizer`,
+    `batch`, `step` and `progress` are as in `train_step`.
     """
     loss = _loss(model, batch, step, model.uses_bfloat16)
     finite = mean_gradients(optimizer, backward(loss.total, optimizer))
@@ -93,7 +82,6 @@ def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16:
     """Return the loss of a model on a batch, in training mode.
 
     Args:
-        model: the model to train.
         batch: pixels or views, as the model's loss takes them.
         step: number of training steps done.
         progress: fraction of the budget spent, 0 to 1.

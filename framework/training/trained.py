@@ -85,8 +85,6 @@ def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, An
     """Return the model of a checkpoint, in evaluation mode.
 
     Args:
-        method: the method.
-        config: the run's settings.
         checkpoint: content of the checkpoint, with the model's scene.
         device: device of the model.
 
@@ -112,7 +110,6 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | N
     """Load a checkpoint's parameters into a model.
 
     Args:
-        model: the model.
         checkpoint: content of the checkpoint.
         method: name of the model's method; None to accept any method's checkpoint.
 

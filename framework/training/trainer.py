@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.checked import checked
-from nerfloom.base.config import RayConfig, TrainConfig, to_plain
+from nerfloom.base.config import TrainConfig, to_plain
 from nerfloom.base.console import say
 from nerfloom.base.device import BEFORE_STEP, seed_step
 from nerfloom.base.errors import CheckpointError, DivergenceError
@@ -44,7 +44,7 @@ from nerfloom.training.trained import restore_model
 
 STEPS_PER_LOG = 25
 """Steps between points of TensorBoard's curves, and between readings of errors from a device."""
-TOLD_SECONDS = 0.5
+MIN_REPORTED_SECONDS = 0.5
 """Report preparation that takes at least this long, seconds."""
 MAX_BAD_STEPS = 10
 """Number of consecutive non-finite steps that stop a run."""
@@ -58,7 +58,6 @@ class Trainer:
     Each of several processes has a trainer. Only the first process evaluates and writes.
 
     Args:
-        method: the method.
         config: its settings; open ones are decided from the data.
         train_set: training images, on the device.
         eval_set: images of the periodic evaluation; None for no evaluation.
@@ -97,8 +96,8 @@ class Trainer:
         self.graphs = make_graphs(mode, self.device, self._learnt, lambda taken: taken[1].loss.total)
         self.held_out = HeldOut(self.config, self.model, eval_set, folder)
         self.batch_size: BatchSize | None = None
-        if isinstance(self.config, RayConfig):
-            self.batch_size = BatchSize(self.config, recorded=self.graphs is not None)
+        if self.model.batches == "pixels":
+            self.batch_size = BatchSize(self.model.config, recorded=self.graphs is not None)
         self._bad_in_a_row, self._prepared = 0, False
         self._saved_step: int | None = None
         self._last_save = 0.0
@@ -269,7 +268,7 @@ class Trainer:
         seconds = time.perf_counter() - begun + self._deciding
         if fresh:
             self.state.seconds += seconds
-        if seconds >= TOLD_SECONDS:
+        if seconds >= MIN_REPORTED_SECONDS:
             say(f"prepared in {seconds:.1f} s, which count as training")
 
     def train_step(self) -> StepReport:
@@ -345,10 +344,10 @@ class Trainer:
 
     def _request(self) -> Request:
         """Return the request for the next batch: at first one ray per pixel, later the rendering's number."""
-        config, state = self.config, self.state
+        state = self.state
         if self.batch_size is None:
             return Request(state.step, 0)
-        assert isinstance(config, RayConfig)
+        config = self.batch_size.config
         late = self.progress >= config.train_rays_per_pixel_from
         rays_per_pixel = config.rays_per_pixel if late else 1
         rays = self.batch_size.rays(self.model.samples_per_step, state.samples_per_ray)

@@ -67,7 +67,6 @@ class Browser:
         """Show a coarse picture for a new request.
 
         Args:
-            request: the request.
             stride: stride of the picture.
             step: training step of the model.
             kept: arrays of the picture.

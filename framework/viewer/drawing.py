@@ -35,51 +35,50 @@ Truth = Callable[[View, Tensor, Tensor], "Tensor | None"]
 """Function from a view, its picture (H, W, 3) and the background (3,) to the true image; None if unknown."""
 
 
-def draw(subject: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None) -> Arrays:
+def draw(loaded: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None) -> Arrays:
     """Return the part of a piece of a view that the requested output needs.
 
     Args:
-        subject: the model and its run.
-        request: the request.
+        loaded: the model and its run.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
         truth: true images for the output `error`; where unknown, the rendered colours are returned.
     """
-    model = subject.model
+    model = loaded.model
     camera = request.camera(piece.stride, (piece.top, piece.bottom), ndc).to(model.device)
     crop = request.crop if ndc is None else None
     view = View(camera, request.time if model.scene.moving else None, piece.rays)
     background = model.background
     if request.background is not None:
         background = background.new_tensor(request.background)
-    with _appearance(subject, request.appearance), torch.no_grad():
+    with _appearance(loaded, request.appearance), torch.no_grad():
         if request.output == "rgb" and crop is None:
-            kept = rendered_outputs(model, view, background, [RGB], subject.unit)
+            kept = rendered_outputs(model, view, background, [RGB], loaded.unit)
         else:
             if crop is None:
                 picture = model.render_view(view, background)
             else:
                 picture = picture_within(model, view, crop, background)
-            kept = _kept(subject, request, view, picture, background, truth)
+            kept = _kept(loaded, request, view, picture, background, truth)
     wait_for(model.device)
     return kept
 
 
 def _kept(
-    subject: Loaded, request: Request, view: View, picture: Picture, background: Tensor, truth: Truth | None
+    loaded: Loaded, request: Request, view: View, picture: Picture, background: Tensor, truth: Truth | None
 ) -> Arrays:
     if request.output == FLAWS:
         found = None if truth is None else truth(view, picture.rgb, background)
-        return kept_outputs(picture, [RGB if found is None else ERROR], subject.unit, found)
-    known = {output.name: output for output in (*FIXED, *subject.model.outputs)} | {DEPTH: MEDIAN_DEPTH}
-    return kept_outputs(picture, [known.get(request.output, RGB)], subject.unit)
+        return kept_outputs(picture, [RGB if found is None else ERROR], loaded.unit, found)
+    known = {output.name: output for output in (*FIXED, *loaded.model.outputs)} | {DEPTH: MEDIAN_DEPTH}
+    return kept_outputs(picture, [known.get(request.output, RGB)], loaded.unit)
 
 
-def _appearance(subject: Loaded, image: int | None) -> AbstractContextManager[None]:
-    appearance = appearance_of(subject.model)
+def _appearance(loaded: Loaded, image: int | None) -> AbstractContextManager[None]:
+    appearance = appearance_of(loaded.model)
     if appearance is None or image is None or not 0 <= image < len(appearance.vectors):
         return nullcontext()
-    return shown_appearance(subject.model, appearance.vectors[image].detach())
+    return shown_appearance(loaded.model, appearance.vectors[image].detach())
 
 
 def number_kept(kept: Arrays) -> str | None:

@@ -14,11 +14,11 @@ from nerfloom.cameras.camera_path import CameraPath, Keyframe
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.alignment import nearest_rotations
 
-MOST_KEYFRAMES = 500
+MAX_KEYFRAMES = 500
 """Maximum number of cameras on a path."""
-MOST_FRAMES = 20_000
+MAX_FRAMES = 20_000
 """Maximum number of frames on a path."""
-LONGEST_NAME = 40
+MAX_NAME_LENGTH = 40
 """Maximum length of a path's name, characters."""
 
 
@@ -37,7 +37,7 @@ class Editor:
 
     def added(self, keyframe: Keyframe) -> Editor:
         """Return the path with a `keyframe` appended; unchanged if it is full."""
-        if len(self.keyframes) >= MOST_KEYFRAMES:
+        if len(self.keyframes) >= MAX_KEYFRAMES:
             return self
         return replace(self, keyframes=(*self.keyframes, keyframe))
 
@@ -64,7 +64,7 @@ class Editor:
         if count < 2:
             return None
         legs = count if self.closed else count - 1
-        frames = min(max(round(legs * self.seconds * self.fps), 2), MOST_FRAMES)
+        frames = min(max(round(legs * self.seconds * self.fps), 2), MAX_FRAMES)
         places = torch.linspace(0, legs, frames + self.closed, dtype=torch.float64)[:frames]
         known = [one.time for one in self.keyframes if one.time is not None]
         times = None
@@ -137,7 +137,7 @@ def path_file(folder: Path, name: object) -> Path:
         folder: the run's folder.
         name: name sent by a browser.
     """
-    kept = re.sub(r"[^A-Za-z0-9_-]", "", name)[:LONGEST_NAME] if isinstance(name, str) else ""
+    kept = re.sub(r"[^A-Za-z0-9_-]", "", name)[:MAX_NAME_LENGTH] if isinstance(name, str) else ""
     return folder / (f"camera_path-{kept}.json" if kept and kept != "camera_path" else "camera_path.json")
 
 

@@ -8,11 +8,11 @@ from torch import Tensor
 from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import SkipsCells
 
-MOST_CELLS = 40_000
+MAX_CELLS = 40_000
 """Maximum number of cells shown."""
 
 
-def shown_cells(model: Renderable, most: int = MOST_CELLS) -> tuple[Tensor, float] | None:
+def shown_cells(model: Renderable, most: int = MAX_CELLS) -> tuple[Tensor, float] | None:
     """Return the centres (N, 3) of occupied cells that have an empty neighbour, and the mean edge of a cell.
 
     Inner cells would not be visible. With nested boxes, the cells of the smallest box are shown. If there are more than

@@ -19,12 +19,12 @@ FIRST_PIXELS = 6_000
 """Number of pixels of the first picture, before any measurement."""
 KEPT_MEASUREMENTS = 16
 """Number of pictures used to estimate the speed."""
-KEEP = (0.5, 1.4)
+KEPT_STRIDE_COSTS = (0.5, 1.4)
 """A stride is kept while its picture takes at most the second value times the budget, and the next finer stride's
 picture at least the first value times the budget."""
-JUMP = 4
+MAX_RATIO = 4
 """Maximum ratio of the strides of consecutive passes."""
-LEAST_ROWS = 4
+MIN_ROWS = 4
 """Minimum number of rows of a piece."""
 Rays = Literal[1, 4, 9, 16]
 """Number of rays averaged per pixel."""
@@ -90,8 +90,8 @@ def coarse_stride(speed: Speed, width: int, height: int, budget: float, before: 
         return next((stride for stride in STRIDES if rays(stride) <= FIRST_PIXELS), STRIDES[-1])
     if before is not None:
         finer = [stride for stride in STRIDES if stride < before]
-        slow = speed.seconds(rays(before)) > KEEP[1] * budget
-        could_be_finer = bool(finer) and speed.seconds(rays(finer[-1])) < KEEP[0] * budget
+        slow = speed.seconds(rays(before)) > KEPT_STRIDE_COSTS[1] * budget
+        could_be_finer = bool(finer) and speed.seconds(rays(finer[-1])) < KEPT_STRIDE_COSTS[0] * budget
         if not slow and not could_be_finer:
             return before
     return next((stride for stride in STRIDES if speed.seconds(rays(stride)) <= budget), STRIDES[-1])
@@ -126,7 +126,8 @@ def refinement(speed: Speed, width: int, height: int, shown: int, rays: Rays, se
     pieces: list[Piece] = []
     stride = shown
     while stride > 1:
-        stride = 1 if stride <= JUMP or speed.seconds(width * height) <= 2 * seconds else max(stride // JUMP, 2)
+        last = stride <= MAX_RATIO or speed.seconds(width * height) <= 2 * seconds
+        stride = 1 if last else max(stride // MAX_RATIO, 2)
         pieces += _bands(speed, width, height, stride, 1, seconds)
     if shown == 1 or rays > 1:
         pieces += _bands(speed, width, height, 1, rays, seconds)
@@ -138,7 +139,7 @@ def _bands(speed: Speed, width: int, height: int, stride: int, rays: Rays, secon
     columns, rows = smaller(width, height, stride)
     each = rows
     if speed.measured:
-        each = min(max(int(speed.rays(seconds) / (columns * rays)), LEAST_ROWS), rows)
+        each = min(max(int(speed.rays(seconds) / (columns * rays)), MIN_ROWS), rows)
     count = -(-rows // each)
     edges = [round(index * rows / count) for index in range(count + 1)]
     bands = [Piece(stride, rays, top, bottom) for top, bottom in pairwise(edges)]

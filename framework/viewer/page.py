@@ -13,10 +13,10 @@ from nerfloom.base.console import say
 from nerfloom.cameras.poses import looked_at
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
-from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.panel import Panel
 from nerfloom.viewer.path_panel import PathPanel
 from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.reports import curve, heading
 
 if TYPE_CHECKING:
@@ -28,13 +28,13 @@ class Page:
 
     Args:
         server: the server.
-        studio: draws the pictures.
-        photographs: the training images.
+        queue: draws the pictures.
+        photos: the training images.
         may_render: whether a browser may start ns-render on its path.
     """
 
-    def __init__(self, server: viser.ViserServer, studio: Studio, photographs: Photographs, may_render: bool) -> None:
-        self._server, self._studio, self._photographs = server, studio, photographs
+    def __init__(self, server: viser.ViserServer, queue: RenderQueue, photos: Photographs, may_render: bool) -> None:
+        self._server, self._queue, self._photographs = server, queue, photos
         self._renders: list[subprocess.Popen[bytes]] | None = [] if may_render else None
         self._panels: dict[int, list[Any]] = {}
         self._curve: Any = None
@@ -53,36 +53,36 @@ class Page:
             client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
             client.flush()
 
-        number, studio = client.client_id, self._studio
+        number, queue = client.client_id, self._queue
         tabs = client.gui.add_tab_group()
         with tabs.add_tab("View"):
-            panel = Panel(client, studio)
-        studio.enter(number, Browser(show))
-        studio.ask(number, panel.request)
+            panel = Panel(client, queue)
+        queue.add(number, Browser(show))
+        queue.ask(number, panel.request)
         parts: list[Any] = []
         self._panels[number] = parts
-        if not studio.subject.model.scene.warped:
-            if studio.subject.source is not None:
+        if not queue.loaded.model.scene.warped:
+            if queue.loaded.source is not None:
                 with tabs.add_tab("Photographs"):
                     parts.append(CameraPanel(client, self._photographs))
             with tabs.add_tab("Path"):
-                parts.append(PathPanel(client, lambda: studio.subject, panel.request, self._renders))
+                parts.append(PathPanel(client, lambda: queue.loaded, panel.request, self._renders))
         if number not in self._server.get_clients():  # the browser left before it was set up
             self._farewell(client)
 
     def _farewell(self, client: viser.ClientHandle) -> None:
-        self._studio.leave(client.client_id)
+        self._queue.remove(client.client_id)
         for part in self._panels.pop(client.client_id, ()):
             part.close()
 
     def refresh(self) -> None:
         """Update the run's step, PSNR and learning curve."""
-        subject = self._studio.subject
-        content = heading(subject)
+        loaded = self._queue.loaded
+        content = heading(loaded)
         if content != self._heading.content:
             self._heading.content = content
-        if subject.is_run:
-            self.show_curve(*curve(subject.folder))
+        if loaded.is_run:
+            self.show_curve(*curve(loaded.folder))
 
     def show_curve(self, seconds: list[float], psnr: list[float]) -> None:
         """Show a learning curve.
@@ -104,7 +104,7 @@ class Page:
 
     def _place_camera(self) -> None:
         """Place the initial camera at the first training camera, with the same view direction."""
-        scene = self._studio.subject.model.scene
+        scene = self._queue.loaded.model.scene
         poses = scene.camera_to_worlds
         if poses is None or not len(poses) or scene.warped:
             center, size = scene.box.mean(0), float((scene.box[1] - scene.box[0]).norm())

@@ -9,10 +9,10 @@ import numpy as np
 
 from nerfloom.evaluation.appearance import appearance_of
 from nerfloom.viewer.crop import meaning
-from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.occupancy import shown_cells
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import (
-    FARTHEST,
+    MAX_COORDINATE,
     OUTPUTS,
     Crop,
     Request,
@@ -37,14 +37,14 @@ class Panel:
 
     Args:
         client: the browser.
-        studio: draws its pictures.
+        queue: draws its pictures.
     """
 
-    def __init__(self, client: viser.ClientHandle, studio: Studio) -> None:
-        self._client, self._studio = client, studio
-        scene = studio.subject.model.scene
-        declared = [output.name for output in studio.subject.model.outputs]
-        has_photographs = studio.subject.source is not None and not scene.warped
+    def __init__(self, client: viser.ClientHandle, queue: RenderQueue) -> None:
+        self._client, self._queue = client, queue
+        scene = queue.loaded.model.scene
+        declared = [output.name for output in queue.loaded.model.outputs]
+        has_photographs = queue.loaded.source is not None and not scene.warped
         self._outputs = [*OUTPUTS[:-1], *declared, *(OUTPUTS[-1:] if has_photographs else ())]
         gui = client.gui
         self._output = gui.add_dropdown("Output", self._outputs, initial_value="rgb")
@@ -59,7 +59,7 @@ class Panel:
         self._crop_values: list[Any] = []
         if not scene.warped:
             self._add_crop()
-        if shown_cells(studio.subject.model, 1) is not None:
+        if shown_cells(queue.loaded.model, 1) is not None:
             self._cells = gui.add_checkbox("Occupied cells", False, hint="Outer cells of the sampled region")
             self._cells.on_update(lambda _: self._show_cells())
         handles = [self._output, self._size, self._time, self._appearance, self._own_background, self._background]
@@ -69,7 +69,7 @@ class Panel:
         client.camera.on_update(self._moved)
 
     def _add_appearance(self) -> Any:
-        appearance = appearance_of(self._studio.subject.model)
+        appearance = appearance_of(self._queue.loaded.model)
         if appearance is None or not len(appearance.vectors):
             return None
         return self._client.gui.add_slider(
@@ -77,7 +77,7 @@ class Panel:
         )
 
     def _add_crop(self) -> None:
-        model, gui = self._studio.subject.model, self._client.gui
+        model, gui = self._queue.loaded.model, self._client.gui
         low, high = (tuple(corner) for corner in model.scene.box.cpu().tolist())
         step = float((model.scene.box[1] - model.scene.box[0]).max()) / 200
         with gui.add_folder("Crop", expand_by_default=False):
@@ -93,10 +93,10 @@ class Panel:
     # -- requests ---------------------------------------------------------------------------------------------
 
     def _changed(self, _: Any) -> None:
-        self._studio.ask(self._client.client_id, self.request)
+        self._queue.ask(self._client.client_id, self.request)
 
     async def _moved(self, _: Any) -> None:  # in the server's own thread, so that cameras stay in order
-        self._studio.ask(self._client.client_id, self.request)
+        self._queue.ask(self._client.client_id, self.request)
 
     def request(self, last: Request | None = None) -> Request | None:
         """Return the browser's current request; the `last` request if its camera is invalid."""
@@ -128,7 +128,7 @@ class Panel:
         first, second = corner_of(low, (-1, -1, -1)), corner_of(high, (1, 1, 1))
         if not all(a < b for a, b in zip(first, second, strict=True)):
             return None
-        begin, end = number_in(near, 0, FARTHEST, 0), number_in(far, 0, FARTHEST, FARTHEST)
+        begin, end = number_in(near, 0, MAX_COORDINATE, 0), number_in(far, 0, MAX_COORDINATE, MAX_COORDINATE)
         return Crop((first, second), begin, end if end > begin else math.inf)
 
     def time(self) -> float | None:
@@ -142,7 +142,7 @@ class Panel:
         if self._cells.value is not True:
             self._client.scene.remove_by_name(name)
             return
-        found = shown_cells(self._studio.subject.model)
+        found = shown_cells(self._queue.loaded.model)
         if found is not None and len(found[0]):
             points, edge = found
             low, high = points.amin(0), points.amax(0)

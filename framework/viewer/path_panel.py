@@ -19,7 +19,7 @@ from nerfloom.base.console import say
 from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.camera_panel import move_camera
-from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, listed, path_file
+from nerfloom.viewer.keyframes import MAX_KEYFRAMES, Editor, listed, path_file
 from nerfloom.viewer.request import Request, number_in
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 LINE = "/camera_path"
 """Name of the path in the scene."""
-PREVIEW_FPS = 20.0
+MAX_PREVIEW_FPS = 20.0
 """Maximum number of cameras per second in a preview."""
 NOTHING = "-"
 """Entry in the list of cameras while it is empty."""
@@ -38,7 +38,7 @@ class PathPanel:
 
     Args:
         client: the browser.
-        subject: function that returns the model and its run.
+        loaded: function that returns the model and its run.
         request: function that returns the browser's request; None if its camera is invalid.
         renders: processes that render paths, at most one at a time; None if rendering is not allowed.
     """
@@ -46,11 +46,11 @@ class PathPanel:
     def __init__(
         self,
         client: viser.ClientHandle,
-        subject: Callable[[], Loaded],
+        loaded: Callable[[], Loaded],
         request: Callable[[], Request | None],
         renders: list[subprocess.Popen[bytes]] | None,
     ) -> None:
-        self._client, self._subject, self._request, self._renders = client, subject, request, renders
+        self._client, self._loaded, self._request, self._renders = client, loaded, request, renders
         self._editor = Editor()
         self._playing = False
         gui = client.gui
@@ -86,12 +86,12 @@ class PathPanel:
 
     def _added(self, editor: Editor) -> Editor:
         keyframe = self._keyframe()
-        if keyframe is not None and len(editor.keyframes) == MOST_KEYFRAMES:
-            self._note.content = f"A path has at most {MOST_KEYFRAMES} cameras."
+        if keyframe is not None and len(editor.keyframes) == MAX_KEYFRAMES:
+            self._note.content = f"A path has at most {MAX_KEYFRAMES} cameras."
         return editor if keyframe is None else editor.added(keyframe)
 
     def _change(self, event: Any) -> None:
-        index = int(number_in(_or_zero(self._chosen.value), 0, MOST_KEYFRAMES, 0)) - 1
+        index = int(number_in(_or_zero(self._chosen.value), 0, MAX_KEYFRAMES, 0)) - 1
         if not 0 <= index < len(self._editor.keyframes):
             self._note.content = "Add a camera first."
             return
@@ -124,7 +124,7 @@ class PathPanel:
 
     def _path(self) -> CameraPath | None:
         width, height = (round(number_in(one.value, 16, 8192, 720)) for one in (self._width, self._height))
-        return self._editor.path(width, height, self._subject().placement)
+        return self._editor.path(width, height, self._loaded().placement)
 
     def _show(self, path: CameraPath | None) -> None:
         """Draw the path as a line in the scene."""
@@ -155,7 +155,7 @@ class PathPanel:
                 index = min(int(passed * path.fps), len(path) - 1)
                 move_camera(self._client, path.poses[index], math.radians(float(path.fovs[index])))
                 self._client.flush()
-                time.sleep(1 / min(PREVIEW_FPS, path.fps))
+                time.sleep(1 / min(MAX_PREVIEW_FPS, path.fps))
         finally:
             self._playing, self._preview.label = False, "Preview"
 
@@ -163,7 +163,7 @@ class PathPanel:
 
     def _save(self) -> Path | None:
         """Write the path beside the run or file, and return its file; None if that was not possible."""
-        path, folder = self._path(), self._subject().folder
+        path, folder = self._path(), self._loaded().folder
         if path is None:
             self._note.content = "A path needs two cameras."
             return None
@@ -173,7 +173,7 @@ class PathPanel:
         except OSError as error:
             self._note.content = f"Cannot write {file.name}: {error.strerror or error}"
             return None
-        words = map(shlex.quote, (str(self._subject().origin), "--camera-path-filename", str(file)))
+        words = map(shlex.quote, (str(self._loaded().origin), "--camera-path-filename", str(file)))
         command = f"ns-render camera-path {' '.join(words)}"
         say(f"viewer: saved {file}; render it with: {command} --output-path {video_suffix(file.stem)}")
         self._note.content = f"Saved {file.name}, {len(path)} frames."
@@ -190,7 +190,7 @@ class PathPanel:
             return
         output = file.with_name(video_suffix(file.stem))
         words = ["--camera-path-filename", file, "--output-path", output]
-        command = python_command("nerfloom.cli.render", "camera-path", self._subject().origin, *words)
+        command = python_command("nerfloom.cli.render", "camera-path", self._loaded().origin, *words)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
         self._renders[:] = [process]
         self._note.content = f"Rendering {output.name} ..."

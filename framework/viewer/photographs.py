@@ -25,11 +25,11 @@ from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose
 
-MOST = 200
+MAX_SHOWN = 200
 """Maximum number of cameras shown."""
 THUMBNAIL = 96
 """Longer side of a thumbnail, pixels."""
-SAME_PLACE, SAME_WAY = 1e-3, 0.02
+MAX_SHIFT, MAX_ANGLE = 1e-3, 0.02
 """Maximum distance, relative to the spread of the cameras, and angle in radians between a view and its photograph."""
 
 
@@ -44,7 +44,7 @@ class Photographs:
         self._run = run
         self._lock = threading.RLock()
         self._whole = lru_cache(maxsize=1)(self._read)
-        self._small = lru_cache(maxsize=4 * MOST)(self._thumbnail)
+        self._small = lru_cache(maxsize=4 * MAX_SHOWN)(self._thumbnail)
 
     @property
     def parsed(self) -> ParsedScene | None:
@@ -72,8 +72,8 @@ class Photographs:
         return self.cameras.ndc if isinstance(self.cameras, NdcCameras) else None
 
     def chosen(self) -> list[int]:
-        """Return the indices of the images whose cameras are shown, at most `MOST`, evenly spaced."""
-        return [] if self.cameras is None else spread(len(self.cameras), MOST)
+        """Return the indices of the images whose cameras are shown, at most `MAX_SHOWN`, evenly spaced."""
+        return [] if self.cameras is None else spread(len(self.cameras), MAX_SHOWN)
 
     def name(self, index: int) -> str:
         """Return the file name of image `index`."""
@@ -123,7 +123,7 @@ class Photographs:
         distances = (given[:, :, 3] - here[:, 3]).norm(dim=-1)
         size = float((given[:, :, 3] - given[:, :, 3].mean(0)).norm(dim=-1).max()) or 1.0
         ahead = (given[:, :, 2] * here[:, 2]).sum(-1)
-        close = (distances <= SAME_PLACE * size) & (ahead >= math.cos(SAME_WAY))
+        close = (distances <= MAX_SHIFT * size) & (ahead >= math.cos(MAX_ANGLE))
         return int(torch.where(close, distances, torch.inf).argmin()) if bool(close.any()) else None
 
     def truth(self, view: View, rgb: Tensor, background: Tensor) -> Tensor | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from nerfloom.training.loaded import Loaded
 
-LARGEST_REPORT = 2**24
+MAX_REPORT = 2**24
 """Maximum size of a report, bytes."""
 
 
@@ -49,7 +49,7 @@ def curve(folder: Path) -> tuple[list[float], list[float]]:
 
 def _read(path: Path) -> Any:
     try:
-        if path.stat().st_size > LARGEST_REPORT:
+        if path.stat().st_size > MAX_REPORT:
             return None
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):

@@ -13,11 +13,11 @@ from torch import Tensor
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
 
-FARTHEST = 1e6
+MAX_COORDINATE = 1e6
 """Maximum coordinate of a camera, scene units."""
-ANGLES = (0.5, 170.0)
+FIELDS_OF_VIEW = (0.5, 170.0)
 """Range of the vertical field of view, degrees."""
-LARGEST_SIDE, SMALLEST_SIDE = 4096, 8
+MAX_SIDE, MIN_SIDE = 4096, 8
 """Range of the width and height of a picture, pixels."""
 OUTPUTS = ("rgb", "depth", "accumulation", "error")
 """Outputs available for every method; a method may declare others."""
@@ -117,7 +117,7 @@ def pose_of(wxyz: Any, position: Any, fov: Any) -> Pose | None:
     if quaternion is None or place is None or angle is None:
         return None
     length = math.hypot(*quaternion)
-    if not 1e-6 < length < 1e6 or max(map(abs, place)) > FARTHEST:
+    if not 1e-6 < length < 1e6 or max(map(abs, place)) > MAX_COORDINATE:
         return None
     w, x, y, z = (value / length for value in quaternion)
     rotation = (
@@ -128,7 +128,7 @@ def pose_of(wxyz: Any, position: Any, fov: Any) -> Pose | None:
     matrix = [
         number for (right, down, ahead), t in zip(rotation, place, strict=True) for number in (right, -down, -ahead, t)
     ]
-    least, most = map(math.radians, ANGLES)
+    least, most = map(math.radians, FIELDS_OF_VIEW)
     return Pose(tuple(matrix), min(max(angle[0], least), most))
 
 
@@ -165,8 +165,8 @@ def size_of(width: Any, height: Any, longest: int) -> tuple[int, int]:
     """
     numbers = _numbers([width, height], 2)
     w, h = (4.0, 3.0) if numbers is None or min(numbers) < 1 or max(numbers) > 1e5 else numbers
-    factor = min(longest, max(w, h) if numbers is not None else longest, LARGEST_SIDE) / max(w, h)
-    return max(round(w * factor), SMALLEST_SIDE), max(round(h * factor), SMALLEST_SIDE)
+    factor = min(longest, max(w, h) if numbers is not None else longest, MAX_SIDE) / max(w, h)
+    return max(round(w * factor), MIN_SIDE), max(round(h * factor), MIN_SIDE)
 
 
 def number_in(value: Any, least: float, most: float, default: float) -> float:
@@ -210,7 +210,7 @@ def corner_of(value: Any, default: Sequence[float]) -> tuple[float, float, float
         default: three coordinates.
     """
     found = _numbers(value, 3)
-    x, y, z = default if found is None else (min(max(part, -FARTHEST), FARTHEST) for part in found)
+    x, y, z = default if found is None else (min(max(part, -MAX_COORDINATE), MAX_COORDINATE) for part in found)
     return x, y, z
 
 

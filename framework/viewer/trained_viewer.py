@@ -9,11 +9,11 @@ from pathlib import Path
 from nerfloom.base.console import say
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.server import close_server, open_server
-from nerfloom.viewer.viewed import newer_checkpoint, reloaded
 
 SECONDS_PER_LOOK = 2.0
 """Seconds between checks for a newer checkpoint."""
@@ -33,36 +33,36 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
         KeyboardInterrupt: on Ctrl-C, after the server has stopped.
     """
     photographs = Photographs(loaded.source)
-    studio = Studio(loaded, ndc=_ndc(loaded.model.scene.warped, photographs), truth=photographs.truth)
+    queue = RenderQueue(loaded, ndc=_ndc(loaded.model.scene.warped, photographs), truth=photographs.truth)
     server = open_server(host, port, "nerfloom")
-    page = Page(server, studio, photographs, may_render=follow)
+    page = Page(server, queue, photographs, may_render=follow)
     say("Ctrl-C ends it")
     seen, looked = loaded.checkpoint, time.monotonic()
     try:
         while True:
-            if studio.work() is None:
-                studio.wait(0.05 if not studio.is_empty else SECONDS_PER_LOOK)
+            if queue.draw_next() is None:
+                queue.wait(0.05 if not queue.is_empty else SECONDS_PER_LOOK)
             if time.monotonic() - looked >= SECONDS_PER_LOOK:
                 looked = time.monotonic()
-                seen = _follow(studio, page, seen) if follow else seen
+                seen = _follow(queue, page, seen) if follow else seen
     finally:
         page.close()
         close_server(server)
 
 
-def _follow(studio: Studio, page: Page, seen: Path) -> Path:
+def _follow(queue: RenderQueue, page: Page, seen: Path) -> Path:
     """Show the newest checkpoint, if it is new, and return the newest one that was seen."""
-    folder = studio.subject.folder
+    folder = queue.loaded.folder
     newer = newer_checkpoint(folder, seen)
     if newer is None:
         page.refresh()
         return seen
-    found = reloaded(studio.subject, newer)
+    found = reloaded(queue.loaded, newer)
     if isinstance(found, str):
         if os.path.exists(newer):  # it may have been replaced by a newer one meanwhile
             say(f"viewer: {found}")
     else:
-        studio.subject = found
+        queue.loaded = found
         page.refresh()
     return newer
 

@@ -19,16 +19,16 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.training.progress import StepReport
 from nerfloom.training.run import Run
 from nerfloom.training.trainer import BetweenSteps, Trainer
-from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.pace import Share
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.server import close_server, open_server
 
 if TYPE_CHECKING:
     import viser
 
-PIECE = 0.04
+PIECE_SECONDS = 0.04
 """Time limit for a picture, or a piece of it, between two steps, seconds."""
 SECONDS_PER_REPORT = 0.5
 """Seconds between updates of the numbers in the panel."""
@@ -41,12 +41,12 @@ class Turns:
 
     Args:
         trainer: the run's trainer.
-        studio: draws the pictures.
+        queue: draws the pictures.
         share: fraction of the time for pictures.
     """
 
-    def __init__(self, trainer: Trainer, studio: Studio, share: float) -> None:
-        self._trainer, self._studio, self._share = trainer, studio, Share(share)
+    def __init__(self, trainer: Trainer, queue: RenderQueue, share: float) -> None:
+        self._trainer, self._queue, self._share = trainer, queue, Share(share)
         self._ended = time.perf_counter()
         self.paused = False
         self.waited = 0.0
@@ -59,18 +59,18 @@ class Turns:
             stopped: signals received so far; any signal ends a pause.
         """
         start = time.perf_counter()
-        if self._studio.is_empty and not self.paused:  # no browsers
+        if self._queue.is_empty and not self.paused:  # no browsers
             self._ended = start
             return
         self._share = self._share.earned(start - self._ended)
-        self._studio.subject = replace(self._studio.subject, step=self._trainer.state.step)
-        self._studio.hurried = True
-        while self._share.credit > 0 and (seconds := self._studio.work()) is not None:
+        self._queue.loaded = replace(self._queue.loaded, step=self._trainer.state.step)
+        self._queue.hurried = True
+        while self._share.credit > 0 and (seconds := self._queue.draw_next()) is not None:
             self._share = self._share.spent(seconds)
         while self.paused and not stopped:
-            self._studio.hurried = False
-            if self._studio.work() is None:
-                self._studio.wait(PAUSE)
+            self._queue.hurried = False
+            if self._queue.draw_next() is None:
+                self._queue.wait(PAUSE)
         self._ended = time.perf_counter()
         self.waited += self._ended - start
 
@@ -120,7 +120,6 @@ def in_training(run: Run, trainer: Trainer) -> Loaded:
     """Return a run in training, at its present step, as something to look at.
 
     Args:
-        run: the run.
         trainer: its trainer.
     """
     placement, checkpoints = trainer.train_set.placement, run.folder / FOLDER
@@ -132,7 +131,6 @@ def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     """Serve a run in training to browsers, within a `with` block.
 
     Args:
-        run: the run.
         trainer: the run's trainer.
 
     Yields:
@@ -144,14 +142,14 @@ def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     config, cameras = trainer.config, trainer.train_set.cameras
     photographs = Photographs(run)
     ndc = cameras.ndc if isinstance(cameras, NdcCameras) else None
-    studio = Studio(in_training(run, trainer), PIECE, PIECE, ndc, photographs.truth)
-    turns = Turns(trainer, studio, config.viewer_share)
+    queue = RenderQueue(in_training(run, trainer), PIECE_SECONDS, PIECE_SECONDS, ndc, photographs.truth)
+    turns = Turns(trainer, queue, config.viewer_share)
     server = open_server(config.viewer.websocket_host, config.viewer.websocket_port, "nerfloom")
-    page = Page(server, studio, photographs, may_render=False)
+    page = Page(server, queue, photographs, may_render=False)
     status = Status(server, page, trainer, turns)
 
     def between_steps(report: StepReport, stopped: Sequence[int]) -> None:
-        if not studio.is_empty:
+        if not queue.is_empty:
             status.show(report)
         turns.take(report, stopped)
 

@@ -70,8 +70,8 @@ def test_parts_for_which_too_little_time_is_left_are_left_out_and_named(capsys: 
     parts = [part("kernels", 0, 30), part("training", 80, 80), part("graphs", 70, 5), part("more", 66, 1)]
     in_time(parts, 100.0, lambda found: kept.append(copy.deepcopy(found)), lambda: now[0])
     assert given == {"kernels": 100.0, "graphs": 70.0}
-    assert kept[0] == {"kernels": 30, "left out for want of time": []}
-    assert kept[-1] == {"kernels": 30, "graphs": 5, "left out for want of time": ["training", "more"]}
+    assert kept[0] == {"kernels": 30, "left out, too little time": []}
+    assert kept[-1] == {"kernels": 30, "graphs": 5, "left out, too little time": ["training", "more"]}
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(";")[0] for line in lines if ";" in line] == ["left out: training", "left out: more"]
 

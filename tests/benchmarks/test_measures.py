@@ -28,13 +28,13 @@ def test_a_curve_meets_the_target_between_its_points() -> None:
 
 
 def test_means_over_seeds_with_the_spread_of_a_run() -> None:
-    row = ablation.summary("name", [(10.0, 30.0), (20.0, 32.0)])
+    row = ablation.summary([(10.0, 30.0), (20.0, 32.0)])
     assert row["seconds to the target"] == 15.0
     assert row["test PSNR, dB"] == 31.0
     assert row["standard deviation of a run, dB"] == pytest.approx(math.sqrt(2), abs=1e-3)
-    missed = ablation.summary("name", [(10.0, 30.0), (None, 32.0)])
+    missed = ablation.summary([(10.0, 30.0), (None, 32.0)])
     assert missed["seconds to the target"] is None  # a mean over those that met it would flatter the variant
-    assert ablation.summary("name", [(10.0, 30.0)])["standard deviation of a run, dB"] is None
+    assert ablation.summary([(10.0, 30.0)])["standard deviation of a run, dB"] is None
 
 
 def test_the_fair_share_is_that_of_threads_over_cores() -> None:

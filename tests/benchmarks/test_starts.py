@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import starts
+from benchmarks import ablation, starts
 from nerfloom.base.errors import NerfloomError
 
 
@@ -15,7 +15,7 @@ def test_a_refused_start_is_a_row_and_its_message(monkeypatch: pytest.MonkeyPatc
             raise NerfloomError("a process of the benchmark failed: error: --start points: the data has no points")
         return (10.0 + seed, 30.0 + 2 * seed)
 
-    monkeypatch.setattr(starts, "train", train)
+    monkeypatch.setattr(ablation, "train", train)
     rows = {row["start"]: row for row in starts.measure(Path("data"), 5.0, 2, 30.0)["rows"]}
     assert set(rows) == set(starts.STARTS)
     assert "has no points" in rows["points of a reconstruction"]["refused"]
@@ -27,6 +27,6 @@ def test_a_run_that_fails_ends_the_benchmark(monkeypatch: pytest.MonkeyPatch) ->
     def train(*_: object) -> object:
         raise NerfloomError("a process of the benchmark failed: Killed")
 
-    monkeypatch.setattr(starts, "train", train)
+    monkeypatch.setattr(ablation, "train", train)
     with pytest.raises(NerfloomError, match="Killed"):
         starts.measure(Path("data"), 5.0, 1, 30.0)

@@ -97,7 +97,7 @@ def test_what_is_said(name: str, words: list[str], line: str) -> None:
         (
             "ns-render",
             ["orbit", "x", "--output-path", "y.gif", "--num-frames", 0],
-            "--num-frames and --downscale-factor must be at least 1, --fps more than 0 and at most 1000",
+            "--num-frames is 0; it must be at least 1",
         ),
         (
             "ns-process-data",

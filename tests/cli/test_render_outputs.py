@@ -309,9 +309,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     assert "name at least one output, and each once" in said("orbit", nowhere, names, "rgb", "rgb")
     assert "add depth to --rendered-output-names" in said("orbit", nowhere, "--depth-format", "npy")
     assert "needs a folder" in said("orbit", nowhere, names, "depth", "--depth-format", "npy")
-    assert "near must be at least 0, below far" in said(
-        "orbit", nowhere, "--depth-near-plane", 3, "--depth-far-plane", 2
-    )
+    assert "near must be from 0 to far" in said("orbit", nowhere, "--depth-near-plane", 3, "--depth-far-plane", 2)
     assert "--fps more than 0" in said("orbit", nowhere, "--fps", 0)
     assert "--radius is -1; it must be above zero" in said("spiral", nowhere, "--radius", -1)
     avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi", status=2)

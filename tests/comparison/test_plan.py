@@ -9,7 +9,7 @@ import pytest
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.compare import CompareFlags, plan_of
-from nerfloom.comparison.crops import VIEWS
+from nerfloom.comparison.crops import MAX_VIEWS
 from nerfloom.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
@@ -141,4 +141,4 @@ def test_without_curve_images_nothing_is_evaluated_during_training(tmp_path: Pat
 
 def test_only_the_pictures_that_a_report_shows_are_written(tmp_path: Path) -> None:
     command = Job(Contender.of("kplanes"), 42, tmp_path).eval_command(CONDITIONS)
-    assert command[command.index("--max-pictures") + 1] == str(VIEWS)
+    assert command[command.index("--max-pictures") + 1] == str(MAX_VIEWS)

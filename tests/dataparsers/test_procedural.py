@@ -13,7 +13,7 @@ import torch
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.procedural import Procedural
-from nerfloom.dataparsers.procedural.many import REACH, random_parts, scene_numbers, write_scenes
+from nerfloom.dataparsers.procedural.random_scenes import MAX_REACH, random_parts, scene_numbers, write_scenes
 from nerfloom.dataparsers.procedural.scene import LIGHT, PARTS, inside, trace, trace_rows
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
 from nerfloom.evaluation.evaluator import views_to_judge
@@ -161,7 +161,7 @@ def test_random_solids_fit_into_the_box_and_differ_between_scenes() -> None:
     assert {len(parts) for parts in found} == {2, 3, 4, 5}
     solids = [part for parts in found for part in parts.values()]
     assert {type(part.shape).__name__ for part in solids} == {"Sphere", "Box"}
-    assert max(math.hypot(*part.centre) + part.shape.bound for part in solids) <= REACH
+    assert max(math.hypot(*part.centre) + part.shape.bound for part in solids) <= MAX_REACH
     centres = torch.tensor([part.centre for part in solids])
     assert len(centres.unique(dim=0)) == len(centres)
     assert centres.mean(0).abs().max() < 0.1

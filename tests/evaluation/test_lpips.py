@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.evaluation.lpips import SHAPES, SMALLEST_OF_LPIPS, load_lpips, read_weights
+from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, SHAPES, load_lpips, read_weights
 
 Arrays = dict[str, np.ndarray]
 CPU = torch.device("cpu")
@@ -63,7 +63,7 @@ def images(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("size", [(SMALLEST_OF_LPIPS, 47), (64, 64)])
+@pytest.mark.parametrize("size", [(MIN_SIDE_OF_LPIPS, 47), (64, 64)])
 def test_lpips_is_the_papers(size: tuple[int, int], arrays: Arrays, weights: Path) -> None:
     image, target = images(*size)
     measure, note = load_lpips(weights, CPU)

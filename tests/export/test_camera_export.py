@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.json_files import read_object
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.parsed_scene import DataParser, ParsedScene
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap, read_images
 from nerfloom.dataparsers.colmap_model import read_model
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.dataparsers.reading import read_json, read_pose
+from nerfloom.dataparsers.reading import read_pose
 from nerfloom.export.cameras import PosedFiles, all_cameras, orthonormal, posed_files
 from nerfloom.export.colmap_text import images_folder, quaternion, write_model
 from nerfloom.export.transforms import transforms, write_transforms
@@ -37,7 +38,7 @@ def exported(parser: DataParser, data: Path) -> tuple[PosedFiles, dict[str, Pars
 
 def given_poses(file: Path) -> dict[str, Tensor]:
     """Name of each image of a transforms file -> its pose as it stands there, float64."""
-    frames = read_json(file)["frames"]
+    frames = read_object(file)["frames"]
     return {Path(row["file_path"]).stem: read_pose(row, "frame", torch.float64)[:3] for row in frames}
 
 

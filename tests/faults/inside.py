@@ -10,13 +10,13 @@ from itertools import count, cycle
 import numpy as np
 
 from nerfloom.cli.train import main
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 
 INJECTED = "injected"
 DAY = 86_400.0
 READS = 2
 """Of the thread that reads pixels ahead, before it dies."""
-LARGEST_FILE = 20_000
+MAX_FILE = 20_000
 """Bytes. A checkpoint needs more, and nothing else does."""
 
 
@@ -36,7 +36,7 @@ def full_disk() -> None:
     import resource
 
     sys.dont_write_bytecode = True  # Python may keep half of a compiled file, which ends every later import of it
-    resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE, MAX_FILE))
     say_so()
 
 

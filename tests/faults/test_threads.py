@@ -11,7 +11,7 @@ import pytest
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.pixels.batch import draw_pixels
 from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.pixels.stream import FIRST_STEPS, PixelStream
 from nerfloom.training.checkpoint import load_checkpoint
 from tests.images import write_noise

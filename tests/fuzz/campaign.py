@@ -15,7 +15,7 @@ from tests.fuzz.outcome import Outcome
 from tests.fuzz.worker import Task
 
 ROOT = Path(__file__).parents[2]
-MOST_DEATHS = 50
+MAX_DEATHS = 50
 """After which it is given up: something else is wrong."""
 
 
@@ -44,7 +44,7 @@ def run(
     task = Task(module, list(readers), str(base), str(report), first_seed, 0, stop, seconds, patience, memory)
     (base / "temporary").mkdir(parents=True, exist_ok=True)
     report.unlink(missing_ok=True)
-    for _ in range(MOST_DEATHS):
+    for _ in range(MAX_DEATHS):
         code, said = _work(task, base)
         outcomes, unfinished, ended = read_report(report)
         if ended:
@@ -59,7 +59,7 @@ def run(
         task = replace(task, start=unfinished["index"] + 1, seconds=left)
         if task.start == task.stop or (left is not None and left <= 0):
             return outcomes
-    raise RuntimeError(f"{MOST_DEATHS} inputs killed the worker, the last: {outcomes[-1]}")
+    raise RuntimeError(f"{MAX_DEATHS} inputs killed the worker, the last: {outcomes[-1]}")
 
 
 def names(module: str = "tests.fuzz.readers") -> list[str]:

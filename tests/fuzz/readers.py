@@ -17,13 +17,13 @@ import torch
 
 from nerfloom import DataParser, Dataset
 from nerfloom.base.config import from_plain, read_yaml
-from nerfloom.cameras.camera_path import MOST_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
+from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
 from nerfloom.data.pixels.cache import PixelMemory, pack, unpack
-from nerfloom.data.pixels.mapped import MappedPixels
+from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap
@@ -40,7 +40,7 @@ from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
 from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.look import LEAST_BLUR, MOST_BLUR, Look
+from nerfloom.splats.look import MAX_BLUR, MIN_BLUR, Look
 from nerfloom.training.checkpoint import FOLDER, load_checkpoint, load_newest
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder, read_run
@@ -165,7 +165,7 @@ def write_splats(folder: Path) -> None:
 def read_splats(folder: Path, scratch: Path) -> None:
     for file in sorted(folder.glob("splat*")):
         gaussians, look = read_gaussians(file)
-        require(LEAST_BLUR <= look.blur <= MOST_BLUR, "Gaussians that are drawn as none can be")
+        require(MIN_BLUR <= look.blur <= MAX_BLUR, "Gaussians that are drawn as none can be")
         require(len(gaussians), "no Gaussians")
         require(bool(gaussians.finite().all()), "Gaussians that are nowhere")
         require(bool(gaussians.log_scales.exp().isfinite().all()), "Gaussians without end")
@@ -184,7 +184,7 @@ def write_path(folder: Path) -> None:
 
 def read_path(folder: Path, scratch: Path) -> None:
     path = read_camera_path(folder / "camera_path.json")
-    require(1 <= len(path) <= MOST_FRAMES and 0 < path.fps < math.inf, "a video of no length")
+    require(1 <= len(path) <= MAX_FRAMES and 0 < path.fps < math.inf, "a video of no length")
     other = Placement(torch.eye(4, dtype=torch.float64)[:3], 2.0)
     for cameras in (path.cameras(), path.placed(other).cameras()):
         check_cameras(cameras, 0.1, 10.0)

@@ -18,8 +18,8 @@ from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.rasteriser import Projected, Rasteriser
 from nerfloom.splats.table import as_rows
+from nerfloom.testing.method_under_test import Learner
 from nerfloom.testing.scenes import RISE, moving_ball
-from nerfloom.testing.trial_run import Learner
 from nerfloom.viewer.crop import picture_within
 from nerfloom.viewer.request import Crop
 from tests.interfaces.methods.drift import Drift

@@ -16,7 +16,7 @@ from nerfloom.cli.render import main as render
 from nerfloom.data.pixels.batch import composite
 from nerfloom.training import load as loading
 from nerfloom.viewer.browser import Browser
-from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Pose, Request
 from tests.interfaces.conftest import HERE
 from tests.interfaces.renderables.beside import Beside
@@ -98,12 +98,12 @@ def test_it_is_rendered_by_the_command(
 @pytest.mark.medium
 def test_it_is_viewed(both: nerfloom.Loaded) -> None:
     """The finished picture of a browser is the one that is rendered."""
-    pictures, studio = list[np.ndarray](), Studio(both)
+    pictures, queue = list[np.ndarray](), RenderQueue(both)
     pose = Pose((1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0), 0.7)
     request = Request(pose, 40, 30)
-    studio.enter(1, Browser(lambda image, quality: pictures.append(image)))
-    studio.ask(1, lambda _: request)
-    while studio.work() is not None or studio._browsers[1].pieces:
+    queue.add(1, Browser(lambda image, quality: pictures.append(image)))
+    queue.ask(1, lambda _: request)
+    while queue.draw_next() is not None or queue._browsers[1].pieces:
         time.sleep(0.02)
     view = View(request.camera(), rays_per_pixel=both.model.rays_per_pixel)  # of both halves
     expected = both.render(view).rgb.clamp(0, 1)

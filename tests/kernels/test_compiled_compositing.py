@@ -10,9 +10,9 @@ from nerfloom.kernels.compositing.density import (
     composite,
     composite_reference,
     distortion,
-    distortion_by_pairs,
 )
 from tests.kernels.compiled import needs_kernels, relative_error
+from tests.kernels.distortion_by_pairs import distortion_by_pairs
 from tests.kernels.test_compositing import ragged
 
 COUNTS = [0, 1, 5, 0, 40, 7, 300, 0]

@@ -36,7 +36,7 @@ from nerfloom.kernels.histograms.spacing import SPACED
 from nerfloom.kernels.histograms.step_functions import BLURRED_EXCESS
 from nerfloom.kernels.images.silhouettes import HOLD_BALLS, OPAQUE_SUMS, PIXELS_NEAR_BALLS, Photograph, opaque_sums
 from nerfloom.kernels.images.ssim import PHOTOMETRIC, SIMILARITY
-from nerfloom.kernels.march.first_shared import CELLS, FIRST_SHARED, LEVELS
+from nerfloom.kernels.march.first_covisible import CELLS, FIRST_COVISIBLE, LEVELS
 from nerfloom.kernels.march.fixed_slots import FILL, REACH, fill
 from nerfloom.kernels.march.occupancy import REFRESH_OCCUPANCY, Occupancy
 from nerfloom.kernels.march.ray_order import SORT_BY_RAY
@@ -104,7 +104,7 @@ def grid_density() -> GridDensity:
     return GridDensity(1 / size, -BOX[0] / size, table, GRID, None, weights)
 
 
-def unshared() -> Tensor:
+def excluded() -> Tensor:
     return torch.cat([torch.rand(LEVELS * CELLS**3) < 0.8, torch.tensor([False])])
 
 
@@ -166,7 +166,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     INTERVAL_WEIGHTS: lambda: (rand(6, 9), edges(6, 9)),
     RESAMPLE: lambda: (edges(6, 9), rand(6, 9), torch.rand(6), 5, 0.7, 0.01),
     SPACED: lambda: (torch.rand(6, 9), torch.rand(6), 3 + rand(6), 0.9),
-    FIRST_SHARED: lambda: (rays(), BOX, unshared()),
+    FIRST_COVISIBLE: lambda: (rays(), BOX, excluded()),
     PROPOSAL_WEIGHTS: lambda: (rays(), edges(100, 9), grid_density()),
     PROPOSAL_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10),
     BLURRED_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10, 0.03),

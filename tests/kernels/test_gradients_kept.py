@@ -18,7 +18,7 @@ from nerfloom.fields.base import Field
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points
 from nerfloom.geometry.rays import Rays, Samples
-from nerfloom.kernels.compositing.density import composite, composite_reference, distortion, distortion_by_pairs
+from nerfloom.kernels.compositing.density import composite, composite_reference, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
@@ -49,6 +49,7 @@ from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
+from tests.kernels.distortion_by_pairs import distortion_by_pairs
 
 pytestmark = needs_kernels
 GRID = HashGridLayout.build(3, 4, 20, 8)
@@ -358,7 +359,7 @@ COLORS = torch.randint(256, (9, 4), generator=torch.Generator().manual_seed(0)).
 WITHOUT_A_GRADIENT = {
     "pack_occupancy", "refresh_occupancy", "march_begin", "march_wave", "march_advance",  # refused, as tested below
     "trace_rays", "trace_take",  # whose values the operations are given that have the gradient (test_trace.py)
-    "spaced_distances", "first_shared",  # of what has no gradient
+    "spaced_distances", "first_covisible",  # of what has no gradient
     "proposal_weights",  # likewise (test_proposals.py)
     "traced_error", "traced_error_take",  # compared in test_traced_error.py
     "traced_colors",  # for pictures alone, and refused where a gradient is asked for

@@ -45,7 +45,7 @@ MUTANTS = {
             "colours are stored premultiplied, and multiplied by alpha once more",
             "test_dataset.py::test_palette_images_keep_their_transparency"),
     ],
-    "nerfloom.data.light": [
+    "nerfloom.data.light_spread": [
         Mutant("light-of-transparent", "light_of", "A == 255", "A >= 0",
             "what is transparent decides what light there was",
             "test_appearance.py::test_it_looks_at_opaque_and_kept_pixels_only"),
@@ -119,8 +119,8 @@ MUTANTS = {
             "Gaussians start at points that held-out images alone know",
             "test_tracks.py::test_what_is_known_without_held_out_images"),
     ],
-    "nerfloom.data.travel": [
-        Mutant("travel-of-the-slower", "Travel.of", "torch.maximum", "torch.minimum",
+    "nerfloom.data.motion_bound": [
+        Mutant("travel-of-the-slower", "MotionBound.of", "torch.maximum", "torch.minimum",
             "what starts or stops is carved away there",
             "test_moving_hulls.py::test_distances_add_up_speeds_and_the_larger_of_two_counts"),
     ],
@@ -277,7 +277,7 @@ MUTANTS = {
             "what a mask hides is carved away", "test_masks.py::test_what_is_ignored_is_not_taken_for_empty"),
     ],
     "nerfloom.scene.speed": [
-        Mutant("speed-never-raised", "travel_of", "A < enough", "A < 0",
+        Mutant("speed-never-raised", "motion_bound", "A < enough", "A < 0",
             "what is fast is carved away for good: hands, a thrown ball",
             "test_silhouettes.py::test_of_a_moving_scene_all_that_is_ever_seen_stays"),
     ],
@@ -306,7 +306,7 @@ MUTANTS = {
             "downloads/test_unpack.py::test_paths_that_lead_elsewhere_are_refused"),
         Mutant("archive-with-links", "_files", "A not in (0, stat.S_IFREG, stat.S_IFDIR)", "A in (stat.S_IFIFO,)",
             "links in an archive are taken for files", "downloads/test_unpack.py::test_links_and_devices_are_refused"),
-        Mutant("archive-without-end", "_check_sizes", "A > MAX_EXPANSION * size + ALLOWANCE", "A < 0",
+        Mutant("archive-without-end", "_check_sizes", "A > MAX_EXPANSION * size + MIN_ALLOWANCE", "A < 0",
             "a small archive fills the disk",
             "downloads/test_unpack.py::test_a_bomb_is_refused"),
     ],

@@ -79,7 +79,7 @@ MUTANTS = {
         Mutant("se3-order", "PoseRefinement.forward", "A + B", "A - B",
             "poses are refined away from what is exported as refined",
             "test_pose_refinement.py::test_a_screw_turns_about_the_scenes_origin"),
-        Mutant("held-out-not-carried", "PoseRefinement.forward", "self.carried(A)", "A",
+        Mutant("held-out-not-carried", "PoseRefinement.forward", "self.propagated(A)", "A",
             "held-out cameras stay where they were while the learnt scene has drifted",
             "test_pose_refinement.py::test_held_out_cameras_follow_when_all_poses_drift_together"),
     ],
@@ -167,8 +167,8 @@ MUTANTS = {
             "of a box that is not around the origin, space is contracted around the wrong place",
             "kernels/test_intervals.py::test_contraction"),
     ],
-    "nerfloom.kernels.march.first_shared": [
-        Mutant("first-shared-whole-steps", "_compiled", "PARTS", "1",
+    "nerfloom.kernels.march.first_covisible": [
+        Mutant("first-covisible-whole-steps", "_compiled", "PARTS", "1",
             "rays of captures start up to a step behind what images do show",
             "kernels/test_dispatch.py::test_an_implementation_computes_what_its_reference_does"),
     ],

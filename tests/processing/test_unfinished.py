@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from nerfloom.base.errors import DataError, FlagError
-from nerfloom.processing.estimate import about
 from nerfloom.processing.matching import choose_matching
 from nerfloom.processing.output import begin, claim
 from nerfloom.processing.retrieval import similar_pairs
@@ -74,8 +73,3 @@ def test_loops_are_looked_for_away_from_neighbours() -> None:
     assert {abs(j - i) for i, j in similar_pairs(descriptors, 2)} <= {0, 1, 19, 20, 21, 39}
     assert {(i, i + 20) for i in range(20)} <= set(similar_pairs(descriptors, 1, apart=5))
     assert min(j - i for i, j in similar_pairs(descriptors, 5, apart=5)) > 5
-
-
-@pytest.mark.parametrize(("seconds", "text"), [(4.2, "4 s"), (99, "99 s"), (130, "2 min"), (7500, "2 h 05 min")])
-def test_times_for_people(seconds: float, text: str) -> None:
-    assert about(seconds) == f"about {text}"

@@ -12,8 +12,8 @@ from nerfloom.data.image_files import read_image
 from nerfloom.processing.colmap import Model
 from nerfloom.processing.database import PAIR_BASE
 from nerfloom.processing.unfolding import folded_pairs, unfold
-from nerfloom.scene.folds import folds, thumbnail
-from tests.test_folds import walk
+from nerfloom.scene.folded_poses import folded_neighbours, thumbnail
+from tests.test_folded_poses import walk
 
 COUNT = 60
 
@@ -105,7 +105,7 @@ def test_a_can_whose_label_repeats_is_unfolded(
     names = [Path(frame["file_path"]).name for frame in frames]
     ahead = -np.array([frame["transform_matrix"] for frame in frames])[:, :3, 2]
     seen = np.stack([thumbnail(read_image(output / frame["file_path"])) for frame in frames])
-    assert folds(names, ahead, seen) == []
+    assert folded_neighbours(names, ahead, seen) == []
     level = ahead[np.argsort(names)][:, :2]
     around = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))
     assert len(frames) >= 68

@@ -14,9 +14,9 @@ from tests.release.problem import Problem
 from tests.release.sources import ROOT, version
 
 PACKAGES = ("framework", "methods", "dataparsers")
-LARGEST_WHEEL = 6_000_000
+MAX_WHEEL = 6_000_000
 """Bytes. The kernels of five instruction sets are most of it."""
-LARGEST_SDIST = 3_000_000
+MAX_SDIST = 3_000_000
 """Bytes."""
 DATA = (".png", ".jpg", ".jpeg", ".gif", ".exr", ".mp4", ".npy", ".npz", ".ply", ".spz", ".ckpt", ".pt", ".zip")
 """Suffixes of pictures, data and checkpoints, none of which belongs into a distribution."""
@@ -57,7 +57,7 @@ def check_wheel(wheel: Path) -> str:
     if not re.fullmatch(rf"nerfloom-{re.escape(version())}-py3-none-(?!any)\w+\.whl", wheel.name):
         raise Problem(f"{wheel.name} is not for any Python on one platform")
     check_declared(metadata)
-    check_size(wheel, LARGEST_WHEEL)
+    check_size(wheel, MAX_WHEEL)
     built = ", ".join(sorted(kinds))
     return f"wheel: {len(names)} files, {wheel.stat().st_size / 1e6:.2f} MB, kernels {built}; no data, licence included"
 
@@ -88,7 +88,7 @@ def check_sdist(sdist: Path) -> str:
     unwanted = [name for name in names if name.startswith(("tests/", "docs/")) or name.lower().endswith(suffixes)]
     if unwanted:
         raise Problem(f"the sdist holds {', '.join(unwanted[:5])} ({len(unwanted)} files), which do not belong into it")
-    check_size(sdist, LARGEST_SDIST)
+    check_size(sdist, MAX_SDIST)
     return f"sdist: {len(names)} files, {sdist.stat().st_size / 1e6:.2f} MB; no tests, no data, no libraries"
 
 

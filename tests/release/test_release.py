@@ -128,7 +128,7 @@ def test_sdists_that_are_not(change: dict[str, str], said: str, tmp_path: Path) 
 
 
 def test_one_that_has_grown_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(archives, "LARGEST_WHEEL", 10)
+    monkeypatch.setattr(archives, "MAX_WHEEL", 10)
     with pytest.raises(Problem, match="10 at most are expected"):
         check_wheel(write_wheel(tmp_path))
 

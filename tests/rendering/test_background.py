@@ -32,8 +32,8 @@ from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.proposal import ProposalSampler
 from nerfloom.samplers.uniform import UniformSampler
 from nerfloom.testing import check_method
+from nerfloom.testing.method_under_test import Learner
 from nerfloom.testing.scenes import ball_in_a_box, ball_under_a_sky
-from nerfloom.testing.trial_run import Learner
 from tests.training.helpers import TINY
 
 SPHERE = torch.tensor([0.2, -0.1, 0.0, 1.5]).double()

@@ -105,7 +105,7 @@ def test_a_picture_is_the_same_with_rays_through_every_pixel(
     config, _ = method.decided(dataclasses.replace(method.config, eval_num_rays_per_chunk=5000), scene)
     model = RayModel(config, scene, Cloud(), sampler(), VolumeRenderer())
     model.register_parameter("any", torch.nn.Parameter(torch.zeros(1)))  # by which a model knows its device
-    monkeypatch.setattr("nerfloom.samplers.in_view.LEAST", 1)
+    monkeypatch.setattr("nerfloom.samplers.in_view.MIN_PIXELS", 1)
     view, cast = View(camera((4.0, 1.0, 0.5)), rays_per_pixel=per_pixel, stride=stride), []  # type: ignore[arg-type]
     render = RayModel.render
     background = torch.tensor([1.0, 0.0, 1.0])

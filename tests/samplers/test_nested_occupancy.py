@@ -17,7 +17,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.compositing.density import composite
 from nerfloom.kernels.march.occupancy import own_cells
 from nerfloom.samplers.choice import SamplingConfig, contracted_box, make_sampler
-from nerfloom.samplers.occupancy import FARTHEST, WARM_UP_STEPS, OccupancySampler
+from nerfloom.samplers.occupancy import ENDLESS_FAR, WARM_UP_STEPS, OccupancySampler
 from nerfloom.scene.seen_cells import seen_cells
 from nerfloom.training.checkpoint import load_newest
 from nerfloom.training.trainer import Trainer
@@ -79,7 +79,7 @@ def test_fog_at_all_distances_is_the_closed_form(jitter: bool) -> None:
     torch.testing.assert_close(out.opacity, torch.ones(100), rtol=0, atol=1e-6)
     torch.testing.assert_close(out.color, torch.full((100, 3), expected), rtol=0, atol=0.02)
     last = samples.offsets[1:] - 1
-    assert bool((samples.t_ends[last] == FARTHEST).all())
+    assert bool((samples.t_ends[last] == ENDLESS_FAR).all())
     assert bool((samples.t[last] > 500).all())
     inner = samples.ranks[1:] > 0
     inner[last - 1] = False  # the last starts where the box ends, and the step before may not

@@ -13,7 +13,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import VolumeRenderer
-from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, interlevel_loss
+from nerfloom.samplers.proposal import ENDLESS_FAR, ProposalSampler, interlevel_loss
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
@@ -188,7 +188,7 @@ def test_the_gaussian_of_an_endless_interval_is_that_of_its_beginning() -> None:
     sampler = ProposalSampler(BOX, (16, 8, 4), unbounded=True, endless=True, fields=[Wall(0.3, 1e9)])
     samples = sampler.sample(cones_along_x(5), field, False)
     (points,) = field.asked
-    assert bool((samples.padded(samples.t_ends)[:, -1] == FARTHEST).all())
+    assert bool((samples.padded(samples.t_ends)[:, -1] == ENDLESS_FAR).all())
     assert float(points.positions.abs().max()) < 1001
     assert samples.sigma is not None
     assert samples.sigma.requires_grad

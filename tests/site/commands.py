@@ -55,17 +55,11 @@ class Checker:
             "nerfloom.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
             "benchmarks.__main__.trained_run": lambda path, *_: path,
             **{f"nerfloom.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
-            **{
-                f"{module}.check_data": lambda path: None
-                for module in (
-                    "benchmarks.__main__",
-                    *(f"nerfloom.cli.{name}" for name in ("bench", "compare", "stress")),
-                )
-            },
+            **{f"nerfloom.cli.{name}.check_data": lambda path: None for name in ("bench_results", "compare", "stress")},
             "nerfloom.cli.session.start": begin,
             "nerfloom.cli.session.resume": begin,
             "nerfloom.training.load.load": begin,
-            "nerfloom.cli.process_data._process": begin,
+            "nerfloom.cli.process_data._check_input": begin,
             "nerfloom.cli.compare.compare": begin,
             "nerfloom.cli.stress.stress": stress,
             "nerfloom.downloads.install.announce": begin,

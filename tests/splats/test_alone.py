@@ -17,12 +17,12 @@ from nerfloom.cli import render as render_command
 from nerfloom.evaluation.paths import around
 from nerfloom.export.web import gaussians_of
 from nerfloom.kernels.splats.project import DC
-from nerfloom.splats.alone import HALF_WITHIN, placed_alone
 from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.placement import HALF_WITHIN, placed_gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.viewer.browser import Browser
-from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import called
 from tests.conftest import Refused
@@ -61,7 +61,7 @@ def orbit(file: Path, name: str, *flags: object) -> np.ndarray:
 
 def test_half_of_them_are_near_the_middle_and_the_rest_does_not_count() -> None:
     given = ball()
-    placement, scene = placed_alone(given)
+    placement, scene = placed_gaussians(given)
     placed = placement.points(given.means)
     assert float(placed.norm(dim=-1).median()) == pytest.approx(HALF_WITHIN, rel=1e-3)
     assert scene.has_alpha
@@ -69,23 +69,23 @@ def test_half_of_them_are_near_the_middle_and_the_rest_does_not_count() -> None:
     stray = given[torch.arange(300)].map(torch.clone)
     stray.means[:20] += 1e4
     stray.means[20] = math.nan
-    placement, scene = placed_alone(stray)
+    placement, scene = placed_gaussians(stray)
     assert float(placement.points(stray.means[21:]).norm(dim=-1).median()) == pytest.approx(HALF_WITHIN, rel=0.1)
     assert scene.unbounded
     with pytest.raises(DataError, match="no Gaussians whose numbers are finite"):
-        placed_alone(given.map(lambda values: torch.full_like(values, math.nan)))
+        placed_gaussians(given.map(lambda values: torch.full_like(values, math.nan)))
 
 
 @pytest.mark.parametrize(("up", "axis"), [("z", (0, 0, 1)), ("-y", (0, -1, 0)), ("x", (1, 0, 0)), ("-z", (0, 0, -1))])
 def test_up_is_up(up: str, axis: tuple[float, float, float]) -> None:
-    placement, _ = placed_alone(ball(), up)  # type: ignore[arg-type]
+    placement, _ = placed_gaussians(ball(), up)  # type: ignore[arg-type]
     turned = placement.transform[:, :3] @ torch.tensor(axis, dtype=torch.float64)
     torch.testing.assert_close(turned, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     assert float(torch.linalg.det(placement.transform[:, :3])) == pytest.approx(1)
 
 
 def test_cameras_go_around() -> None:
-    _, scene = placed_alone(ball())
+    _, scene = placed_gaussians(ball())
     cameras = around(scene, 6)
     assert len(cameras) == 6
     centers, ahead = cameras.camera_to_worlds[:, :, 3], -cameras.camera_to_worlds[:, :, 2]
@@ -142,11 +142,11 @@ def test_it_is_loaded_and_looked_at_in_python_and_in_the_viewer(file: Path) -> N
     assert float(picture.median_depth[400, 400]) == pytest.approx(from_outside, abs=0.1)
     with pytest.raises(ConfigError, match="its photographs are unknown: give --data DIR"):
         found.views("test")
-    pictures, studio = list[np.ndarray](), Studio(found)
+    pictures, queue = list[np.ndarray](), RenderQueue(found)
     request = Request(Pose(tuple(camera.camera_to_worlds[0].flatten().tolist()), math.radians(50)), 80, 80)
-    studio.enter(1, Browser(lambda image, quality: pictures.append(image)))
-    studio.ask(1, lambda _: request)
-    while studio.work() is not None or studio._browsers[1].pieces:
+    queue.add(1, Browser(lambda image, quality: pictures.append(image)))
+    queue.ask(1, lambda _: request)
+    while queue.draw_next() is not None or queue._browsers[1].pieces:
         pass
     expected = found.render(request.camera()).rgb.clamp(0, 1)
     np.testing.assert_allclose(pictures[-1] / 255, expected.cpu().numpy(), atol=0.01)

@@ -11,9 +11,9 @@ from nerfloom.kernels.splats.project import RECORD, Record
 from nerfloom.splats.density_control import (
     CHILDREN,
     GRADIENT,
-    LARGE,
+    MAX_CLONED_SIZE,
+    MAX_DEAD_OPACITY,
     SHRUNK,
-    TRANSPARENT,
     grown,
     image_gradients,
 )
@@ -29,7 +29,7 @@ def row(count: int) -> Gaussians:
     """Opaque Gaussians, small enough to be cloned, of which each can be told by its centre."""
     torch.manual_seed(0)
     one = torch.ones(count)
-    sizes = torch.full((count, 3), 0.5 * LARGE * EXTENT).log()
+    sizes = torch.full((count, 3), 0.5 * MAX_CLONED_SIZE * EXTENT).log()
     return Gaussians(
         torch.arange(count)[:, None] * torch.tensor([1.0, 0, 0]), sizes, torch.randn(count, 4), 2 * one,
         torch.randn(count, 3), torch.randn(count, 3, 3),
@@ -38,7 +38,7 @@ def row(count: int) -> Gaussians:
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
     given = row(5)
-    given.log_scales[3, 1] = math.log(1.5 * LARGE * EXTENT)
+    given.log_scales[3, 1] = math.log(1.5 * MAX_CLONED_SIZE * EXTENT)
     gradients = torch.tensor([0.0, 2.0, 0.5, 2.0, 0.0]) * GRADIENT
     change = grown(given, gradients, 100, EXTENT)
     assert change is not None
@@ -50,7 +50,7 @@ def test_small_ones_are_cloned_and_large_ones_split() -> None:
     torch.testing.assert_close(children.log_scales.exp() * SHRUNK, given[[3, 3]].log_scales.exp())
     away = (children.means - given.means[3]).norm(dim=-1)
     assert (away > 0).all()
-    assert (away < 6 * 1.5 * LARGE * EXTENT).all()
+    assert (away < 6 * 1.5 * MAX_CLONED_SIZE * EXTENT).all()
 
 
 def test_children_are_spread_as_their_parent_is() -> None:
@@ -81,7 +81,7 @@ def test_the_most_wanting_come_first_where_there_is_little_room() -> None:
 
 def test_transparent_ones_and_those_that_are_not_finite_are_dropped() -> None:
     given = row(4)
-    given.logits[1] = math.log(0.5 * TRANSPARENT)
+    given.logits[1] = math.log(0.5 * MAX_DEAD_OPACITY)
     given.means[2, 0] = float("nan")
     change = grown(given, torch.full((4,), 2 * GRADIENT), 2, EXTENT)
     assert change is not None

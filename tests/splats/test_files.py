@@ -21,8 +21,8 @@ from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussian_limit import colour_error, fitted_ply, fitted_spz, visibility
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
-from nerfloom.splats.ply import SURE, ply_size, property_names, write_ply
-from nerfloom.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits, write_spz
+from nerfloom.splats.ply import MAX_LOGIT, ply_size, property_names, write_ply
+from nerfloom.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits
 from nerfloom.splats.transform import quaternion, quaternion_product, rotated_harmonics, transformed
 from tests.conftest import Refused
 
@@ -182,7 +182,7 @@ def test_what_cannot_be_rendered_is_left_out_and_counted(tmp_path: Path, capsys:
     read = gaussians_in(tmp_path / "a.ply")
     assert "4 of 9 Gaussians" in capsys.readouterr().err
     assert torch.equal(read.means, gaussians.means[4:])
-    assert read.logits[:2].tolist() == [SURE, -SURE]
+    assert read.logits[:2].tolist() == [MAX_LOGIT, -MAX_LOGIT]
     gaussians.means[:] = math.nan
     write_ply(tmp_path / "a.ply", gaussians)
     with pytest.raises(DataError, match="none of its 9 Gaussians is finite"):
@@ -306,7 +306,7 @@ def test_written_rotations_are_off_by_a_degree_at_most(tmp_path: Path) -> None:
     """Sizes of an integer number of steps, so that orientation alone is rounded."""
     gaussians = some(20_000, 0)
     gaussians.log_scales[:] = torch.tensor([-6.0, -4.0, -2.0])
-    write_spz(tmp_path / "a.spz", gaussians)
+    (tmp_path / "a.spz").write_bytes(encoded(gaussians))
     read = gaussians_in(tmp_path / "a.spz")
     assert float(read.rotations[:, 0].min()) > 0.84
     order = read.log_scales.argsort(-1)
@@ -358,7 +358,7 @@ def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
 def test_opacities_of_0_and_1_stay_finite(tmp_path: Path) -> None:
     gaussians = some(2, 0)
     gaussians.logits[:] = torch.tensor([100.0, -100.0])
-    write_spz(tmp_path / "a.spz", gaussians)
+    (tmp_path / "a.spz").write_bytes(encoded(gaussians))
     assert gaussians_in(tmp_path / "a.spz").logits.sigmoid().tolist() == pytest.approx([1019 / 1020, 1 / 1020])
 
 

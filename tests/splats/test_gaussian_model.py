@@ -10,7 +10,7 @@ from nerfloom import Dataset, GaussianModel, Loss, Method, Scene, ViewBatch
 from nerfloom.base.pace import Pace
 from nerfloom.splats.density_control import DensityControl
 from nerfloom.splats.drawing import splat_camera
-from nerfloom.splats.learning import FEWEST_STEPS, MOST_MOVES, MOST_STEPS, steps_per_move
+from nerfloom.splats.learning import MAX_MOVES, MAX_STEPS, MIN_STEPS, steps_per_move
 from nerfloom.splats.mcmc import Mcmc
 from nerfloom.splats.settings import SplattingConfig, decide_splatting
 from nerfloom.splats.start import first_points, from_points, seen_colors
@@ -48,19 +48,19 @@ def test_a_start_and_a_loss_are_a_method(strategy: str) -> None:
 def test_there_are_enough_changes_to_reach_the_maximum() -> None:
     for changes in (DensityControl.changes_per_doubling, Mcmc.changes_per_doubling):
         once = steps_per_move(300.0, 30_000, 60_000, changes)
-        assert once == pytest.approx(300 / min(changes, MOST_MOVES), abs=1)
-        assert 300 / steps_per_move(300.0, 100, 60_000, changes) == pytest.approx(300 / FEWEST_STEPS)
-        assert steps_per_move(1_000.0, 100, 60_000, changes) == 1_000 // MOST_MOVES
-    assert steps_per_move(500.0, 60_000, 60_000, DensityControl.changes_per_doubling) == MOST_STEPS
-    assert steps_per_move(0.0, 10, 60_000, DensityControl.changes_per_doubling) == FEWEST_STEPS
+        assert once == pytest.approx(300 / min(changes, MAX_MOVES), abs=1)
+        assert 300 / steps_per_move(300.0, 100, 60_000, changes) == pytest.approx(300 / MIN_STEPS)
+        assert steps_per_move(1_000.0, 100, 60_000, changes) == 1_000 // MAX_MOVES
+    assert steps_per_move(500.0, 60_000, 60_000, DensityControl.changes_per_doubling) == MAX_STEPS
+    assert steps_per_move(0.0, 10, 60_000, DensityControl.changes_per_doubling) == MIN_STEPS
 
 
-@pytest.mark.parametrize(("given", "expected"), [({}, FEWEST_STEPS), ({"steps_per_move": 40}, 40)])
+@pytest.mark.parametrize(("given", "expected"), [({}, MIN_STEPS), ({"steps_per_move": 40}, 40)])
 def test_a_slow_run_changes_the_number_more_often(given: dict[str, Any], expected: int) -> None:
     """A second a step leaves 50 steps: far too few for changes each 100 steps, whatever was expected."""
     config, _ = decide_splatting(SplattingConfig(max_seconds=60.0, start_gaussians=100, **given), SCENE)
     model = Plain(config, SCENE)
-    assert model.steps_per_move == given.get("steps_per_move", MOST_STEPS)
+    assert model.steps_per_move == given.get("steps_per_move", MAX_STEPS)
     for step in range(4):
         model.keep_pace(Pace(step, float(step), 60.0))
         model.before_step(step, step / 60)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.mcmc import DEAD, MOST_COPIES, moved, shaken, shared
+from nerfloom.splats.mcmc import DEAD, MAX_COPIES, moved, shaken, shared
 
 
 def some(count: int, logits: Tensor | None = None) -> Gaussians:
@@ -35,7 +35,7 @@ def test_copies_at_one_place_look_like_the_one(alpha: float, count: int) -> None
 def test_many_copies_in_float32_stay_as_in_float64() -> None:
     """The sum over binomials alternates, so that float32 would keep one or two digits of it."""
     logits = torch.linspace(-4, 16, 40)
-    counts = torch.full((40,), MOST_COPIES)
+    counts = torch.full((40,), MAX_COPIES)
     single = shared(logits, torch.zeros(40, 3), counts)
     double = shared(logits.double(), torch.zeros(40, 3, dtype=torch.float64), counts)
     torch.testing.assert_close(single[0].double(), double[0], atol=1e-3, rtol=1e-4)

@@ -5,7 +5,7 @@ import torch
 
 from nerfloom.base.pace import Pace
 from nerfloom.splats.resolution import (
-    LEAST_SIDE,
+    MIN_SIDE,
     REDUCED_SHARE,
     ImageSizes,
     enlarged,
@@ -54,8 +54,8 @@ def test_each_size_has_as_much_time_as_all_smaller_ones() -> None:
 def test_images_are_not_halved_to_a_stamp() -> None:
     for side in (50, 299, 301, 601, 1201, 5000):
         most = most_octaves(side**2)
-        assert most == 1 or side / 2**most >= LEAST_SIDE
-        assert side / 2 ** (most + 1) < LEAST_SIDE
+        assert most == 1 or side / 2**most >= MIN_SIDE
+        assert side / 2 ** (most + 1) < MIN_SIDE
 
 
 def test_fewer_steps_at_full_size_leave_more_time_for_small_ones() -> None:

@@ -141,7 +141,7 @@ def test_other_cameras_follow_the_training_cameras() -> None:
     generator_matrix[:3] = torch.cat([cross_matrix(motion[3:]), motion[:3, None]], dim=1)
     other = camera().camera_to_worlds[0]
     expected = torch.linalg.matrix_exp(generator_matrix)[:3] @ torch.cat([other, torch.tensor([[0.0, 0, 0, 1]])])
-    torch.testing.assert_close(model.poses.carried_pose(other), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(model.poses.propagated_pose(other), expected, atol=1e-5, rtol=0)
 
 
 def test_known_depths_pull_gaussians_there() -> None:

@@ -17,7 +17,7 @@ from nerfloom.kernels.grids.downweighting import level_weights
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.multisampled_grid import multisampled_grid
 from nerfloom.kernels.grids.multisamples import unit_multisamples
-from nerfloom.samplers.proposal import FARTHEST
+from nerfloom.samplers.proposal import ENDLESS_FAR
 from tests.stress.backends import backends
 from tests.stress.test_cones import assert_like, drawn_in_frustum, two_rays
 
@@ -126,7 +126,7 @@ def test_far_gaussians_keep_their_precision_in_float32() -> None:
     """A cone's last interval: from 1,000 to 10^10, a standard deviation of 10^9 along, which contracts to 10^-10."""
     axes = directions(40)
     rays = Rays(0.3 * directions(40).roll(1, 0), axes, pixel_radii=torch.full((40,), 1e-3, dtype=F64))
-    samples = Samples.regular(torch.full((40, 1), 1e3, dtype=F64), torch.full((40, 1), FARTHEST, dtype=F64))
+    samples = Samples.regular(torch.full((40, 1), 1e3, dtype=F64), torch.full((40, 1), ENDLESS_FAR, dtype=F64))
     outcome = []
     for dtype in (torch.float32, F64):
         some = Rays(

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from nerfloom.data.light import QUANTILES, light_of
+from nerfloom.data.light_spread import QUANTILES, light_of
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.evaluation.images import to_uint8
 from nerfloom.fields.encoded import EncodedField
@@ -141,7 +141,7 @@ def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 @pytest.mark.entry(15)
 def test_the_only_srgb_curve_has_no_gradient_and_a_value_at_black() -> None:
     """Colours are as stored; numpy's curve looks at photographs alone. Another one needs a test of its slope at 0."""
-    assert mentioned(r"\*\* *2\.4\b") == ["light.py"]
+    assert mentioned(r"\*\* *2\.4\b") == ["light_spread.py"]
     black = light_of(np.zeros((16, 16, 3), np.uint8))
     assert black.tolist() == [[-9.0] * len(QUANTILES), [0.0] * len(QUANTILES), [0.0] * len(QUANTILES)]
 

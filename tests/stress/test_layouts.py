@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing.density import distortion, distortion_by_pairs
+from nerfloom.kernels.compositing.density import distortion
 from nerfloom.kernels.encodings.frequency import frequency_encoding
 from tests.kernels.compiled import relative_error
+from tests.kernels.distortion_by_pairs import distortion_by_pairs
 from tests.stress.backends import FEW, backends
 from tests.stress.test_encodings import ANY_SHAPE, ROWS
 

@@ -19,7 +19,7 @@ from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.evaluation.lpips import load_lpips
 from nerfloom.evaluation.metrics import MAX_PSNR, psnr, ssim
 from nerfloom.geometry.rays import Histogram, Samples
-from nerfloom.kernels.compositing.density import distortion, distortion_by_pairs
+from nerfloom.kernels.compositing.density import distortion
 from nerfloom.kernels.grids.plane_bands import squared_steps, variation
 from nerfloom.kernels.grids.planes_layout import PlanesLayout
 from nerfloom.losses.functions import depth_error, mean_squared_error
@@ -27,6 +27,7 @@ from nerfloom.methods.kplanes import METHOD, KPlanes, KPlanesConfig, PlaneRegula
 from nerfloom.samplers.proposal import interlevel_loss
 from tests.images import parsed
 from tests.kernels.compiled import relative_error
+from tests.kernels.distortion_by_pairs import distortion_by_pairs
 from tests.stress.backends import FEW, backends
 
 # -- distortion ---------------------------------------------------------------------------------------------------

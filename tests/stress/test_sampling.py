@@ -17,7 +17,7 @@ from nerfloom.kernels.histograms.spacing import spacing
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch
 from nerfloom.rendering.volume import VolumeRenderer
-from nerfloom.samplers.proposal import FARTHEST, ProposalSampler, half_edge, interlevel_loss
+from nerfloom.samplers.proposal import ENDLESS_FAR, ProposalSampler, half_edge, interlevel_loss
 from tests.kernels.test_march import walk
 from tests.stress.backends import COMPILED, FEW, backends
 
@@ -195,7 +195,7 @@ def test_proposals_from_zero_to_infinity(backend: str, unbounded: bool, jitter: 
     assert bool((ends >= starts).all())
     assert bool((points.diff(dim=-1) >= 0).all())
     if endless:
-        assert bool((ends[:, -1] == FARTHEST).all())
+        assert bool((ends[:, -1] == ENDLESS_FAR).all())
     loss = interlevel_loss(samples, found.weights)
     loss.backward()
     assert math.isfinite(loss.item())

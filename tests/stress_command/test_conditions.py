@@ -14,7 +14,7 @@ from nerfloom.data.sources import make_source
 from nerfloom.registry import load_method
 from nerfloom.stress.conditions import CONDITIONS, PLAIN, Condition, select
 from nerfloom.stress.scenes import ball_views
-from nerfloom.stress.trial import MOST_RAYS, MOST_SAMPLES, Budget, StressedSource, shortened
+from nerfloom.stress.trial import MAX_RAYS, MAX_SAMPLES, Budget, StressedSource, shortened
 from nerfloom.training.run import Run, create_folder
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import tiny_run
@@ -90,9 +90,9 @@ def test_short_runs_take_small_steps() -> None:
         loaded = load_method(method)
         config = shortened(loaded.config, Budget(7, 1.5), loaded, BALL.train.scene)
         assert (config.max_num_iterations, config.max_seconds, config.vis) == (7, 1.5, "none")
-        assert config.num_rays_per_batch == MOST_RAYS
+        assert config.num_rays_per_batch == MAX_RAYS
         assert config.learning_rate == (5e-4 if method == "vanilla-nerf" else 0.02)  # in 1.5 s
-        assert config.samples_per_batch == (None if method == "vanilla-nerf" else MOST_SAMPLES)
+        assert config.samples_per_batch == (None if method == "vanilla-nerf" else MAX_SAMPLES)
 
 
 def stressed(run: Run, condition: Condition) -> Trainer:

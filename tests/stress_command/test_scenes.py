@@ -15,10 +15,10 @@ from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.stress.scenes import (
+    BALL_SHARE,
     FIELD_OF_VIEW,
     NUM_TEST,
     NUM_TRAIN,
-    SHARE,
     SIZE,
     Views,
     as_decoded,
@@ -97,7 +97,7 @@ def test_the_ball_takes_its_share_of_a_picture(field_of_view: float) -> None:
     for dataset in both(views_of(field_of_view)):
         assert dataset.scene.has_alpha
         alpha = dataset.pixels[:, 3].double().mean() / 255
-        assert float(alpha) == pytest.approx(math.pi / 4 * SHARE**2, abs=5e-3)
+        assert float(alpha) == pytest.approx(math.pi / 4 * BALL_SHARE**2, abs=5e-3)
 
 
 @pytest.mark.parametrize(("field_of_view", "distance"), LOOKS[:3])

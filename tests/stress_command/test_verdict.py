@@ -5,10 +5,10 @@ import math
 import pytest
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.stress.conditions import ALLOWED, PLAIN, Condition
+from nerfloom.stress.conditions import MAX_LOSS, PLAIN, Condition
 from nerfloom.stress.faults import spoiled_pixel
 from nerfloom.stress.trial import Trial, in_a_line
-from nerfloom.stress.verdict import LEAST_LEARNT, Outcome, verdict_of
+from nerfloom.stress.verdict import MIN_LEARNT, Outcome, verdict_of
 
 HARD = Condition("hard", "anything")
 EXPLAINED = Condition("explained", "anything", reason="who could do better")
@@ -22,12 +22,12 @@ BROKEN = "RuntimeError: it broke"
     ("condition", "trial", "outcome", "lost", "why"),
     [
         (PLAIN, Trial(30.0, 300), "pass", 0.0, None),
-        (PLAIN, Trial(30.0, 300, learnt=LEAST_LEARNT), "pass", 0.0, None),
+        (PLAIN, Trial(30.0, 300, learnt=MIN_LEARNT), "pass", 0.0, None),
         (PLAIN, Trial(30.0, 300, learnt=1.0), "degraded", 0.0, "only 1.0 dB better than empty images"),
         (HARD, Trial(30.0, 300, learnt=0.0), "pass", 0.0, None),
         (HARD, Trial(29.0, 300), "pass", 1.0, None),
         (HARD, Trial(41.0, 300), "pass", -11.0, None),
-        (HARD, Trial(30.0 - ALLOWED - 0.1, 300), "degraded", ALLOWED + 0.1, "unexpected: at most 2 dB"),
+        (HARD, Trial(30.0 - MAX_LOSS - 0.1, 300), "degraded", MAX_LOSS + 0.1, "unexpected: at most 2 dB"),
         (EXPLAINED, Trial(12.0, 300), "degraded", 18.0, "who could do better"),
         (EXPLAINED, Trial(29.5, 300), "pass", 0.5, None),
         (HARD, Trial(30.0, 300, skipped=7), "degraded", 0.0, "7 of 300 steps were not finite"),

@@ -7,7 +7,7 @@ import pytest
 
 from nerfloom.base.config import RayConfig
 from nerfloom.base.pace import Pace
-from nerfloom.training.batch_size import BATCH_CHANGES, LARGEST_BATCH, SMALLEST_BATCH, BatchSize
+from nerfloom.training.batch_size import BATCH_CHANGES, MAX_BATCH, MIN_BATCH, BatchSize
 
 CONFIG = RayConfig(num_rays_per_batch=2_048)
 
@@ -33,14 +33,14 @@ def steps(config: RayConfig, budget: float, fixed: float, each: float, slower: f
 @pytest.mark.parametrize("each", [3e-5, 1e-3])
 def test_there_are_as_many_steps_as_rays_in_one(each: float) -> None:
     rays = steps(CONFIG, 60.0, 0.005, each)
-    assert rays[0] == SMALLEST_BATCH  # as it is not known how long a step takes
+    assert rays[0] == MIN_BATCH  # as it is not known how long a step takes
     usual = rays[len(rays) // 2]
     assert len(rays) / usual == pytest.approx(CONFIG.steps_per_ray, rel=0.1)
 
 
 def test_a_quick_machine_has_all_rays_and_a_very_slow_one_a_few() -> None:
     assert steps(CONFIG, 60.0, 1e-4, 1e-6)[-1] == 2_048
-    assert steps(CONFIG, 60.0, 0.1, 0.05)[-1] == SMALLEST_BATCH
+    assert steps(CONFIG, 60.0, 0.1, 0.05)[-1] == MIN_BATCH
     assert set(steps(dataclasses.replace(CONFIG, num_rays_per_batch=16), 60.0, 0.1, 0.05)) == {16}
 
 
@@ -58,15 +58,15 @@ def test_times_are_read_where_the_device_is_waited_for() -> None:
     for step in range(60):  # nine steps return at once, the tenth waits for all: 0.01 s each
         sizes.keep_pace(Pace(step, step // 10 * 0.1, 60.0, steps_per_read=10))
         sizes.rays(None, math.nan)
-    assert sizes.rays(None, math.nan) > 2 * SMALLEST_BATCH
+    assert sizes.rays(None, math.nan) > 2 * MIN_BATCH
 
 
 def test_samples_decide_where_they_are_given() -> None:
     sizes = BatchSize(CONFIG, recorded=False)
     sizes.keep_pace(Pace(0, 0.0, 60.0))
     assert sizes.rays(2**15, 32.0) == 1_024
-    assert sizes.rays(2**15, 1e9) == SMALLEST_BATCH
-    assert sizes.rays(2**30, 0.0) == LARGEST_BATCH
+    assert sizes.rays(2**15, 1e9) == MIN_BATCH
+    assert sizes.rays(2**30, 0.0) == MAX_BATCH
 
 
 def test_recorded_steps_keep_their_size_for_small_changes() -> None:

@@ -17,9 +17,9 @@ from nerfloom.evaluation.metrics import psnr
 from nerfloom.registry import load_method, registered
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.curve import (
-    FEW,
-    MARGIN,
-    SHARE,
+    MAX_IMAGES,
+    MAX_TIME_SHARE,
+    PLANNED_SHARE,
     FewImages,
     Point,
     in_order,
@@ -68,7 +68,7 @@ def test_every_run_has_a_curve_at_its_price(
     spent = sum(point.evaluation_seconds or 0.0 for point in points)
     print(f"{len(points)} points, stride {points[-1].pixel_stride}, {spent / now:.1%} of {seconds:g} s")
     assert len(points) >= 4
-    assert spent <= SHARE * now
+    assert spent <= MAX_TIME_SHARE * now
     assert len(points) <= 60
     assert len({point.pixel_stride for point in points[1:]}) == 1
     assert points[-1].seconds > 0.8 * seconds
@@ -76,8 +76,8 @@ def test_every_run_has_a_curve_at_its_price(
 
 @pytest.mark.medium
 def test_looks_change_no_bit(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nerfloom.training.curve.SHARE", math.inf)
-    monkeypatch.setattr("nerfloom.training.curve.SPACING", 0.0)
+    monkeypatch.setattr("nerfloom.training.curve.MAX_TIME_SHARE", math.inf)
+    monkeypatch.setattr("nerfloom.training.curve.MIN_SPACING", 0.0)
     blind = tiny_trainer("nerfacto", shared_tiny, tmp_path / "blind", max_num_iterations=8)
     seeing = tiny_trainer("nerfacto", shared_tiny, tmp_path / "seeing", True, max_num_iterations=8)
     blind.train()
@@ -166,7 +166,7 @@ def test_a_look_comes_when_it_is_time_and_when_there_is_time() -> None:
         if is_due(points, seconds, 1.0):
             points.append(Point(seconds, 0, 20.0, evaluation_seconds=1.0))
     assert len(points) >= 25
-    assert len(points) <= MARGIN * SHARE * seconds
+    assert len(points) <= PLANNED_SHARE * MAX_TIME_SHARE * seconds
     assert seconds / points[-1].seconds < 1.2
 
 
@@ -207,7 +207,7 @@ def test_no_more_images_than_asked_for(shared_tiny: Path, tmp_path: Path) -> Non
     assert trainer.eval_set is not None
     report = StepReport(1, 1e9, 1.0, {}, 20.0, 1e9, None)
     ten = replace(trainer.train_set, drawn=None)
-    for limit, expected in ((None, FEW), (1, 1), (9, FEW)):
+    for limit, expected in ((None, MAX_IMAGES), (1, 1), (9, MAX_IMAGES)):
         found = FewImages(ten, limit, 1).look_if_due(trainer.model, (), report, last=False)
         assert found is not None
         assert found.images == expected

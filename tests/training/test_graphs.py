@@ -140,7 +140,7 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     for _ in range(steps):
         reports = [trainer.train_step() for trainer in (usual, repeating)]
         assert reports[0].losses == reports[1].losses
-        kinds.add((repeating._request().num_pixels, repeating.model.sampler.room.per_ray))
+        kinds.add((repeating._request().num_pixels, repeating.model.sampler.capacity.per_ray))
     assert_same_bits(tensors(usual), tensors(repeating))
     assert usual.state.samples_per_ray == repeating.state.samples_per_ray
     assert usual.state.train_mse == repeating.state.train_mse
@@ -149,7 +149,7 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     assert recorder.repeated > steps / 4
     assert len(recorder.tapes) <= len(kinds) + 1  # that of the first step
     assert said == ["training steps are captured as CUDA graphs and replayed"]
-    assert repeating.model.sampler.room.left_out == 0
+    assert repeating.model.sampler.capacity.left_out == 0
 
 
 @pytest.mark.medium
@@ -335,7 +335,7 @@ def test_another_loss_is_found(said: list[str]) -> None:
 
 def test_what_moves_later_is_found(said: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """A tensor that is replaced after the first test: a recording still reads the old one."""
-    monkeypatch.setattr(graphs, "TESTED", (0, 3))
+    monkeypatch.setattr(graphs, "REPLAYS_BEFORE_TESTS", (0, 3))
     toy, held = Toy(), [torch.ones(5)]
 
     def step() -> Tensor:
@@ -365,12 +365,12 @@ def test_few_kinds_are_kept(said: list[str]) -> None:
     toy = Toy()
     steps = StepGraphs[Tensor](recorder := FakeRecorder(), lambda: [toy.weight])
     for turn in range(2):
-        for number in range(graphs.MOST_KINDS):
+        for number in range(graphs.MAX_KINDS):
             for _ in range(WARM_UP + 1):
                 steps.run(StepKind((number,)), toy.seed, toy.step)
-        assert len(recorder.tapes) == graphs.MOST_KINDS, turn
+        assert len(recorder.tapes) == graphs.MAX_KINDS, turn
     steps.run(StepKind((99,)), toy.seed, toy.step)
-    assert set(steps._kinds) == {(number,) for number in range(1, graphs.MOST_KINDS)} | {(99,)}
+    assert set(steps._kinds) == {(number,) for number in range(1, graphs.MAX_KINDS)} | {(99,)}
 
 
 def test_draws_of_another_step_are_found(said: list[str]) -> None:

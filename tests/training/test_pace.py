@@ -52,7 +52,7 @@ def test_no_more_than_all_of_a_budget_is_spent() -> None:
 @pytest.mark.parametrize(("seconds", "told"), [(1.0, None), (1.3, None), (3.0, 0.33), (0.25, 4.0)])
 def test_a_speed_counts_if_it_is_unusual(seconds: float, told: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(speed, "step_seconds", lambda: seconds * speed.REFERENCE)
+    monkeypatch.setattr(speed, "step_seconds", lambda: seconds * speed.REFERENCE_SECONDS)
     config = TrainConfig(max_seconds=10.0, machine=MachineConfig(device_type="cpu"))
     found, made = speed.with_speed(config)
     assert found.machine.speed == told
@@ -60,14 +60,14 @@ def test_a_speed_counts_if_it_is_unusual(seconds: float, told: float | None, mon
     assert len(made) == (told is not None)
     for other in (
         dataclasses.replace(config, max_seconds=None),
-        dataclasses.replace(config, max_seconds=speed.LEAST_BUDGET / 2),
+        dataclasses.replace(config, max_seconds=speed.MIN_BUDGET / 2),
         dataclasses.replace(config, machine=MachineConfig(device_type="cpu", speed=2.5)),
     ):
         assert speed.with_speed(other) == (other, [])
 
 
 def test_the_measurement_leaves_random_numbers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "MEASURED_FOR", 0.0)
+    monkeypatch.setattr(speed, "MEASURING_SECONDS", 0.0)
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)

@@ -113,7 +113,7 @@ def test_large_gradients_are_averaged_as_small_ones_are(monkeypatch: pytest.Monk
     optimizer = Adam([{"params": [small, large]}], {}, 1e-2, (0.9, 0.99), 1e-8)
     own = [torch.randn_like(parameter) for parameter in (small, large)]
     small.grad, large.grad = (gradient.clone() for gradient in own)
-    monkeypatch.setattr(averaging, "LARGE", 16)
+    monkeypatch.setattr(averaging, "MIN_SEPARATE_SIZE", 16)
     monkeypatch.setattr(averaging, "processes", lambda: Processes(0, COUNT))
     monkeypatch.setattr(averaging, "gathered", lambda ours: [ours] * COUNT)
     monkeypatch.setattr(averaging, "add_up", lambda ours: ours.mul_(4))

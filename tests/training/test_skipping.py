@@ -34,7 +34,7 @@ def test_the_report_tells_what_was_skipped(shared_tiny: Path, tmp_path: Path) ->
 def test_rays_without_room_are_told(shared_tiny: Path, tmp_path: Path) -> None:
     """Off the CPU, where samples have a fixed number of slots."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
-    trainer.model.sampler.room.rays, trainer.model.sampler.room.left_out = 4000, 100
+    trainer.model.sampler.capacity.rays, trainer.model.sampler.capacity.left_out = 4000, 100
     (rung,) = (rung for rung in skip_report(trainer) if "buffer full" in rung.name)
     assert rung.skipped == 0.025
     assert "the sample buffer was full: 2.5%" in "\n".join(lines([rung]))

@@ -19,7 +19,7 @@ from nerfloom.base.device import StepValue, runs_ahead, seed_step
 from nerfloom.data.pixels.error_map import DECAY, ErrorMap
 from nerfloom.losses.functions import depth_error
 from nerfloom.methods.tensorf import TensoRF
-from nerfloom.scene.shared_space import SharedSpace
+from nerfloom.scene.covisible_space import CovisibleSpace
 from nerfloom.training.trainer import Trainer
 from tests.training.test_graphs import VARIANTS, idle, small
 
@@ -58,7 +58,7 @@ def test_a_step_neither_asks_the_device_nor_brings_it_tensors(
     trainer = Trainer(here.method, here.config, here.train_set.to(NOWHERE))
     assert trainer.device == NOWHERE
     assert trainer.steps_per_read > 20
-    monkeypatch.setattr(SharedSpace, "leave_out", lambda *cells: None)  # before the first step it may wait
+    monkeypatch.setattr(CovisibleSpace, "exclude", lambda *cells: None)  # before the first step it may wait
     for part in trainer.model.modules():  # reads it once, after loading
         if isinstance(part, TensoRF):
             part._growths.change(part.growths, 0.0)

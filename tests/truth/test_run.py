@@ -113,8 +113,8 @@ def evaluated(trained: Path, folder: Path, *flags: object) -> dict[str, Any]:
 
 def parts(comparison: np.ndarray) -> list[np.ndarray]:
     """The first three parts of a comparison, without the frames around them, one pixel where it shows a square."""
-    factor = -(-panels.SMALLEST_WIDTH // WIDTH)
-    gap = max(factor * WIDTH // panels.TEXT_SHARE, panels.SMALLEST_TEXT)
+    factor = -(-panels.MIN_WIDTH // WIDTH)
+    gap = max(factor * WIDTH // panels.TEXT_SHARE, panels.MIN_TEXT)
     top, step = round(1.6 * gap) + factor // 2, factor * WIDTH + gap
     lefts = [gap + index * step + factor // 2 for index in range(3)]
     return [comparison[top:, left:][: factor * HEIGHT : factor, : factor * WIDTH : factor] for left in lefts]

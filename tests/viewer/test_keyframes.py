@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfloom.cameras.camera_path import Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
-from nerfloom.viewer.keyframes import MOST_KEYFRAMES, Editor, through
+from nerfloom.viewer.keyframes import MAX_KEYFRAMES, Editor, through
 
 
 def turned(angle: float, x: float) -> Tensor:
@@ -58,9 +58,9 @@ def test_editing() -> None:
     assert edited.moved(-1, edited.keyframes[0]) == edited
     assert edited.moved(2, edited.keyframes[0]).keyframes[2] is edited.keyframes[0]
     full = edited
-    for _ in range(MOST_KEYFRAMES + 5):
+    for _ in range(MAX_KEYFRAMES + 5):
         full = full.added(edited.keyframes[0])
-    assert len(full.keyframes) == MOST_KEYFRAMES
+    assert len(full.keyframes) == MAX_KEYFRAMES
     assert Editor().path(64, 48, None) is None
 
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from nerfloom.viewer.pace import (
-    LEAST_ROWS,
+    MIN_ROWS,
     STRIDES,
     Share,
     Speed,
@@ -71,7 +71,7 @@ def test_every_pass_covers_the_picture_once(shown: int, rays: int) -> None:
     for piece in pieces:
         passes.setdefault((piece.stride, piece.rays), []).append((piece.top, piece.bottom))
         pixels = smaller(WIDTH, HEIGHT, piece.stride)[0] * (piece.bottom - piece.top) * piece.rays
-        assert speed.seconds(pixels) <= 0.11 or piece.bottom - piece.top <= LEAST_ROWS
+        assert speed.seconds(pixels) <= 0.11 or piece.bottom - piece.top <= MIN_ROWS
     for (stride, _), bands in passes.items():
         rows = sorted(bands)
         assert rows[0][0] == 0

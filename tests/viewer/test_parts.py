@@ -31,13 +31,13 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.crop import CroppedCameras, picture_within
-from nerfloom.viewer.draw_queue import Studio
+from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
 from nerfloom.viewer.photographs import THUMBNAIL, Photographs, small_picture
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.reports import curve, heading
 from nerfloom.viewer.request import Crop, Pose, Request
-from nerfloom.viewer.viewed import newer_checkpoint, reloaded
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 
@@ -106,11 +106,11 @@ def test_gaussians_are_drawn_as_a_whole_however_slow_that_is() -> None:
     strips = [model.render_view(View(request.camera(rows=rows)), torch.ones(3)).rgb for rows in ((0, 32), (32, 64))]
     assert float((torch.cat(strips) - whole).abs().max()) > 0.1  # so it matters
     placement, file = Placement(torch.eye(4)[:3].double(), 1.0), Path("splat.ply")
-    studio = Studio(Loaded(model, placement, "gaussian-splatting", file, file))
-    studio._speed = Slow(((64 * 64, 100.0),))
-    studio.enter(1, Browser(lambda image, quality: shown.append(image)))
-    studio.ask(1, lambda _: request)
-    while studio.work() is not None or studio._browsers[1].pieces:
+    queue = RenderQueue(Loaded(model, placement, "gaussian-splatting", file, file))
+    queue._speed = Slow(((64 * 64, 100.0),))
+    queue.add(1, Browser(lambda image, quality: shown.append(image)))
+    queue.ask(1, lambda _: request)
+    while queue.draw_next() is not None or queue._browsers[1].pieces:
         time.sleep(0.02)
     np.testing.assert_allclose(shown[-1] / 255, whole.numpy(), atol=0.01)
 

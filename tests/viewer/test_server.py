@@ -15,9 +15,9 @@ from nerfloom.cameras.view import View
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import create_folder
 from nerfloom.training.trainer import Trainer
-from nerfloom.viewer.draw_queue import Studio
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import pose_of
 from nerfloom.viewer.server import free_port, is_allowed
 from nerfloom.viewer.training_viewer import in_training
@@ -40,24 +40,24 @@ class Served:
         for _ in range(60):
             trainer.train_step()
         self.photographs = Photographs(run)
-        self.studio = Studio(in_training(run, trainer), truth=self.photographs.truth)
+        self.queue = RenderQueue(in_training(run, trainer), truth=self.photographs.truth)
         self.folder, self.model = folder, trainer.model
         self._server = open_server("127.0.0.1", 17007, "test")
         self.port = self._server.get_port()
-        self.page = Page(self._server, self.studio, self.photographs, may_render=False)
+        self.page = Page(self._server, self.queue, self.photographs, may_render=False)
         self._ending = False
         self._thread = threading.Thread(target=self._draw)
         self._thread.start()
 
     def _draw(self) -> None:
         while not self._ending:
-            if self.studio.work() is None:
-                self.studio.wait(0.01)
+            if self.queue.draw_next() is None:
+                self.queue.wait(0.01)
 
     def rests(self) -> bool:
         """Whether every browser has the finished picture of what it asked for last."""
-        browsers, now = list(self.studio._browsers.values()), time.monotonic()
-        waiting = [browser.waiting(self.studio.subject.step, now) for browser in browsers]
+        browsers, now = list(self.queue._browsers.values()), time.monotonic()
+        waiting = [browser.waiting(self.queue.loaded.step, now) for browser in browsers]
         return not any(one.new or one.rough for one in waiting)
 
     def close(self) -> None:

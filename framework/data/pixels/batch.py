@@ -45,7 +45,7 @@ class PixelBatch:
     """(R,) standard deviation of `distances`, if these come from a reconstruction's points; None if depth images
     measured them."""
     clear: Tensor | None = None
-    """(R,) distance up to which the pixel's image shows nothing; None if unknown."""
+    """(R,) distance from the camera that the pixel's image shows to be empty; None if unknown."""
     weights: Tensor | None = None
     """(R,) factors of the pixels' losses, with mean 1, if pixels were not drawn uniformly or differ in size."""
 
@@ -191,7 +191,7 @@ def draw_batch(
         look_up: for pixels in a file, a function that returns the stored colours of all drawn pixels, in the order of
             drawing (`PixelStream.look_up`).
         keypoints: number of pixels drawn from `dataset.sparse_depth`; they are the last ones.
-        num_images: number of images from which the other pixels are drawn; None for all.
+        num_images: number of images that the other pixels come from; None for all.
     """
     uniform, sparse = count - keypoints, dataset.sparse_depth
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.

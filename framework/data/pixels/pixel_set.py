@@ -54,7 +54,7 @@ class PixelSet:
 
     @classmethod
     def joined(cls, sets: Iterable[PixelSet]) -> PixelSet:
-        """Concatenate `sets`, each of which lies behind the one before."""
+        """Concatenate `sets`; each lies behind the one before."""
         pairs = [(part.starts, part.before.diff()) for part in sets]
         starts, lengths = (torch.cat(column) for column in zip(*pairs, strict=True))
         return cls.of_runs(starts, lengths)

@@ -19,7 +19,7 @@ from nerfloom.base.device import stream_seed
 from nerfloom.base.processes import processes
 from nerfloom.data.dataset import Dataset
 
-MOST_STEPS = 64
+MAX_STEPS = 64
 """Maximum number of steps whose pixels are read together."""
 FIRST_STEPS = 4
 """Number of steps of the first block; training waits for it. Each later block has twice as many."""
@@ -90,7 +90,7 @@ class PixelStream:
         if block is None or not block.holds(step):
             block = self._begin(step, FIRST_STEPS, count).result()
         steps = len(block.colors)
-        self._next = self._begin(block.first + steps, min(2 * steps, MOST_STEPS), round(MARGIN * count))
+        self._next = self._begin(block.first + steps, min(2 * steps, MAX_STEPS), round(MARGIN * count))
         return block
 
     def _begin(self, first: int, steps: int, count: int) -> Future[Block]:

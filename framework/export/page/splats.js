@@ -151,7 +151,7 @@ function drawer(gl, gaussians, { look, near }) {
   const splat = program(gl, vertexShader(gaussians.degree), FRAGMENT), copy = program(gl, WHOLE, COPY);
   const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
   if (gaussians.width > most || gaussians.rows > most) {
-    throw new Refused("This device's graphics have no room for so many Gaussians; export with a lower --max-megabytes.");
+    throw new Refused("This device's graphics cannot hold this many Gaussians; export with a lower --max-megabytes.");
   }
   const texture = (unit, format, width, height) => {
     gl.activeTexture(unit);

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015), dense, and sparse for tables of which each step uses few entries.
+"""Adam (Kingma and Ba 2015), dense, and sparse for tables whose entries are mostly unused in a step.
 
 Sparse Adam updates an entry only if its gradient is not zero. The moments of the entry decay, and their bias is
 corrected, by the number of its updates, not by the number of steps. So an entry first used after a thousand steps moves

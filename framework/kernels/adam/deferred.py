@@ -40,7 +40,7 @@ def waiting(table: Tensor, positions: Tensor, width: int, parts: Parts) -> Tenso
         table: (E, F) parameters.
         positions: (N, D) positions of the look-up.
         width: number of features of the result.
-        parts: positions and gradients of look-ups, to which this one's are appended.
+        parts: positions and gradients of look-ups; this one's are appended.
 
     Returns:
         (N, width) zeros. The look-up must return the gradient of its result as the gradient of this tensor.

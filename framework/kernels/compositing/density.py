@@ -239,16 +239,6 @@ def _composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor,
 COMPOSITE.implementation(TRITON, differentiable=2)(later("compositing.density_triton", "composite"))
 
 
-def distortion_by_pairs(weights: Tensor, samples: Samples) -> Tensor:
-    """Compute `distortion` of `weights` and `samples` over all pairs of samples of a ray, by its definition."""
-    middles, losses = (samples.t_starts + samples.t_ends) / 2, []
-    for start, end in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
-        w, m, delta = weights[start:end], middles[start:end], samples.deltas[start:end]
-        pairs = (w[:, None] * w * (m[:, None] - m).abs()).sum()
-        losses.append(pairs + (w * w * delta).sum() / 3)
-    return torch.stack(losses) if losses else weights.sum()[None][:0]
-
-
 def distortion_reference(weights: Tensor, samples: Samples) -> Tensor:
     """Compute `distortion` of `weights` and `samples` in PyTorch, on any device and for any float type."""
     # m_i - m_j is the sum of the gaps between neighbouring middles from j to i, so each gap is multiplied by the sum of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-SMALLEST = 0.05
+MIN_DEVIATION = 0.05
 """Below this standard deviation, in cells, a weight is 1: erf(1 / (sqrt(8) 0.05)) differs from 1 by 2e-23."""
 
 
@@ -25,5 +25,5 @@ def level_weights(deviations: Tensor, resolutions: Tensor) -> Tensor:
     """
     deviations = deviations if deviations.dtype == torch.float64 else deviations.float()
     # The bound changes no value; without it the gradient would be infinity times 0 at s = 0.
-    cells = (deviations[:, None] * resolutions.to(deviations)).clamp(min=SMALLEST)
+    cells = (deviations[:, None] * resolutions.to(deviations)).clamp(min=MIN_DEVIATION)
     return torch.erf(8**-0.5 / cells)

@@ -44,7 +44,7 @@ def drawn_bands(table: Tensor, layout: PlanesLayout, bands: Sequence[Rows]) -> l
         (rows, vertices along the first axis, F) entries of each band.
     """
     known = _known(layout, tuple(bands), table.device)
-    spread = known.last + known.above + known.above + 1  # positions at which a band has a row within the factor
+    spread = known.last + known.above + known.above + 1  # positions where a band has a row within the factor
     places = (torch.rand(len(bands), device=table.device) * spread).long() - known.above
     moved = torch.minimum(places.clamp(min=0), known.last) * known.across
     found = table.index_select(0, known.entries + moved.index_select(0, known.owners))

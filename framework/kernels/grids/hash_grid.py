@@ -68,13 +68,7 @@ def _signed(strides: tuple[int, ...]) -> tuple[int, ...]:
 def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
     """Compute `hash_grid` in PyTorch, for any device and float type, with derivatives of any order.
 
-    Args:
-        positions: (N, 3); coordinates are clamped to [0, 1].
-        table: (E, F) entries of all levels.
-        layout: resolutions and offsets of the levels.
-
-    Returns:
-        (N, L * F) features, level by level.
+    `positions`, `table`, `layout` and the result are as in `hash_grid`.
     """
     features = []
     for level, offset in enumerate(layout.offsets[:-1]):

@@ -25,13 +25,7 @@ from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient
 def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
     """Compute `multisampled_grid` in PyTorch, for any device and float type, with derivatives of any order.
 
-    Args:
-        points: (N, J, 4) positions in [0, 1] and standard deviations.
-        table: (E, F) entries of all levels.
-        layout: resolutions and offsets of the levels.
-
-    Returns:
-        (N, L * F) features, level by level.
+    `points`, `table`, `layout` and the result are as in `multisampled_grid`.
     """
     positions, deviations = points[..., :3].flatten(0, 1), points[..., 3].detach().flatten()
     shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)

@@ -31,13 +31,7 @@ MAX_HELD = 2**26
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
     """Compute `planes` in PyTorch, on any device and for any float type, with derivatives of any order.
 
-    Args:
-        positions: (N, D); coordinates are clamped to [0, 1].
-        table: (E, F) entries of all factors.
-        layout: axes, resolutions and offsets of the factors.
-
-    Returns:
-        (N, G * F) features, group by group.
+    `positions`, `table`, `layout` and the result are as in `planes`.
     """
     clamped, features = between(positions, 0.0, 1.0), []
     for group, resolution in enumerate(layout.resolutions):

@@ -6,7 +6,7 @@ the covariance s_xy in it of an image x and its target y:
 
     S(p) = (2 m_x m_y + C1) (2 s_xy + C2) / ((m_x^2 + m_y^2 + C1) (s_xx + s_yy + C2))
 
-The compiled form uses the sum u = x + y - 1 and the difference v = x - y, with which
+The compiled form uses the sum u = x + y - 1 and the difference v = x - y:
 
     S(p) = (1 - m_v^2 / (m_x^2 + m_y^2 + C1)) (1 - s_vv / ((s_uu + s_vv) / 2 + C2))
 
@@ -116,45 +116,20 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tenso
 
 
 def photometric_reference(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Compute `photometric_loss` in torch, on any device, with derivatives of any order by both images.
-
-    Args:
-        image: (H, W, C) values.
-        target: (H, W, C) values to compare with.
-        ssim_weight: between 0 and 1.
-    """
+    """Compute `photometric_loss` of `image`, `target` and `ssim_weight` in torch, with derivatives of any order."""
     return (1 - ssim_weight) * (image - target).abs().mean() + ssim_weight * (1 - ssim_reference(image, target))
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
-    """Compute `ssim` in torch, on any device, in any float type, with derivatives of any order by both images.
-
-    Args:
-        image: (H, W, C) values.
-        target: (H, W, C) values to compare with.
-
-    Returns:
-        The mean over channels and windows, a tensor without dimensions.
-    """
+    """Compute `ssim` of all windows of `image` and `target` in torch, with derivatives of any order by both."""
     return similarity_reference(image, target, None, True)
 
 
 def structure(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the mean of S without its first factor, which compares means; contrast and structure remain.
 
-    SSIM at several scales (Wang, Simoncelli and Bovik 2003) uses it for all scales but the coarsest. With NaN the
-    result is NaN.
-
-    Args:
-        image, target: (H, W, C) values, assumed to be in [0, 1]. Compiled without a derivative.
-        counted: as in `ssim`.
-
-    Returns:
-        The mean over channels and over the windows that count, a tensor without dimensions.
-
-    Raises:
-        ValueError: The shapes differ or are not those of images, a side is shorter than the window, or no window
-            counts.
+    SSIM at several scales (Wang, Simoncelli and Bovik 2003) uses it for all scales but the coarsest. `image`, `target`,
+    `counted`, the result and errors are as in `ssim`; the compiled form has no derivative. With NaN the result is NaN.
     """
     _check(image, target)
     _check_window(image, counted)

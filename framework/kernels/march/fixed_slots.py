@@ -118,7 +118,7 @@ def most_steps(num_steps: int) -> int:
 
 @torch.no_grad()
 def fill(
-    rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, room: tuple[int, int]
+    rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, capacities: tuple[int, int]
 ) -> Filled:
     """Return the steps of rays whose middle is in an occupied cell, in a fixed number of slots.
 
@@ -126,24 +126,24 @@ def fill(
 
     Args:
         rays: R rays, R > 0.
-        occupancy: the grid, of one box, or with time slices, for which rays need times.
+        occupancy: the grid, of one box, or with time slices; rays then need times.
         step: length of a step, scene units.
         num_steps: number of steps along the diagonal of the box.
-        shift: (R,) fraction of a step by which the first step starts before the box; None for 0.
-        room: capacity for runs of 8 steps that are examined more closely (not in all forms), and number of slots.
+        shift: (R,) fraction of the first step that is before the box; None for 0.
+        capacities: capacity for runs of 8 steps that are examined more closely (not in all forms), and number of slots.
     """
     tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
-    return FILL(tensors, rays, occupancy, step, num_steps, shift, room)
+    return FILL(tensors, rays, occupancy, step, num_steps, shift, capacities)
 
 
 def fill_reference(
-    rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, room: tuple[int, int]
+    rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, capacities: tuple[int, int]
 ) -> Filled:
     """Compute `fill` in PyTorch, on any device.
 
-    `rays`, `occupancy`, `step`, `num_steps`, `shift` and `room` are as in `fill`.
+    `rays`, `occupancy`, `step`, `num_steps`, `shift` and `capacities` are as in `fill`.
     """
-    count, device, (room_of_runs, capacity) = len(rays), rays.origins.device, room
+    count, device, (runs_capacity, capacity) = len(rays), rays.origins.device, capacities
     enter, leave, first, steps = step_range(rays, occupancy, step, 0.0, shift)
     slices = occupancy.slices_of(rays.times)
     # All possible runs of all rays: one look-up each, then one position each for those that count.
@@ -155,9 +155,9 @@ def fill_reference(
     near = occupancy.near(math.ceil((RUN - 1) / 2 * step / occupancy.edge)).index_select(0, cells)
     near = near & (run * RUN < steps.index_select(0, owners))
     ends_of_runs = near.view(count, most).sum(1).cumsum(0)
-    whole = ends_of_runs <= room_of_runs
-    chosen = _places(near, room_of_runs)
-    here = torch.arange(room_of_runs, device=device) < ends_of_runs[-1]
+    whole = ends_of_runs <= runs_capacity
+    chosen = _places(near, runs_capacity)
+    here = torch.arange(runs_capacity, device=device) < ends_of_runs[-1]
     here = (here & whole.index_select(0, owners.index_select(0, chosen))).repeat_interleave(RUN)
     owners = owners.index_select(0, chosen).repeat_interleave(RUN)
     k = (run.index_select(0, chosen)[:, None] * RUN + torch.arange(RUN, device=device)).view(-1)
@@ -174,7 +174,7 @@ def fill_reference(
 
 
 def _places(mask: Tensor, capacity: int) -> Tensor:
-    """Return the first `capacity` positions (C,) int64 at which `mask` (N,) is True; 0 for missing ones."""
+    """Return the first `capacity` positions (C,) int64 where `mask` (N,) is True; 0 for missing ones."""
     ranks = torch.where(mask, mask.cumsum(0) - 1, capacity).clamp(max=capacity)  # the others go past the end
     places = ranks.new_zeros(capacity + 1).scatter_(0, ranks, torch.arange(len(mask), device=mask.device))
     return places[:capacity]
@@ -202,7 +202,7 @@ def reach(placed: Placed, sigma: Tensor, early_stop: float, num_steps: int) -> T
 def reach_reference(placed: Placed, sigma: Tensor, budget: float, num_steps: int) -> Tensor:
     """Compute `reach` in PyTorch, on any device.
 
-    `placed`, `sigma` and `num_steps` are as in `reach`; `budget` is the optical depth at which a ray ends.
+    `placed`, `sigma` and `num_steps` are as in `reach`; `budget` is the optical depth where a ray ends.
     """
     slots = placed.slots
     tau = optical_depth(sigma, placed.t_ends - placed.t_starts).nan_to_num(nan=0.0)  # a NaN sample hides nothing

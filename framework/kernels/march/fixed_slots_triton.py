@@ -22,10 +22,10 @@ from nerfloom.kernels.triton_launch import blocks, launch, optical_depth
 
 
 def fill(
-    rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, room: tuple[int, int]
+    rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, capacities: tuple[int, int]
 ) -> Filled:
-    """Compute `kernels.march.fixed_slots.fill` of `rays`, `occupancy`, `step`, `num_steps`, `shift` and `room`."""
-    marched, capacity = TritonMarch(rays, occupancy, step, 0.0, shift, 0.0), room[1]
+    """Compute `march.fixed_slots.fill` of `rays`, `occupancy`, `step`, `num_steps`, `shift` and `capacities`."""
+    marched, capacity = TritonMarch(rays, occupancy, step, 0.0, shift, 0.0), capacities[1]
     found, limit = torch.empty_like(marched.next), most_steps(num_steps)
     marched.go_on(limit, found)
     counts = found.long()

@@ -33,7 +33,7 @@ RUN = 8
 WAVES = (8, 8, 16, 32, 64, 128)
 """Samples per ray in each wave of a compiled march; the last size repeats."""
 CAPACITY = 2**18
-"""Number of samples up to which the reference takes all candidates in one wave, because another wave would wait for a
+"""Maximum number of samples for the reference to take all candidates in one wave, because another wave would wait for a
 GPU. With more samples, it is the approximate number per wave."""
 
 
@@ -69,7 +69,7 @@ class March(ABC):
         self.budget = -math.log(early_stop) if early_stop > 0 else math.inf
         self.waves: list[Wave] = []
         self.reached: list[Tensor] = []
-        """(N,) uint8 for each wave: 1 for samples in front of which the transmittance is not below `early_stop`."""
+        """(N,) uint8 for each wave: 1 for samples with a transmittance in front of them of at least `early_stop`."""
         self.longest: int | None = None
         """Upper bound of the number of samples on a ray; None if computing it would take a pass over them."""
         self.spent: Tensor
@@ -153,12 +153,12 @@ class CompiledMarch(March):
         self.spent = torch.zeros(count)
 
     def wave(self, limit: int) -> Wave | None:
-        living, room = len(self.alive), len(self.alive) * limit
+        living, capacity = len(self.alive), len(self.alive) * limit
         if living == 0:
             return None
         self.counts, self.limit = torch.empty(living, dtype=torch.int32), limit
-        starts, ends, positions = torch.empty(room), torch.empty(room), torch.empty(room, 3)
-        owners = torch.empty(room, dtype=torch.int64)
+        starts, ends, positions = torch.empty(capacity), torch.empty(capacity), torch.empty(capacity, 3)
+        owners = torch.empty(capacity, dtype=torch.int64)
         count = _wave(
             self.origins.data_ptr(), self.directions.data_ptr(), self.enter.data_ptr(), self.leave.data_ptr(),
             self.first.data_ptr(), None if self.slices is None else self.slices.data_ptr(), self.next.data_ptr(),
@@ -275,10 +275,10 @@ def march(rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Ten
 
     Args:
         rays: R rays.
-        occupancy: the grid, of one or several boxes, or with time slices, for which rays need times.
+        occupancy: the grid, of one or several boxes, or with time slices; rays then need times.
         step: length of a step near the camera, scene units.
         cone: growth of a step per unit of distance; 0 for even steps.
-        shift: (R,) fraction of a step by which the first step starts before the box; None for 0.
+        shift: (R,) fraction of the first step that is before the box; None for 0.
         early_stop: transmittance below which a ray ends; 0 for never.
     """
     tensors = rays.origins, rays.directions, rays.nears, rays.fars, occupancy.box
@@ -291,7 +291,7 @@ MARCH.implementation(TRITON)(later("march.waves_triton", "TritonMarch"))
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
-    """Return the distances (N,) at which steps `k` (N,) start on rays whose step 0 starts at `first` (N,).
+    """Return the distances (N,) where steps `k` (N,) start on rays whose step 0 starts at `first` (N,).
 
     Steps have the length `step` while it exceeds `cone` * t, and then grow by the factor 1 + `cone`.
     """
@@ -306,7 +306,7 @@ def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
 def step_range(
     rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the distances at which rays enter and leave the grid, and of their first step, and the numbers of steps.
+    """Return the distances where rays enter and leave the grid, and of their first step, and the numbers of steps.
 
     `rays`, `occupancy`, `step`, `cone` and `shift` are as in `march`.
 

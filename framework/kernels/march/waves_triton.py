@@ -26,14 +26,14 @@ from nerfloom.kernels.triton_launch import blocks, launch, optical_depth
 
 RAYS, SAMPLES = 32, 256
 """Rays, and samples, per program."""
-FARTHEST = 16
+MAX_BLOCK_DISTANCE = 16
 """Largest distance that is distinguished, in blocks."""
 EDGE = tl.constexpr(CELLS)
 INFINITY = tl.constexpr(math.inf)
 
 
 def block_distances(occupied: Tensor, resolution: int) -> Tensor:
-    """Return the distance in blocks, at most FARTHEST, from each block of cells to one with an occupied cell.
+    """Return the distance in blocks, at most MAX_BLOCK_DISTANCE, from each block of cells to one with an occupied cell.
 
     Args:
         occupied: (n^3,) bool, as in `Occupancy`.
@@ -46,7 +46,7 @@ def block_distances(occupied: Tensor, resolution: int) -> Tensor:
     grid = functional.pad(occupied.view(1, 1, *[resolution] * 3).float(), (0, short) * 3)
     near = functional.max_pool3d(grid, CELLS)
     distances = 1 - near
-    for _ in range(FARTHEST - 1):
+    for _ in range(MAX_BLOCK_DISTANCE - 1):
         near = functional.max_pool3d(near, 3, stride=1, padding=1)
         distances += 1 - near
     return distances.to(torch.uint8).flatten()
@@ -54,7 +54,7 @@ def block_distances(occupied: Tensor, resolution: int) -> Tensor:
 
 @triton.jit
 def _slab(origins, directions, box, r, here, axis: tl.constexpr, enter, leave):
-    """Return the distances at which rays enter and leave the box, updated for one more axis."""
+    """Return the distances where rays enter and leave the box, updated for one more axis."""
     o = tl.load(origins + r * 3 + axis, mask=here, other=0.0)
     d = tl.load(directions + r * 3 + axis, mask=here, other=1.0)
     low, high = tl.load(box + axis), tl.load(box + 3 + axis)
@@ -117,7 +117,7 @@ def _shrunk(position, size, half):
 
 @triton.jit
 def _leave(position, direction, cell, size, more, resolution):
-    """Return the distance at which rays leave a cell's cube of `size` cells plus `more`, or the box, by an axis."""
+    """Return the distance where rays leave a cell's cube of `size` cells plus `more`, or the box, by an axis."""
     corner = cell - cell % size
     face = tl.where(direction > 0, tl.minimum(corner + size + more, resolution), tl.maximum(corner - more, 0))
     distance = (face.to(tl.float32) - position) / tl.where(direction == 0, 1.0, direction)

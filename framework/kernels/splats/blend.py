@@ -88,13 +88,7 @@ def blend_reference(
 ) -> Blended:
     """Compute `blend` in torch, tile by tile, on any device and in any float type.
 
-    Args:
-        records: (N, RECORD) Gaussians on the image.
-        lists: Gaussians that each tile may show.
-        width, height: size of the image, pixels.
-        background: (3,) colour behind everything.
-        channels: number of channels, a value of `CHANNELS`.
-        median: whether to find the median distance.
+    `records`, `lists`, `width`, `height`, `background`, `channels` and `median` are as in `blend`.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     behind = torch.cat([background.to(records), records.new_zeros(channels - 3)])

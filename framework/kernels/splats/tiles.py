@@ -32,11 +32,11 @@ class TileLists(NamedTuple):
     firsts: Tensor
     """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
     needed: Tensor | None = None
-    """() int64 number of entries that there would be with room for all; None if there was."""
+    """() int64 number of entries that there would be with capacity for all; None if there was."""
 
 
 def tile_lists(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
     """Return lists of the Gaussians that each tile of an image may show, nearest first, those as near by their index.
@@ -45,7 +45,7 @@ def tile_lists(
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
         for_gradients: whether a backward pass follows; otherwise the lists may have no slots.
-        room: capacity in entries, which avoids a synchronisation; Gaussians beyond it are dropped whole. None for no
+        capacity: number of entries, which avoids a synchronisation; Gaussians beyond it are dropped whole. None for no
             limit.
         keys: (N,) positive numbers that sort the visible Gaussians instead, smallest first.
 
@@ -55,21 +55,16 @@ def tile_lists(
     if keys is not None and keys.shape != (len(records),):
         raise ValueError(f"{len(records)} Gaussians are sorted by as many keys, not by {tuple(keys.shape)}")
     records, keys = records.detach(), None if keys is None else keys.detach()
-    return TILES((records, keys), records, width, height, for_gradients, room, keys)
+    return TILES((records, keys), records, width, height, for_gradients, capacity, keys)
 
 
 def tile_lists_reference(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
     """Compute `tile_lists` in torch. A Gaussian is listed in every tile that the box around it touches.
 
-    Args:
-        records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
-        width, height: size of the image, pixels.
-        for_gradients: makes no difference here.
-        room: capacity in entries; the nearest Gaussians are kept.
-        keys: (N,) numbers that sort Gaussians instead of their distances.
+    `records`, `width`, `height`, `capacity` and `keys` are as in `tile_lists`; `for_gradients` makes no difference.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
     device = records.device
@@ -84,8 +79,8 @@ def tile_lists_reference(
 
     touched = (met(y, high, edges_y)[:, :, None] & met(x, wide, edges_x)[:, None]).flatten(1)
     needed = None
-    if room is not None:
-        needed, touched = touched.sum(), touched & (touched.sum(1).cumsum(0) <= room)[:, None]
+    if capacity is not None:
+        needed, touched = touched.sum(), touched & (touched.sum(1).cumsum(0) <= capacity)[:, None]
     place, tile = touched.nonzero().unbind(-1)  # by Gaussian in order of distance, then by tile
     return _dealt(order.index_select(0, place), tile, columns * rows, len(records))._replace(needed=needed)
 
@@ -119,10 +114,10 @@ TILES = Operation("tile_lists", tile_lists_reference)
 
 @TILES.implementation(FEW_OPERATIONS, types=None)
 def _by_entries(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
-    """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once, if no room is
+    """Compute `tile_lists` without a table of all Gaussians and tiles; the device is waited for once, if no capacity is
     given. The nearest Gaussians have it."""
     count, device = len(records), records.device
     columns, rows = -(-width // TILE), -(-height // TILE)
@@ -133,13 +128,13 @@ def _by_entries(
     top, bottom = _met(y, high, rows)
     across, down = (right - left).clamp(min=0), (bottom - top).clamp(min=0)
     counts = (across * down).masked_fill(sorted_records[:, Record.CUT] <= 0, 0)
-    needed = None if room is None else counts.sum()
-    if room is None:
-        room = int(counts.sum())
+    needed = None if capacity is None else counts.sum()
+    if capacity is None:
+        capacity = int(counts.sum())
     else:
-        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
+        counts = counts.masked_fill(counts.cumsum(0) > capacity, 0)
     ends = counts.cumsum(0)
-    place = torch.arange(room, device=device)
+    place = torch.arange(capacity, device=device)
     owners = torch.searchsorted(ends, place, right=True)
     none, owners = owners == count, owners.clamp(max=count - 1)
     number = place - (ends - counts).index_select(0, owners)
@@ -164,15 +159,15 @@ _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
 def _for_all(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> bool:  # fmt: skip
-    return room is None
+    return capacity is None
 
 
 @TILES.implementation(CPP, fits=_for_all)
 def _compiled(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
     records = records.contiguous()  # kept until the kernels have read it

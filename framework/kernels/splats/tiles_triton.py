@@ -70,7 +70,7 @@ def _list(records, distances, counts, firsts, keys, owners, count, columns, rows
     here = here & (tl.load(record + CUT, mask=here, other=0.0) > 0)
     if firsts is not None:
         first = tl.load(firsts + g, mask=here, other=0)
-        here = here & (tl.load(firsts + g + 1, mask=here, other=0) > first)  # else there is no room
+        here = here & (tl.load(firsts + g + 1, mask=here, other=0) > first)  # else it is full
         distance = tl.load(distances + g, mask=here, other=0.0).to(tl.int32, bitcast=True).to(tl.int64)
     x = tl.load(record + X, mask=here, other=0.0)
     y = tl.load(record + Y, mask=here, other=0.0)
@@ -94,13 +94,13 @@ def _list(records, distances, counts, firsts, keys, owners, count, columns, rows
 
 
 def tile_lists(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, room: int | None = None,
+    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
     """Compute `nerfloom.kernels.splats.tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
 
     A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
-    `room`. They are sorted by `keys`, if there are some.
+    `capacity`. They are sorted by `keys`, if there are some.
 
     Raises:
         ValueError: if there are 2^31 entries or more.
@@ -111,16 +111,16 @@ def tile_lists(
     counts, programs = torch.empty(count, dtype=torch.int32, device=device), (blocks(count, BLOCK),)
     shared = (count, columns, rows)
     launch(_list, programs, records, distances, counts, None, None, None, *shared, BLOCK=BLOCK, num_warps=1)
-    needed = None if room is None else counts.sum()
-    if room is None:
-        room = int(counts.sum())
+    needed = None if capacity is None else counts.sum()
+    if capacity is None:
+        capacity = int(counts.sum())
     else:
-        counts = counts.masked_fill(counts.cumsum(0) > room, 0)
-    if room >= 2**31:
+        counts = counts.masked_fill(counts.cumsum(0) > capacity, 0)
+    if capacity >= 2**31:
         raise ValueError("more than 2^31 Gaussians on the image's tiles")
     firsts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    places = torch.full((room,), LAST, dtype=torch.int64, device=device)
-    owners = torch.zeros(room, dtype=torch.int32, device=device)
+    places = torch.full((capacity,), LAST, dtype=torch.int64, device=device)
+    owners = torch.zeros(capacity, dtype=torch.int32, device=device)
     launch(_list, programs, records, distances, None, firsts, places, owners, *shared, BLOCK=BLOCK, num_warps=1)
     places, slots = places.sort(stable=True)
     first_keys = torch.arange(columns * rows + 1, device=device) << 32

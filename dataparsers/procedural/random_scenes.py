@@ -28,10 +28,10 @@ UNSEEN = {"val": 4, "test": 8}
 """Number of held-out scenes of each split."""
 JUDGED_EVERY = 4
 """Distance between evaluated views of a held-out scene."""
-FEWEST, MOST = 2, 5
+MIN_SOLIDS, MAX_SOLIDS = 2, 5
 """Number of solids in a scene."""
-REACH = 1.35
-"""Distance from the origin within which all solids lie, scene units."""
+MAX_REACH = 1.35
+"""Maximum distance of solids from the origin, scene units."""
 
 
 def random_parts(seed: int, scene: int) -> Parts:
@@ -42,14 +42,14 @@ def random_parts(seed: int, scene: int) -> Parts:
         scene: index of the scene.
     """
     random = np.random.default_rng([seed, scene])
-    return {f"solid {index}": _random_part(random) for index in range(random.integers(FEWEST, MOST + 1))}
+    return {f"solid {index}": _random_part(random) for index in range(random.integers(MIN_SOLIDS, MAX_SOLIDS + 1))}
 
 
 def _random_part(random: np.random.Generator) -> Part:
     size = random.uniform(0.0, 1.0)
     shape: Shape = Sphere(0.25 + 0.25 * size) if random.random() < 0.5 else Box(0.2 + 0.2 * size)
     direction = random.normal(size=3)
-    distance = (REACH - shape.bound) * random.uniform() ** (1 / 3)  # uniform in the ball where it fits
+    distance = (MAX_REACH - shape.bound) * random.uniform() ** (1 / 3)  # uniform in the ball where it fits
     x, y, z = (distance * direction / np.linalg.norm(direction)).tolist()
     colour = colorsys.hsv_to_rgb(random.uniform(), random.uniform(0.5, 1.0), random.uniform(0.3, 0.9))
     return Part(shape, (x, y, z), random.uniform(0.0, math.pi / 2), partial(_plain, colour), 0.0)

@@ -15,7 +15,7 @@ from torch.nn.functional import pad
 from nerfloom.base.device import HostValue
 
 STEPS_PER_LEVEL = 2**10
-"""Number of steps in which a level opens; the factors are exact in float32."""
+"""Number of steps that open a level; the factors are exact in float32."""
 
 
 def opened_levels(num_levels: int, first: float, progress: float) -> float:
@@ -36,7 +36,7 @@ def opened_levels(num_levels: int, first: float, progress: float) -> float:
     return min(max(first + num_levels * progress, 0.0), float(num_levels))
 
 
-class Opening(nn.Module):
+class OpenLevels(nn.Module):
     """The open levels of an encoding. They are saved in checkpoints; a checkpoint without them opens all levels.
 
     Args:

@@ -15,41 +15,41 @@ from torch import Tensor, nn
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.march.first_shared import CELLS, LEVELS, first_shared
+from nerfloom.kernels.march.first_covisible import CELLS, LEVELS, first_covisible
 from nerfloom.kernels.native import torch_on_one_thread
 
 BLOCK = 4
 """Cells along an edge of the cubes that are tested first."""
 
 
-class SharedSpace(nn.Module):
-    """The cells of nested boxes that too few training images show; empty until `leave_out` is called.
+class CovisibleSpace(nn.Module):
+    """Space that enough training images show, by cells of nested boxes; all of space until `exclude` is called.
 
     Args:
         box: (2, 3) corners of the smallest box, scene units.
     """
 
     box: Tensor
-    unshared: Tensor
+    excluded: Tensor
     """(L n^3 + 1,) bool, box by box; the last entry stands for all space beyond the boxes and is False."""
 
     def __init__(self, box: Tensor) -> None:
         super().__init__()
         self.register_buffer("box", box.clone(memory_format=torch.contiguous_format))
-        self.register_buffer("unshared", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
+        self.register_buffer("excluded", torch.zeros(LEVELS * CELLS**3 + 1, dtype=torch.bool, device=box.device))
 
-    def leave_out(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
+    def exclude(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
         """Exclude cells that fewer than `least` images show, or fewer than all if there are fewer images.
 
         Args:
             cameras: M training cameras.
-            nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
+            nearest: (M,) distance of each camera that its image shows to be empty, scene units.
             least: minimum number of images, at least 1.
         """
         least = min(least, len(cameras))
         with torch_on_one_thread():  # the operations are small
             seen = [times_seen(cameras, nearest, box, CELLS, least) for box in nested_boxes(self.box, LEVELS)]
-        self.unshared[:-1] = torch.cat(seen) < least
+        self.excluded[:-1] = torch.cat(seen) < least
 
     def forward(self, rays: Rays) -> Rays:
         """Return rays that start where they first meet space that enough images show; unchanged if they never do.
@@ -57,11 +57,11 @@ class SharedSpace(nn.Module):
         Args:
             rays: R rays; R may be 0.
         """
-        return replace(rays, nears=first_shared(rays, self.box, self.unshared))
+        return replace(rays, nears=first_covisible(rays, self.box, self.excluded))
 
 
 @torch.no_grad()
-def share_cut_off(space: SharedSpace, rays: Rays, distances: Tensor) -> float:
+def share_cut_off(space: CovisibleSpace, rays: Rays, distances: Tensor) -> float:
     """Return the fraction of rays that would start behind their known point.
 
     Args:
@@ -81,7 +81,7 @@ def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, 
 
     Args:
         cameras: M cameras.
-        nearest: (M,) distance from each camera up to which its image shows nothing, scene units.
+        nearest: (M,) distance of each camera that its image shows to be empty, scene units.
         box: (2, 3) minimum and maximum corner, scene units.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
         most: maximum count.

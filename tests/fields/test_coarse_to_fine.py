@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from nerfloom.encodings.coarse_to_fine import OpenLevels, opened_levels
 from nerfloom.encodings.hash_grid import HashGrid
-from nerfloom.encodings.opening import Opening, opened_levels
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField, opened_frequencies
@@ -56,7 +56,7 @@ def test_frequencies_open_as_freenerf_opens_them(progress: float) -> None:
 
 
 def test_levels_open_once_and_stay_open() -> None:
-    opening = Opening(4, 1)
+    opening = OpenLevels(4, 1)
     seen = []
     for progress in (0.0, 0.1, 0.25, 0.6, 0.75, 1.0, 3.0):
         opening.advance(progress)
@@ -115,7 +115,7 @@ def test_once_all_levels_are_open_nothing_is_different(kind: str) -> None:
 
 @pytest.mark.parametrize("opened", [0.0, 0.5, 3.0, 3.25, 4.0])
 def test_frequencies_of_positions(opened: float) -> None:
-    opening = Opening(4, 0)
+    opening = OpenLevels(4, 0)
     opening.opened.fill_(opened)
     x = torch.rand(20, 3) - 0.5
     each = [1.0] * 3 + [min(max(opened - level, 0.0), 1.0) for level in range(4) for _ in range(6)]
@@ -167,9 +167,9 @@ def test_levels_open_with_the_budget(kind: str, shared_tiny: Path, tmp_path: Pat
     counts = []
     for _ in range(steps):
         trainer.train_step()
-        counts.append([int(module.count) for module in trainer.model.modules() if isinstance(module, Opening)])
+        counts.append([int(module.count) for module in trainer.model.modules() if isinstance(module, OpenLevels)])
     assert counts == sorted(counts)
-    openings = [module for module in trainer.model.modules() if isinstance(module, Opening)]
+    openings = [module for module in trainer.model.modules() if isinstance(module, OpenLevels)]
     assert all(opening.complete for opening in openings)
     assert bool(openings) == (kind != "tensorf")
 

@@ -13,13 +13,13 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
-from nerfloom.kernels.march.first_shared import CELLS, LEVELS, REACH, STEPS, first_shared_reference
+from nerfloom.kernels.march.first_covisible import CELLS, LEVELS, REACH, STEPS, first_covisible_reference
 from nerfloom.methods.nerfacto import METHOD
 from nerfloom.registry import load_dataparser
-from nerfloom.scene.shared_space import SharedSpace, share_cut_off, times_seen
+from nerfloom.scene.covisible_space import CovisibleSpace, share_cut_off, times_seen
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.preparation import decided
-from nerfloom.training.ray_starts import MOST_LATE, UNKNOWN, share_late
+from nerfloom.training.ray_starts import MAX_LATE, NOTHING_TO_TEST, share_late
 from tests.test_free_space import row
 from tests.training.test_graphs import small
 
@@ -36,9 +36,9 @@ def fan(*slopes: float, near: float = 0.05, far: float = 100.0) -> Rays:
     return Rays(torch.zeros(len(slopes), 3), directions, near * ends, far * ends)
 
 
-def shared(cameras: Cameras, least: int, nearest: float = 0.0) -> SharedSpace:
-    found = SharedSpace(BOX)
-    found.leave_out(cameras, torch.full((len(cameras),), nearest), least)
+def shared(cameras: Cameras, least: int, nearest: float = 0.0) -> CovisibleSpace:
+    found = CovisibleSpace(BOX)
+    found.exclude(cameras, torch.full((len(cameras),), nearest), least)
     return found
 
 
@@ -77,10 +77,10 @@ def test_a_single_camera_shares_with_itself() -> None:
 
 def test_nothing_is_left_out_before_the_cameras_are_known_and_none_beyond_the_boxes() -> None:
     rays = fan(0.0, 0.4)
-    assert torch.equal(SharedSpace(BOX)(rays).nears, rays.nears)
+    assert torch.equal(CovisibleSpace(BOX)(rays).nears, rays.nears)
     outside = dataclasses.replace(rays, origins=rays.origins + torch.tensor([0.0, 50.0, 0.0]))
     assert torch.equal(shared(row(0.0, 9.0), 2)(outside).nears, rays.nears)
-    assert len(SharedSpace(BOX)(fan()).nears) == 0
+    assert len(CovisibleSpace(BOX)(fan()).nears) == 0
 
 
 def test_cells_are_counted_whose_points_are_all_seen() -> None:
@@ -104,7 +104,7 @@ def test_cells_are_counted_whose_points_are_all_seen() -> None:
 def test_starts_are_those_of_float64() -> None:
     found, rays = shared(row(0.0, 0.5), 2), fan(-0.5, -0.2, 0.0, 0.3, 0.8)
     exact = Rays(*(each.double() for each in (rays.origins, rays.directions, rays.nears, rays.fars)))
-    expected = first_shared_reference(exact, found.box.double(), found.unshared)
+    expected = first_covisible_reference(exact, found.box.double(), found.excluded)
     torch.testing.assert_close(found(rays).nears.double(), expected, rtol=1e-5, atol=1e-6)
     assert bool((expected > exact.nears).all())
 
@@ -112,13 +112,13 @@ def test_starts_are_those_of_float64() -> None:
 def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) -> None:
     trainer = small(tmp_path, rays_shared_by=2)
     trainer.prepare()
-    space, dataset = trainer.model.shared_space, trainer.train_set
-    assert isinstance(space, SharedSpace)
-    expected = SharedSpace(dataset.scene.box)
-    expected.leave_out(dataset.cameras, torch.full_like(dataset.cameras.fx, dataset.scene.near), 2)
-    assert torch.equal(space.unshared, expected.unshared)
-    assert 0 < int(space.unshared.sum()) < len(space.unshared)
-    assert "shared_space.unshared" in trainer.model.state_dict()  # which checkpoints keep
+    space, dataset = trainer.model.covisible_space, trainer.train_set
+    assert isinstance(space, CovisibleSpace)
+    expected = CovisibleSpace(dataset.scene.box)
+    expected.exclude(dataset.cameras, torch.full_like(dataset.cameras.fx, dataset.scene.near), 2)
+    assert torch.equal(space.excluded, expected.excluded)
+    assert 0 < int(space.excluded.sum()) < len(space.excluded)
+    assert "covisible_space.excluded" in trainer.model.state_dict()  # which checkpoints keep
     assert [d.choice for d in trainer.profile.decisions if d.option == "rays start"] == [
         "where at least 2 photographs look"
     ]
@@ -180,7 +180,7 @@ def test_without_points_scenes_that_move_and_several_start_at_the_near_ends(
     config = dataclasses.replace(trainer.config, rays_shared_by="auto")
     _, settings, made = decided(METHOD, config, other)
     assert settings.rays_shared_by == 0
-    assert [decision for decision in made if decision.option == "rays start" and UNKNOWN in decision.line()]
+    assert [decision for decision in made if decision.option == "rays start" and NOTHING_TO_TEST in decision.line()]
 
 
 def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:
@@ -189,9 +189,9 @@ def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:
     The rays start late that are nowhere before 0.8 in both images, and more of them, as a cell counts as seen where
     all of its ball is; fewer than those that are nowhere before 0.9 by a cell's diagonal within both.
     """
-    cameras, space = around(1.0, -40, 40), SharedSpace(BOX / 4)
+    cameras, space = around(1.0, -40, 40), CovisibleSpace(BOX / 4)
     cameras = dataclasses.replace(cameras, fx=4 * cameras.fx, fy=4 * cameras.fy)
-    space.leave_out(cameras, torch.zeros(2), 2)
+    space.exclude(cameras, torch.zeros(2), 2)
     late = share_late(space, cameras, 0.01, 100.0)
     rays = cameras.pixel_rays(torch.arange(int(cameras.offsets[-1])), 0.01, 100.0)
 
@@ -219,12 +219,12 @@ def test_in_real_captures_rays_start_late_where_the_cameras_go_around_something(
 ) -> None:
     path, name = find_data(real_data / capture, None)
     parsed = load_dataparser(name)().parse(path, "train")
-    space = SharedSpace(parsed.box)
-    space.leave_out(parsed.cameras, torch.full_like(parsed.cameras.fx, parsed.near), 2)
+    space = CovisibleSpace(parsed.box)
+    space.exclude(parsed.cameras, torch.full_like(parsed.cameras.fx, parsed.near), 2)
     late = share_late(space, parsed.cameras, parsed.near, parsed.far)
     assert late is not None
     print(f"{capture}: {100 * late:.2f} % start late")
-    assert (late <= MOST_LATE) == on
+    assert (late <= MAX_LATE) == on
 
 
 @pytest.mark.parametrize(("distance", "least"), [(50.0, 2), (0.06, 0)])
@@ -256,5 +256,5 @@ def test_rays_start_at_the_near_end_where_one_says_so_and_in_nested_boxes(
 ) -> None:
     trainer = small(tmp_path, **settings)
     trainer.prepare()
-    assert trainer.model.shared_space is None
+    assert trainer.model.covisible_space is None
     assert not [d for d in trainer.profile.decisions if d.option == "rays start"]

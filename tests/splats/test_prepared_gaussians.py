@@ -11,8 +11,8 @@ from nerfloom.benchmarks.frames import measure
 from nerfloom.splats.drawing import draw_colors, draw_view, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import ELSEWHERE, OURS
+from nerfloom.splats.prepared_gaussians import PreparedGaussians
 from nerfloom.splats.rasteriser import RASTERISER, packed
-from nerfloom.splats.redrawn import Redrawn
 from tests.kernels.compiled import needs_kernels
 from tests.kernels.splat_truth import scene
 from tests.splats.test_method import ball, camera
@@ -29,7 +29,7 @@ def test_every_picture_is_the_first() -> None:
     """But for Gaussians as far as others, which come in another order; here there are none."""
     seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
     truth = draw_colors(cloud(), seen, 1, background)
-    redrawn = Redrawn(cloud(), RASTERISER)
+    redrawn = PreparedGaussians(cloud(), RASTERISER)
     for _ in range(3):
         torch.testing.assert_close(redrawn.colors(seen, 1, background), truth, atol=1e-6, rtol=0)
     torch.testing.assert_close(redrawn.colors(seen, 4, background), truth[2::4, 2::4], atol=1e-6, rtol=0)
@@ -48,7 +48,7 @@ def test_pictures_by_depth() -> None:
     assert float((pair.means - torch.tensor([0.0, 0, 3.0])).norm(dim=-1).diff()) > 0  # the first is nearer
     for look, color in ((OURS, 0), (ELSEWHERE, 1)):
         seen = splat_camera(camera(), 0.1, look)
-        redrawn, background = Redrawn(pair, RASTERISER), torch.zeros(3)
+        redrawn, background = PreparedGaussians(pair, RASTERISER), torch.zeros(3)
         pictures = [redrawn.colors(seen, 1, background) for _ in range(3)]
         pictures.append(draw_view(pair, seen, 1, background, 9.0).rgb)
         for picture in pictures:
@@ -66,7 +66,7 @@ def test_what_no_picture_shows_is_not_packed() -> None:
     assert int((kept.values[:, 10] > -30).sum()) == 100 - 42 - int((given.logits[40:] <= -5.54).sum())
     assert packed(given[:40]) is None
     seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
-    nothing = Redrawn(given[:40], RASTERISER)
+    nothing = PreparedGaussians(given[:40], RASTERISER)
     for _ in range(3):
         torch.testing.assert_close(nothing.colors(seen, 1, background), background.expand(33, 33, 3))
 
@@ -75,7 +75,7 @@ def test_one_far_away_does_not_matter() -> None:
     given = cloud(500)
     given.means[7] = 1e9
     seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
-    redrawn = Redrawn(given, RASTERISER)
+    redrawn = PreparedGaussians(given, RASTERISER)
     first, _, third = (redrawn.colors(seen, 1, background) for _ in range(3))
     torch.testing.assert_close(first, third, atol=1e-6, rtol=0)
 

@@ -7,7 +7,7 @@ import pytest
 
 from nerfloom.data.image_files import read_image
 from nerfloom.registry import load_dataparser
-from nerfloom.scene.folds import folds, in_order, thumbnail
+from nerfloom.scene.folded_poses import folded_neighbours, in_order, thumbnail
 from nerfloom.training.data_folder import find_data
 
 
@@ -31,7 +31,7 @@ def test_a_walk_is_folded_where_it_jumps(repeats: int) -> None:
     names, angles, seen = walk()
     period = 360 / repeats
     jumps = np.flatnonzero(np.diff(angles // period))
-    found = folds(names, looking(angles % period), seen)
+    found = folded_neighbours(names, looking(angles % period), seen)
     assert found == [(int(i), int(i) + 1) for i in jumps]
     assert len(found) == int(1.49 * repeats)
 
@@ -39,21 +39,21 @@ def test_a_walk_is_folded_where_it_jumps(repeats: int) -> None:
 def test_the_order_is_that_of_the_numbers_in_the_names() -> None:
     names, angles, seen = walk()
     mixed = np.random.default_rng(1).permutation(len(names))
-    found = folds([names[i] for i in mixed], looking(angles[mixed] % 180), seen[mixed])
-    assert [(mixed[i], mixed[j]) for i, j in found] == folds(names, looking(angles % 180), seen)
+    found = folded_neighbours([names[i] for i in mixed], looking(angles[mixed] % 180), seen[mixed])
+    assert [(mixed[i], mixed[j]) for i, j in found] == folded_neighbours(names, looking(angles % 180), seen)
     assert in_order(["b10.jpg", "b9.jpg", "a.jpg", "10.jpg"]) == [3, 2, 1, 0]
 
 
 def test_what_is_not_folded_is_left_alone() -> None:
     names, angles, seen = walk()
-    assert folds(names, looking(angles), seen) == []  # all the way around
+    assert folded_neighbours(names, looking(angles), seen) == []  # all the way around
     elsewhere = angles + 180 * (np.arange(len(angles)) >= 30)
     _, _, other = walk(turns=3.1)
     moved = np.concatenate([seen[:30], other[30:]])  # a second walk that begins on the other side, and shows it
-    assert folds(names, looking(elsewhere), moved) == []
+    assert folded_neighbours(names, looking(elsewhere), moved) == []
     mixed = np.random.default_rng(1).permutation(len(names))
-    assert folds(names, looking(angles % 180), seen[mixed]) == []  # photographs in no order
-    assert folds(names[:8], looking(angles[:8] * 30 % 180), seen[:8]) == []  # too few
+    assert folded_neighbours(names, looking(angles % 180), seen[mixed]) == []  # photographs in no order
+    assert folded_neighbours(names[:8], looking(angles[:8] * 30 % 180), seen[:8]) == []  # too few
 
 
 def test_thumbnails_are_box_means_without_brightness_and_contrast() -> None:
@@ -76,4 +76,4 @@ def test_of_real_captures_one_is_folded(real_data: Path, capture: str, pairs: in
     seen = np.stack([thumbnail(read_image(image)) for image in parsed.image_paths])
     names = [image.name for image in parsed.image_paths]
     ahead = -parsed.cameras.camera_to_worlds[:, :, 2].numpy()
-    assert len(folds(names, ahead, seen)) == pairs
+    assert len(folded_neighbours(names, ahead, seen)) == pairs

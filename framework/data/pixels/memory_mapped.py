@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SLICE = 64_000_000
+MAX_SLICE = 64_000_000
 """Maximum number of bytes read before their pages are dropped."""
-SMALLEST_SLICE = 2**20
+MIN_SLICE = 2**20
 """Minimum number of bytes read before their pages are dropped."""
 
 
@@ -32,7 +32,7 @@ class MappedPixels:
 
     def __init__(self, path: Path, count: int, channels: int, limit: float) -> None:
         self.path = path
-        self.slice = int(min(max(limit / 8, SMALLEST_SLICE), SLICE))
+        self.slice = int(min(max(limit / 8, MIN_SLICE), MAX_SLICE))
         """Number of bytes read before pages are dropped."""
         with path.open("rb") as file:
             # Read-only: the system would reserve memory for a writable private mapping.

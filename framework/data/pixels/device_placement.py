@@ -7,7 +7,7 @@ import torch
 from nerfloom.base.device import free_memory
 from nerfloom.data.dataset import Dataset
 
-MOST = 0.5
+MAX_MEMORY_SHARE = 0.5
 """Maximum fraction of a device's free memory for images; the rest is for the model and its steps."""
 MB = 1_000_000
 """Bytes of a megabyte."""
@@ -21,11 +21,11 @@ def on_device(dataset: Dataset, device: torch.device) -> tuple[Dataset, str | No
         device: the training device.
 
     Returns:
-        The data set, and a line about the location of its pixels; None on the CPU. Pixels that need more than `MOST` of
-        the device's free memory stay where they are; batches of them are drawn on the CPU and copied.
+        The data set, and a line about the location of its pixels; None on the CPU. Pixels that need more than
+        `MAX_MEMORY_SHARE` of the device's free memory stay where they are; their batches are drawn on the CPU.
     """
     free, size = free_memory(device), sum(values.nbytes for values in _moved(dataset))
-    fits = dataset.mapped is None and size <= MOST * free
+    fits = dataset.mapped is None and size <= MAX_MEMORY_SHARE * free
     moved = dataset.to(device, with_pixels=fits)
     if device.type == "cpu":
         return moved, None

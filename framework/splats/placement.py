@@ -23,7 +23,7 @@ IMAGE_SIZE = 800
 """Longer side of rendered pictures, pixels."""
 
 
-def placed_alone(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, Scene]:
+def placed_gaussians(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, Scene]:
     """Return the placement of Gaussians without images, and their scene.
 
     The median of the centres becomes the origin, and half of the Gaussians are then within `HALF_WITHIN` of it. Medians

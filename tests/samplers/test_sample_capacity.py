@@ -1,4 +1,4 @@
-"""Training samples in a fixed number of slots: the same pictures and gradients, and room for what is needed."""
+"""Training samples in a fixed number of slots: the same pictures and gradients, and capacity for what is needed."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.rendering.volume import shade
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.samplers.sample_capacity import HEADROOM, LIMIT, PIECE, Room
+from nerfloom.samplers.sample_capacity import HEADROOM, MAX_SLOTS, SLOTS_MULTIPLE, SampleCapacity
 from tests.samplers.test_occupancy import BOX, CountingField, KeptField, random_rays
 
 
@@ -64,7 +64,7 @@ def test_a_step_waits_for_nothing_and_its_sizes_hold() -> None:
     assert before.varies is None
     assert made.step_kind(9) == before
     made.read_counts()
-    assert made.step_kind(10) != before  # there was room for every step of every ray
+    assert made.step_kind(10) != before  # there was capacity for every step of every ray
     assert len(made.sample(random_rays(100), field, jitter=True)) < counts.pop()[0]
 
 
@@ -101,34 +101,35 @@ def test_what_is_derived_from_the_grid_stays_where_it_is() -> None:
     assert samples[0].num_evaluated == len(usual.sample(rays, field, jitter=False))
 
 
-def noted(room: Room, rays: int, *needed: int, left_out: int = 0) -> None:
-    room.note(rays, tuple(map(torch.tensor, needed)), torch.tensor(left_out))  # type: ignore[arg-type]
+def noted(capacity: SampleCapacity, rays: int, *needed: int, left_out: int = 0) -> None:
+    capacity.note(rays, tuple(map(torch.tensor, needed)), torch.tensor(left_out))  # type: ignore[arg-type]
 
 
 def test_room_follows_the_most_that_was_needed_and_mostly_stays() -> None:
-    room = Room(runs=10, steps=66)
-    assert room.of(1000) == (10_240, 66_048, 66_048)
-    room.read()  # nothing was noted
-    assert room.per_ray == (10, 66, 66)
-    noted(room, 1000, 3000, 20_000, 4000)
-    noted(room, 1000, 2000, 24_000, 1000)
-    room.read()
-    assert room.per_ray == pytest.approx((HEADROOM * 3, HEADROOM * 24, HEADROOM * 4))
-    given = room.per_ray
-    noted(room, 1000, 2500, 26_000, 3500)  # fits, by little, and not far too roomy
-    room.read()
-    assert room.per_ray == given
-    noted(room, 1000, 2500, 40_000, 100, left_out=30)
-    room.read()
-    assert room.per_ray == pytest.approx((given[0], HEADROOM * 40, HEADROOM * 1))
-    assert (room.rays, room.left_out) == (4000, 30)
-    assert all(size % PIECE == 0 and size <= LIMIT for rays in (1, 999, 2**17) for size in room.of(rays))
-    assert min(room.of(1)) == PIECE
+    capacity = SampleCapacity(runs=10, steps=66)
+    assert capacity.of(1000) == (10_240, 66_048, 66_048)
+    capacity.read()  # nothing was noted
+    assert capacity.per_ray == (10, 66, 66)
+    noted(capacity, 1000, 3000, 20_000, 4000)
+    noted(capacity, 1000, 2000, 24_000, 1000)
+    capacity.read()
+    assert capacity.per_ray == pytest.approx((HEADROOM * 3, HEADROOM * 24, HEADROOM * 4))
+    given = capacity.per_ray
+    noted(capacity, 1000, 2500, 26_000, 3500)  # fits, by little, and not far too roomy
+    capacity.read()
+    assert capacity.per_ray == given
+    noted(capacity, 1000, 2500, 40_000, 100, left_out=30)
+    capacity.read()
+    assert capacity.per_ray == pytest.approx((given[0], HEADROOM * 40, HEADROOM * 1))
+    assert (capacity.rays, capacity.left_out) == (4000, 30)
+    sizes = [size for rays in (1, 999, 2**17) for size in capacity.of(rays)]
+    assert all(size % SLOTS_MULTIPLE == 0 and size <= MAX_SLOTS for size in sizes)
+    assert min(capacity.of(1)) == SLOTS_MULTIPLE
 
 
 def test_nothing_is_known_of_a_run_that_goes_on() -> None:
     """Its first step must not need the memory of all steps of all its rays."""
-    room = Room(runs=65, steps=514)
-    assert room.of(10_000) == (650_240, LIMIT, LIMIT)
-    assert room.of(10_000, usual=2**15) == (650_240, LIMIT, 2**17)
-    assert room.of(128, usual=2**15).kept == 65_792  # the first of a new run
+    capacity = SampleCapacity(runs=65, steps=514)
+    assert capacity.of(10_000) == (650_240, MAX_SLOTS, MAX_SLOTS)
+    assert capacity.of(10_000, usual=2**15) == (650_240, MAX_SLOTS, 2**17)
+    assert capacity.of(128, usual=2**15).kept == 65_792  # the first of a new run

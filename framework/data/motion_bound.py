@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Travel:
+class MotionBound:
     """Distance that matter may have moved since time 0, as a function of time.
 
     Between two times, matter moves at most by the difference of their distances.
@@ -21,7 +21,7 @@ class Travel:
     """(K,) float64 distances at these times, scene units, not decreasing; linear in between."""
 
     @classmethod
-    def of(cls, times: Tensor, speeds: Tensor) -> Travel:
+    def of(cls, times: Tensor, speeds: Tensor) -> MotionBound:
         """Integrate speeds over time.
 
         Args:

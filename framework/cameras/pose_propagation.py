@@ -7,16 +7,16 @@ from torch import Tensor
 
 from nerfloom.geometry.alignment import align_cameras, nearest_rotations
 
-WIDTH = 3.0
+KERNEL_WIDTH = 3.0
 """Training cameras within this distance have about equal weight, so that no single camera's error dominates. The unit
 is the median distance from a camera to its nearest neighbour."""
-FALL = 4.0
-"""Exponent of the distance by which weights of farther cameras fall off (Shepard 1968)."""
-MEASURED = 64
+WEIGHT_EXPONENT = 4.0
+"""Exponent of the distance in the weights of farther cameras (Shepard 1968)."""
+MAX_SPACING_CAMERAS = 64
 """Maximum number of cameras used to estimate the spacing."""
 
 
-def carried_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Tensor, float]:
+def propagated_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Tensor, float]:
     """Move poses as the cameras near them were moved.
 
     Every pose follows the similarity from given to refined poses. It also gets the weighted mean of the remaining
@@ -46,8 +46,8 @@ def _nearness(positions: Tensor, centers: Tensor) -> Tensor:
     """Return the weights (N, M) of cameras at `centers` (M, 3) for `positions` (N, 3); each row sums to 1."""
     spacing = 0.0
     if len(centers) > 1:
-        some = centers[:: -(-len(centers) // MEASURED)]
+        some = centers[:: -(-len(centers) // MAX_SPACING_CAMERAS)]
         spacing = float(torch.cdist(some, centers).topk(2, largest=False).values[:, 1].median())
-    squares = (positions[:, None] - centers).square().sum(-1) + (WIDTH * spacing) ** 2
+    squares = (positions[:, None] - centers).square().sum(-1) + (KERNEL_WIDTH * spacing) ** 2
     # In logarithms, because all cameras may be at one place.
-    return (-FALL / 2 * (squares + torch.finfo(squares.dtype).tiny).log()).softmax(dim=-1)
+    return (-WEIGHT_EXPONENT / 2 * (squares + torch.finfo(squares.dtype).tiny).log()).softmax(dim=-1)

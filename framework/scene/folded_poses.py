@@ -15,31 +15,31 @@ from collections.abc import Sequence
 
 import numpy as np
 
-SIDE = 16
+THUMBNAIL_SIDE = 16
 """Rows and columns of a thumbnail."""
-FEWEST = 12
+MIN_PHOTOGRAPHS = 12
 """Minimum number of photographs in a sequence."""
-SEQUENCE = 0.75
+MAX_SEQUENCE_DIFFERENCE = 0.75
 """Maximum difference between neighbours in a sequence, relative to the difference between distant ones (medians)."""
-ALIKE = 1.5
+MAX_DIFFERENCE_ALIKE = 1.5
 """Maximum difference between neighbours that look alike, relative to the median difference between neighbours."""
-TURN, TURNS = 75.0, 6.0
+MIN_TURN, MIN_RELATIVE_TURN = 75.0, 6.0
 """Minimum angle between the cameras of a fold: in degrees, and relative to the median angle between neighbours. A
 pattern printed four times around an object folds by 90 degrees."""
 
 
 def thumbnail(image: np.ndarray) -> np.ndarray:
-    """Return an image's luminance in `SIDE` rows and columns, with mean 0 and standard deviation 1.
+    """Return an image's luminance in `THUMBNAIL_SIDE` rows and columns, with mean 0 and standard deviation 1.
 
     Args:
         image: (H, W, 3 or more) of any numeric type.
 
     Returns:
-        (SIDE^2,) float32; 0 for an image of one colour.
+        (THUMBNAIL_SIDE^2,) float32; 0 for an image of one colour.
     """
-    step = max(min(image.shape[:2]) // (4 * SIDE), 1)
+    step = max(min(image.shape[:2]) // (4 * THUMBNAIL_SIDE), 1)
     light = image[::step, ::step, :3].mean(-1, dtype=np.float32)
-    starts = [np.arange(SIDE) * size // SIDE for size in light.shape]
+    starts = [np.arange(THUMBNAIL_SIDE) * size // THUMBNAIL_SIDE for size in light.shape]
     sums = np.add.reduceat(np.add.reduceat(light, starts[0], axis=0), starts[1], axis=1)
     counts = np.outer(*(np.diff(start, append=size) for start, size in zip(starts, light.shape, strict=True)))
     small = (sums / np.maximum(counts, 1)).ravel()  # smaller images repeat some rows or columns
@@ -54,7 +54,7 @@ def in_order(names: Sequence[str]) -> list[int]:
     return sorted(range(len(names)), key=lambda index: keys[index])
 
 
-def folds(names: Sequence[str], directions: np.ndarray, thumbnails: np.ndarray) -> list[tuple[int, int]]:
+def folded_neighbours(names: Sequence[str], directions: np.ndarray, thumbnails: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs of neighbours that look alike although their cameras look in very different directions.
 
     Args:
@@ -63,19 +63,20 @@ def folds(names: Sequence[str], directions: np.ndarray, thumbnails: np.ndarray) 
         thumbnails: (M, D) `thumbnail` of each photograph.
 
     Returns:
-        Indices of both photographs of each pair. Empty if the photographs are not a sequence, in which neighbours look
+        Indices of both photographs of each pair. Empty if the photographs are not a sequence, whose neighbours look
         more alike than distant ones.
     """
-    if len(names) < FEWEST:
+    if len(names) < MIN_PHOTOGRAPHS:
         return []
     order = np.array(in_order(names))
     ahead, seen = directions[order], thumbnails[order]
     turns = np.degrees(np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(-1), -1, 1)))
     differences, half = _differences(seen[1:], seen[:-1]), len(order) // 2
     usual = float(np.median(differences))
-    if usual > SEQUENCE * float(np.median(_differences(seen[half:], seen[: len(order) - half]))):
+    if usual > MAX_SEQUENCE_DIFFERENCE * float(np.median(_differences(seen[half:], seen[: len(order) - half]))):
         return []
-    found = (turns > max(TURN, TURNS * float(np.median(turns)))) & (differences <= ALIKE * usual)
+    turned = turns > max(MIN_TURN, MIN_RELATIVE_TURN * float(np.median(turns)))
+    found = turned & (differences <= MAX_DIFFERENCE_ALIKE * usual)
     return [(int(order[index]), int(order[index + 1])) for index in np.flatnonzero(found)]
 
 

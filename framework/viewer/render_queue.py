@@ -1,4 +1,4 @@
-"""Drawing for all browsers, one piece at a time, in the thread that calls `Studio.work`."""
+"""Drawing for all browsers, one piece at a time, in the thread that calls `RenderQueue.draw_next`."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from nerfloom.viewer.drawing import Truth, draw
 from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
 from nerfloom.viewer.request import Request, smaller
 
-REST = 0.15
+REFINE_AFTER = 0.15
 """Seconds without a new request before a picture is refined."""
-WHOLE = 1e6
+NO_LIMIT = 1e6
 """Time limit for a piece of a method that casts no rays, seconds, so large that a piece is the whole picture. Gaussians
 near an image's border depend on the image's size, so strips of it would differ from the whole: on fox they had 28
 dB."""
 
 
-class Studio:
-    """Pictures of one subject for several browsers.
+class RenderQueue:
+    """Pictures of one model for several browsers.
 
-    Browsers come, go and send requests in any thread. Everything is drawn by `work`, in the calling thread, so that a
+    Browsers come, go and send requests in any thread. `draw_next` draws everything in the calling thread, so that a
     model in training is never read while it changes.
 
     Args:
-        subject: the model and its run.
+        loaded: the model and its run.
         coarse_seconds: time limit for a picture while the camera moves.
         piece_seconds: time limit for a piece of a refinement.
         ndc: function that returns the normalised device coordinates of the scene; None if it has none.
@@ -42,13 +42,13 @@ class Studio:
 
     def __init__(
         self,
-        subject: Loaded,
+        loaded: Loaded,
         coarse_seconds: float = 0.1,
         piece_seconds: float = 0.1,
         ndc: Ndc | None = None,
         truth: Truth | None = None,
     ) -> None:
-        self.subject = subject
+        self.loaded = loaded
         self.coarse_seconds, self.piece_seconds = coarse_seconds, piece_seconds
         self.hurried = False
         self._ndc, self._truth = ndc, truth
@@ -59,12 +59,12 @@ class Studio:
 
     # -- any thread -------------------------------------------------------------------------------------------
 
-    def enter(self, number: int, browser: Browser) -> None:
+    def add(self, number: int, browser: Browser) -> None:
         """Add a `browser` with its `number`."""
         with self._lock:
             self._browsers[number] = browser
 
-    def leave(self, number: int) -> None:
+    def remove(self, number: int) -> None:
         """Remove the browser with a `number`, if it exists."""
         with self._lock:
             self._browsers.pop(number, None)
@@ -95,12 +95,12 @@ class Studio:
         self._asked.wait(seconds)
         self._asked.clear()
 
-    def work(self) -> float | None:
+    def draw_next(self) -> float | None:
         """Draw the next piece for one of the browsers, and return the seconds it took; None if there is none."""
         with self._lock:
             browsers = list(self._browsers.values())
         now = time.monotonic()
-        index = next_browser([one.waiting(self.subject.step, now) for one in browsers], now, REST)
+        index = next_browser([one.waiting(self.loaded.step, now) for one in browsers], now, REFINE_AFTER)
         if index is None:
             return None
         browser = browsers[index]
@@ -110,13 +110,13 @@ class Studio:
         except (NerfloomError, MemoryError, RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())[:300] or type(error).__name__
             say(f"viewer: a picture could not be drawn: {reason}")
-            browser.drawn, browser.pieces, browser.step = browser.wanted, [], self.subject.step
+            browser.drawn, browser.pieces, browser.step = browser.wanted, [], self.loaded.step
         browser.served_at = time.monotonic()
         return time.perf_counter() - start
 
     def _serve(self, browser: Browser) -> None:
         """Draw the next piece for a browser."""
-        request, step, budget = browser.wanted, self.subject.step, self._piece_seconds
+        request, step, budget = browser.wanted, self.loaded.step, self._piece_seconds
         assert request is not None
         if request != browser.drawn:
             stride = coarse_stride(self._speed, request.width, request.height, self.coarse_seconds, browser.stride)
@@ -133,17 +133,17 @@ class Studio:
 
     @property
     def _piece_seconds(self) -> float:
-        return self.piece_seconds if isinstance(self.subject.model, RendersRays) else WHOLE
+        return self.piece_seconds if isinstance(self.loaded.model, RendersRays) else NO_LIMIT
 
     @property
     def _rays(self) -> Rays:
         """Rays per pixel of a finished picture; one while there is other work."""
-        return 1 if self.hurried else cast("Rays", self.subject.model.rays_per_pixel)
+        return 1 if self.hurried else cast("Rays", self.loaded.model.rays_per_pixel)
 
     def _timed(self, request: Request, piece: Piece) -> Arrays:
         """Draw a piece and measure its time."""
         start = time.perf_counter()
-        kept = draw(self.subject, request, piece, self._ndc, self._truth)
+        kept = draw(self.loaded, request, piece, self._ndc, self._truth)
         pixels = smaller(request.width, request.height, piece.stride)[0] * (piece.bottom - piece.top)
         self._speed = self._speed.with_one(pixels * piece.rays, time.perf_counter() - start)
         return kept

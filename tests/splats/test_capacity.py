@@ -9,7 +9,7 @@ from torch import Tensor
 from benchmarks.operations import trainer_of
 from nerfloom.kernels.splats.project import RECORD
 from nerfloom.kernels.splats.tiles import TileLists
-from nerfloom.splats.capacity import FADED, HEADROOM, PIECE, Capacity
+from nerfloom.splats.capacity import ENTRIES_MULTIPLE, FADED, HEADROOM, Capacity
 from nerfloom.training.skipping import skip_report
 from tests.training.recorded import ahead
 
@@ -32,8 +32,8 @@ def test_room_is_the_most_that_images_have_needed_and_some_more(monkeypatch: pyt
     capacity.read()
     given = capacity.of(RECORDS, 64)
     assert given is not None
-    assert given % PIECE == 0
-    assert HEADROOM * 100_000 <= given < HEADROOM * 100_000 + PIECE
+    assert given % ENTRIES_MULTIPLE == 0
+    assert HEADROOM * 100_000 <= given < HEADROOM * 100_000 + ENTRIES_MULTIPLE
     assert capacity.of(RECORDS, 65) is None  # a larger image
     assert capacity.of(RECORDS[:0], 64) is None
     capacity.note(RECORDS, 64, lists(given, given + 1000))
@@ -44,7 +44,7 @@ def test_room_is_the_most_that_images_have_needed_and_some_more(monkeypatch: pyt
     assert more >= HEADROOM * (given + 1000)
     capacity.note(RECORDS, 64, lists(more, 10))
     capacity.read()
-    assert abs(capacity.of(RECORDS, 64) / (FADED * more) - 1) < 2 * PIECE / more  # type: ignore[operator]
+    assert abs(capacity.of(RECORDS, 64) / (FADED * more) - 1) < 2 * ENTRIES_MULTIPLE / more  # type: ignore[operator]
 
 
 def test_the_cpu_asks() -> None:

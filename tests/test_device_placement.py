@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixels import residence
+from nerfloom.data.pixels import device_placement
 from nerfloom.data.pixels.batch import PixelBatch, draw_batch, draw_pixels
+from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.data.pixels.error_map import ErrorMap
 from nerfloom.data.pixels.pixel_set import PixelSet
-from nerfloom.data.pixels.residence import on_device
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.dataparsers.blender import Blender
 
@@ -69,7 +69,7 @@ def test_images_go_to_the_device_as_bytes_if_they_take_half_of_its_room(
     assert dataset.drawn is not None
     assert dataset.drawn.every is not None
     size = dataset.pixels.numel() + 4 * len(dataset.drawn)
-    monkeypatch.setattr(residence, "free_memory", lambda device: room * size)
+    monkeypatch.setattr(device_placement, "free_memory", lambda device: room * size)
     moved, line = on_device(dataset, ELSEWHERE)
     fits = room > 2
     assert moved.resident == fits

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-GRID = 4096
+MAX_PIXELS = 4096
 """Maximum number of pixels of an image used."""
 QUANTILES = (10, 25, 50, 75, 90)
 """Quantiles, per cent."""
-FEWEST = 64
+MIN_PIXELS = 64
 """Minimum number of usable pixels; images with fewer are ignored."""
 APPEARANCE_STOPS = 0.13
 """Minimum spread in stops for varying light. Of seven captures, five in steady light had 0.02 to 0.09; one with dimmed
@@ -33,12 +33,12 @@ def light_of(image: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:
         (3, Q) float32, in stops: quantiles of log2 of luminance, red over green, and blue over green. NaN if too few
         pixels are usable.
     """
-    step = max(int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / GRID))), 1)
+    step = max(int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / MAX_PIXELS))), 1)
     pixels = image[step // 2 :: step, step // 2 :: step].reshape(-1, image.shape[2])
     usable = np.ones(len(pixels), bool) if kept is None else kept[step // 2 :: step, step // 2 :: step].reshape(-1)
     if image.shape[2] == 4:
         usable = usable & (pixels[:, 3] == 255)
-    if usable.sum() < FEWEST:
+    if usable.sum() < MIN_PIXELS:
         return np.full((3, len(QUANTILES)), np.nan, np.float32)
     stored = pixels[usable, :3] / 255
     linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)

@@ -13,14 +13,13 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.rasteriser import Projected, Rasteriser
 
 
-class Redrawn:
+class PreparedGaussians:
     """Gaussians that are prepared when they are drawn a second time.
 
     Preparing takes as long as a few pictures; after a step of training a viewer draws only one.
 
     Args:
         gaussians: the Gaussians; they must not change.
-        rasteriser: the rasteriser.
         time: time of the scene; None for a still scene.
     """
 

@@ -9,12 +9,12 @@ from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice
 from nerfloom.data.scene import Scene
 
-TIMES_A_VERTEX, LEAST_VERTICES, MOST_VERTICES = 6, 3, 2**10
+TIMES_A_VERTEX, MIN_VERTICES, MAX_VERTICES = 6, 3, 2**10
 """Number of image times per vertex along a time axis, and the minimum and maximum number of vertices. The paper has 2
 times per vertex, for training fifty times as long as minutes on a processor: docs/notes/motion.md."""
 
 
-TIMES_A_SLICE, MOST_SLICES = 9, 16
+TIMES_A_SLICE, MAX_SLICES = 9, 16
 """Number of image times per time slice of the occupancy grid, and the maximum number of slices."""
 
 
@@ -39,21 +39,21 @@ class MotionConfig(RayConfig):
     disable."""
     transparent_share: float = 1.0
     """Fraction of the drawn transparent pixels that is rendered; their weight grows accordingly. 1 renders all."""
+    learns_motion = True
 
 
 def vertices_in_time(scene: Scene) -> int:
     """Return the number of vertices along a time axis, from the number of image times of `scene`."""
-    return min(max(scene.num_times // TIMES_A_VERTEX, LEAST_VERTICES), MOST_VERTICES)
+    return min(max(scene.num_times // TIMES_A_VERTEX, MIN_VERTICES), MAX_VERTICES)
 
 
 def slices_choice(scene: Scene, sampler: str) -> Choice:
     """Return the number of time slices of the occupancy grid that suits the scene.
 
     Args:
-        scene: properties of the scene.
         sampler: the chosen sampler.
     """
     shown = scene.moving and scene.has_alpha and not scene.unbounded and sampler == "occupancy"
-    count = min(max(scene.num_times // TIMES_A_SLICE, 1), MOST_SLICES) if shown else 1
+    count = min(max(scene.num_times // TIMES_A_SLICE, 1), MAX_SLICES) if shown else 1
     reason = f"the images have {scene.num_times} times"
     return Choice("time_slices", count, reason, "slices of time in the occupancy grid")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RayConfig, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import seed_step
 from nerfloom.cameras.view import every
 from nerfloom.data.dataset import Dataset
@@ -31,12 +31,12 @@ from nerfloom.training.optim import Adam, make_optimizer, set_learning_rate
 from nerfloom.training.preparation import show_images
 from nerfloom.training.step import backward, forward
 
-RAYS = 256
+MAX_PIXELS = 256
 """Maximum number of pixels in a step."""
 STEPS = 60
 """Number of training steps of the model shared by several checks."""
 BUDGET = 200
-"""Number of steps for which schedules are computed; checks run the first of them."""
+"""Length of the schedules, steps; checks run the first of them."""
 SEED = 42
 STRIDE = 3
 """Distance between the rendered rows and columns of an image."""
@@ -48,8 +48,6 @@ class Learner:
     """A model in training on one scene, with the trainer's steps.
 
     Args:
-        method: the method.
-        config: the method's settings.
         dataset: images of the scene.
         seed: random seed of the initial parameters.
     """
@@ -82,7 +80,7 @@ class Learner:
             rays_per_pixel: rays through each pixel, if the batch is of pixels.
         """
         seed_step(SEED, self.done)
-        count = min(self.config.num_rays_per_batch, RAYS) if isinstance(self.config, RayConfig) else 0
+        count = min(self.model.config.num_rays_per_batch, MAX_PIXELS) if self.model.batches == "pixels" else 0
         return self.source.draw(Request(self.done, count, rays_per_pixel))
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:
@@ -190,11 +188,10 @@ class Learner:
         return fmean(errors)
 
 
-class Subject:
+class MethodUnderTest:
     """A method under test, with its settings and scenes.
 
     Args:
-        method: the method.
         name: the method's name in messages.
         config: the method's settings; its defaults if None.
     """

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.encodings.opening import Opening
 from nerfloom.fields.base import Field
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
@@ -150,6 +150,6 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
         return shape.distances, shape.gradients
 
     def before_step(self, step: int, progress: float) -> None:
-        for opening in parts(self, Opening):
+        for opening in parts(self, OpenLevels):
             opening.advance(progress)
         self.sampler.update(step, self.surface.density_around)

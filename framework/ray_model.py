@@ -17,7 +17,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.coarse_to_fine import OpenLevels
-from nerfloom.fields.base import Field
+from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError
@@ -179,7 +179,12 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         """Open levels of encodings up to `progress`, and update the sampler for `step`."""
         for opening in parts(self, OpenLevels):
             opening.advance(progress)
-        self.sampler.update(step, self.field.density)
+        self.sampler.update(step, self.grid_density)
+
+    @property
+    def grid_density(self) -> DensityFunction:
+        """The density by which the sampler finds occupied cells; the field's."""
+        return self.field.density
 
     def density(self, points: Points) -> Tensor:
         """Return the density (N,) at `points`, in 1/length."""

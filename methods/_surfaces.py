@@ -10,20 +10,18 @@ from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
-from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.fields.base import Field
+from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.losses.surfaces import Eikonal, Silhouette
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
-from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.renderer import Renderer
-from nerfloom.rendering.volume import VolumeRenderer
+from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import decide_samples
@@ -122,7 +120,9 @@ def make_background(config: SurfaceConfig, scene: Scene) -> InvertedField:
 
 def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     """Return the renderer, with a background if the scene has one."""
-    return background_renderer(config, scene, make_background, SurfaceRenderer(thin=config.thin_gradients))
+    return background_renderer(
+        config, scene, make_background, SurfaceRenderer(scaled_up_to(config, scene), config.thin_gradients)
+    )
 
 
 class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
@@ -149,7 +149,6 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
         shape = self.surface.shape(points.positions)
         return shape.distances, shape.gradients
 
-    def before_step(self, step: int, progress: float) -> None:
-        for opening in parts(self, OpenLevels):
-            opening.advance(progress)
-        self.sampler.update(step, self.surface.density_around)
+    @property
+    def grid_density(self) -> DensityFunction:
+        return self.surface.density_around

@@ -85,11 +85,11 @@ def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> Non
     from nerfloom.export.meshing import density_mesh, distance_mesh
     from nerfloom.renderable import HasDensity, HasSignedDistance
 
-    model, level, cameras = loaded.model, flags.isosurface_threshold, loaded.run.parse("train").cameras
-    start = time.monotonic()
+    model, level, start = loaded.model, flags.isosurface_threshold, time.monotonic()
     if isinstance(model, HasSignedDistance):
         if level is not None:
             raise FlagError(f"--isosurface-threshold: the surface of {loaded.method} is where its distance is 0")
+        cameras = loaded.run.parse("train").cameras
         _write(distance_mesh(model, lattice, cameras, cleaning, texturing), loaded.placement, path, start)
         return
     if not isinstance(model, HasDensity):
@@ -101,6 +101,7 @@ def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> Non
     if level is None:
         level = default_level(model.scene.box)
         say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
+    cameras = loaded.run.parse("train").cameras
     mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning, texturing)
     _write(mesh, loaded.placement, path, start)
 

@@ -92,7 +92,7 @@ class SurfaceField(BoxField):
         appearance: Appearance | None = None,
     ) -> None:
         super().__init__(box, encoding)
-        self.grid, self.sharpness = encoding, sharpness
+        self.sharpness = sharpness
         if encoding.deferred is not None:  # gradients of this table are those of features and of their derivatives
             encoding.deferred = TableGradient(LOOK_UP, encoding.layout)
         self.size = float((box[1] - box[0]).min()) / 2
@@ -108,6 +108,12 @@ class SurfaceField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
         self.cell = 0.0
         """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
+
+    @property
+    def grid(self) -> HashGrid:
+        """The hash grid."""
+        assert isinstance(self.encoding, HashGrid)
+        return self.encoding
 
     def shape(self, positions: Tensor) -> Shape:
         """Return distance, gradient and features at positions.

@@ -129,9 +129,7 @@ def read_views(file: Path) -> dict[str, dict[int, Tensor]]:
     try:
         arrays = read_small_arrays(file, lambda name: ENTRY.fullmatch(name) is not None, LARGEST_ENTRY)
     except zipfile.BadZipFile as error:
-        raise DataError(
-            f"{file} is not an archive of numpy arrays (.npz), or it is truncated; copy it again"
-        ) from error
+        raise DataError(f"{file} is not an archive of numpy's (.npz), or it is damaged; copy it again") from error
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or one_line(error)}") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, SyntaxError, zlib.error and more
@@ -179,7 +177,7 @@ def _masks(names: list[str], folder: Path, masks: list[str], quiet: bool) -> tup
     missing = found.count(None)
     if missing == len(names):
         raise DataError(
-            f"{folder}: none of its {len(masks)} masks, such as {masks[0]}, belongs to {names[0]} or others"
+            f"{folder}: no image, such as {names[0]}, has one of its {len(masks)} masks, such as {masks[0]}"
         )
     if not quiet:
         if common == "order":
@@ -212,7 +210,7 @@ def _sphere(file: Path, matrices: Mapping[int, Tensor], numbers: list[int], quie
     off = first[:, :3].T @ first[:, :3] / max(radius, 1e-300) ** 2 - torch.eye(3, dtype=torch.float64)
     if not bool(first.isfinite().all()) or not radius > 0 or not bool((off.abs() < SIMILAR).all()):
         raise DataError(
-            f"{file}: scale_mat_{number} is not a scale and a shift: it must map the unit sphere to a sphere"
+            f"{file}: scale_mat_{number} does not map the unit sphere to a sphere; it must be a scale and a shift"
         )
     for other, matrix in used:
         if not bool(((matrix - first).abs() <= SIMILAR * radius).all()):

@@ -31,7 +31,8 @@ def partners(names: Sequence[str], others: Sequence[str]) -> tuple[list[int | No
     """Return which of N others belongs to each of M names, and the words for what they were matched by.
 
     Names without ending are compared, then the last numbers in them. If neither finds a partner for every name, but
-    there are as many others, both are matched in their order. Otherwise those without a partner have none.
+    there are as many others, they may be matched by order: if their numbers differ by a constant, as those that start
+    at 0 and at 1, or if no name and no number agrees. Otherwise those without a partner have none.
 
     Args:
         names: M names of images, in order.
@@ -44,11 +45,28 @@ def partners(names: Sequence[str], others: Sequence[str]) -> tuple[list[int | No
             return found, words
         if found.count(None) < best[0].count(None):
             best = found, words
-    return (list(range(len(names))), "order") if len(names) == len(others) else best
+    shifted = _shifted([last_number(name) for name in names], [last_number(other) for other in others])
+    if shifted is not None:
+        return shifted, "order"
+    if len(names) == len(others) and best[0].count(None) == len(names):
+        return list(range(len(names))), "order"
+    return best
 
 
 KEYS: tuple[tuple[Callable[[str], str | None], str], ...] = ((without_ending, "name"), (last_number, "number"))
 """What two names may have in common, and the word for it."""
+
+
+def _shifted(names: Sequence[str | None], others: Sequence[str | None]) -> list[int | None] | None:
+    """Return for each number the index of the one at the same rank among others, if all differ by one constant."""
+    ours = [int(number) for number in names if number is not None]
+    theirs = [int(number) for number in others if number is not None]
+    if not len(ours) == len(names) == len(theirs) == len(others) == len(set(ours)):
+        return None
+    shift = min(theirs) - min(ours)
+    places = {number: index for index, number in enumerate(theirs)}
+    found = [places.get(number + shift) for number in ours]
+    return None if None in found else found
 
 
 def _matched(names: Sequence[str | None], others: Sequence[str | None]) -> list[int | None]:

@@ -1,4 +1,4 @@
-"""sdfstudio's scenes: meta_data.json with cameras, region of interest, and the transform to the original frame.
+"""Scenes of sdfstudio: meta_data.json with cameras, region of interest, and the transform to the original frame.
 
 Yu et al. 2022. Monocular depths and normals, image pairs and lists of sparse points that it may name are not read.
 """

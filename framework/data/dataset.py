@@ -265,10 +265,9 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         DataError: if no pixel has a ray, or a depth image is invalid.
     """
     cameras = parsed.cameras
-    kept, opaque = None if masks == "off" else decoded.kept, None
     light = None if decoded.pixels.shape[1] == 4 else decoded.light
-    shows_object = masks == "auto" and parsed.object_distances is not None
-    if kept is not None and (masks == "empty" or shows_object or (masks == "auto" and cuts_out(kept, cameras))):
+    kept, opaque = None if masks == "off" else decoded.kept, None
+    if kept is not None and _means_empty(parsed, kept, masks):
         kept, opaque = None, kept
         if parsed.object_distances is not None:
             near, far = parsed.object_distances
@@ -319,6 +318,12 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         scene_indices=parsed.scene_indices,
         source_images=parsed.source_images,
     )
+
+
+def _means_empty(parsed: ParsedScene, kept: PixelSet, masks: Masks) -> bool:
+    """Return whether pixels that are not in `kept` show nothing."""
+    shows_object = parsed.object_distances is not None
+    return masks == "empty" or (masks == "auto" and (shows_object or cuts_out(kept, parsed.cameras)))
 
 
 def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:

@@ -93,12 +93,14 @@ def test_a_skew_is_left_out_while_nobody_sees_it(capsys: pytest.CaptureFixture[s
     [
         (["000000.png", "000001.png"], ["000.png", "001.png"], ([0, 1], "number")),
         (["a.png", "b.png"], ["b.jpg", "a.jpg"], ([1, 0], "name")),
-        (["3.png", "7.png"], ["0", "3", "5", "7"], ([1, 3], "number")),
+        (["3.png", "7.png"], ["0", "3", "5", "7"], ([1, 3], "name")),
         (["1.png", "2.png", "3.png"], ["0", "1", "2"], ([0, 1, 2], "order")),
-        (["0.png", "1.png", "9.png"], ["0", "1"], ([0, 1, None], "number")),
+        (["0.png", "1.png", "9.png"], ["0", "1"], ([0, 1, None], "name")),
         (["rect_001_3_r5000.png", "rect_002_3_r5000.png"], ["0", "1"], ([0, 1], "order")),
+        (["1.png", "10.png", "2.png"], ["0", "1", "9"], ([0, 2, 1], "order")),
+        (["0.png", "2.png", "3.png"], ["000.png", "001.png", "003.png"], ([0, None, 2], "number")),
         (["left.png", "right.png"], ["0", "1", "2"], ([None, None], "name")),
-        (["1.png", "01.png", "2.png"], ["1", "2"], ([None, None, 1], "number")),
+        (["1.png", "01.png", "2.png"], ["1", "2"], ([0, None, 1], "name")),
     ],
 )
 def test_what_belongs_together(names: list[str], others: list[str], expected: tuple[list[int | None], str]) -> None:

@@ -266,12 +266,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     """
     cameras = parsed.cameras
     light = None if decoded.pixels.shape[1] == 4 else decoded.light
-    kept, opaque = None if masks == "off" else decoded.kept, None
-    if kept is not None and _means_empty(parsed, kept, masks):
-        kept, opaque = None, kept
-        if parsed.object_distances is not None:
-            near, far = parsed.object_distances
-            parsed = replace(parsed, near=near, far=far, unbounded=False)
+    parsed, kept, opaque = _with_masks(parsed, None if masks == "off" else decoded.kept, masks)
     names = tuple(path.name for path in parsed.image_paths)
     visible = pixels_with_rays(cameras, names, split)
     if visible is not None:
@@ -320,10 +315,19 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     )
 
 
-def _means_empty(parsed: ParsedScene, kept: PixelSet, masks: Masks) -> bool:
-    """Return whether pixels that are not in `kept` show nothing."""
-    shows_object = parsed.object_distances is not None
-    return masks == "empty" or (masks == "auto" and (shows_object or cuts_out(kept, parsed.cameras)))
+def _with_masks(
+    parsed: ParsedScene, kept: PixelSet | None, masks: Masks
+) -> tuple[ParsedScene, PixelSet | None, PixelSet | None]:
+    """Return the scene, its pixels that are kept and its pixels that are opaque, by the meaning of masks.
+
+    A scene of which masks show the object ends at its box.
+    """
+    shown = parsed.object_distances
+    if kept is None or masks in ("ignored", "off"):
+        return parsed, kept, None
+    if masks == "auto" and shown is None and not cuts_out(kept, parsed.cameras):
+        return parsed, kept, None
+    return parsed if shown is None else replace(parsed, near=shown[0], far=shown[1], unbounded=False), None, kept
 
 
 def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:

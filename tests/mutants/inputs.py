@@ -8,7 +8,7 @@ MUTANTS = {
         Mutant("depth-unit-without-scale", "_depths", "A * parsed.scale", "A",
             "depth images are in metres where the scene is not",
             "truth/test_captures.py::test_what_goes_with_a_photograph_goes_with_it_where_others_are_missing"),
-        Mutant("object-without-end", "assemble", "replace(A, near=B, far=C, unbounded=False)",
+        Mutant("object-without-end", "_with_masks", "replace(A, near=B, far=C, unbounded=False)",
             "replace(A, near=B, far=C)",
             "a scan that masks cut out is learnt as an unbounded scene",
             "dataparsers/test_dtu.py::test_masks_show_the_object_and_rays_run_where_it_is"),

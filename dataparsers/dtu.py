@@ -176,9 +176,7 @@ def _masks(names: list[str], folder: Path, masks: list[str], quiet: bool) -> tup
     found, common = partners(names, masks)
     missing = found.count(None)
     if missing == len(names):
-        raise DataError(
-            f"{folder}: no image, such as {names[0]}, has one of its {len(masks)} masks, such as {masks[0]}"
-        )
+        raise DataError(f"{folder}: no image, like {names[0]}, has one of its {len(masks)} masks, like {masks[0]}")
     if not quiet:
         if common == "order":
             say(f"{folder}: masks are assigned to images in the order of their names, as these differ")

@@ -376,6 +376,7 @@ def test_bad_folders(folder: Path) -> None:
         Dtu().parse(folder, "train")
 
 
+@pytest.mark.data
 @pytest.mark.medium
 def test_a_real_scan(real_data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """DTU's scan 24: the middles of the masks meet near the sphere's, which all masks show."""

@@ -91,7 +91,7 @@ class Dtu(Captured):
     ) -> PosedImages:
         """Return the images with the cameras of these numbers, without masks."""
         labels = [f"{file}: world_mat_{number}" for number in numbers]
-        projections = factored(torch.stack([views["world_mat"][number] for number in numbers])[:, :3], labels)
+        projections = factored(torch.stack([views["world_mat"][number] for number in numbers]), labels)
         for pose, label in zip(projections.poses, labels, strict=True):
             check_pose(pose, label)
         actual = image_sizes(paths)
@@ -120,7 +120,7 @@ def read_views(file: Path) -> dict[str, dict[int, Tensor]]:
         file: the file.
 
     Returns:
-        world_mat, scale_mat and camera_mat -> number of a view, ascending -> (4, 4) float64.
+        world_mat, scale_mat and camera_mat -> number of a view, ascending -> (3, 4) float64, without the last row.
 
     Raises:
         DataError: if the file is missing, damaged or holds pickled objects, if an array is not a matrix of numbers, or

@@ -1,7 +1,8 @@
 """Folders of IDR and NeuS: images, masks of the object, and cameras_sphere.npz, as for DTU and BlendedMVS.
 
 The file has for each view the projection `world_mat_i` to pixels, and `scale_mat_i`, which maps the unit sphere around
-the object to the world (Yariv et al. 2020; Wang et al. 2021).
+the object to the world (Yariv et al. 2020; Wang et al. 2021). The first pixel's centre is taken to be at 0.5, as
+COLMAP has it: docs/notes/images.md has the measurement.
 """
 
 from __future__ import annotations

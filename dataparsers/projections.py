@@ -13,8 +13,6 @@ from nerfloom.base.console import say
 
 SINGULAR = 1e-10
 """A matrix whose determinant is smaller, relative to the product of its rows' lengths, has no inverse."""
-HALF_PIXEL = 0.5
-"""Position of a pixel's centre here. Projection matrices of this kind have it at whole numbers, as OpenCV does."""
 FACTORS = (1, 1 / 2, 2, 1 / 3, 3, 1 / 4, 4, 1 / 6, 6, 1 / 8, 8)
 """Sizes that are tried, relative to the images'."""
 OFF_CENTRE = 1.1
@@ -31,7 +29,7 @@ class Projections:
     """M projections in parts."""
 
     intrinsics: Tensor
-    """(M, 4) float64 fx, fy, cx, cy, pixels; the first pixel's centre is at 0.5."""
+    """(M, 4) float64 fx, fy, cx, cy, pixels, in the matrices' coordinates of pixels."""
     skews: Tensor
     """(M,) float64, pixels to the right per unit of y / z."""
     poses: Tensor
@@ -45,7 +43,7 @@ def factored(matrices: Tensor, labels: Sequence[str]) -> Projections:
     section 6.2.4). A matrix and its negative are the same projection.
 
     Args:
-        matrices: (M, 3, 4) float64, from homogeneous positions to homogeneous pixels with centres at whole numbers.
+        matrices: (M, 3, 4) float64, from homogeneous positions to homogeneous pixels.
         labels: M names for messages.
 
     Raises:
@@ -68,9 +66,8 @@ def factored(matrices: Tensor, labels: Sequence[str]) -> Projections:
     poses = torch.eye(4, dtype=torch.float64).repeat(len(matrices), 1, 1)
     poses[:, :3, :3] = rotations.mT * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     poses[:, :3, 3] = -torch.linalg.solve(matrices[:, :, :3], matrices[:, :, 3])
-    (fx, skews, cx), (_, fy, cy), (_, _, unit) = (row.unbind(-1) for row in intrinsic.unbind(1))
-    values = torch.stack([fx / unit, fy / unit, cx / unit + HALF_PIXEL, cy / unit + HALF_PIXEL], -1)
-    return Projections(values, skews / unit, poses)
+    (fx, skews, cx), (_, fy, cy) = (row.unbind(-1) for row in intrinsic[:, :2].unbind(1))  # the third row ends in 1
+    return Projections(torch.stack([fx, fy, cx, cy], -1), skews, poses)
 
 
 def size_made_for(

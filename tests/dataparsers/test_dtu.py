@@ -49,10 +49,9 @@ def true_poses(count: int = COUNT) -> np.ndarray:
 
 
 def projections(stretch: float = 1.0, count: int = COUNT, skew: float = 0.0) -> list[np.ndarray]:
-    """(4, 4) from the world to pixels of images `stretch` times as large, whose first has its centre at 0."""
+    """(4, 4) from the world to pixels of images `stretch` times as large, whose first has its centre at 0.5."""
     intrinsic = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
     intrinsic[:2] *= stretch
-    intrinsic[:2, 2] -= 0.5
     intrinsic[0, 1] = skew
     found = []
     for pose in true_poses(count):

@@ -31,7 +31,6 @@ def test_a_projection_comes_apart_into_what_it_was_made_of() -> None:
     intrinsic, rotations, positions, matrices = made()
     found = factored(torch.from_numpy(matrices), [str(index) for index in range(COUNT)])
     expected = np.stack([intrinsic[:, 0, 0], intrinsic[:, 1, 1], intrinsic[:, 0, 2], intrinsic[:, 1, 2]], -1)
-    expected[:, 2:] += 0.5  # centres at whole numbers there, at 0.5 here
     errors = {
         "intrinsics": np.abs(found.intrinsics.numpy() / expected - 1).max(),
         "skew": np.abs(found.skews.numpy() / intrinsic[:, 0, 1] - 1).max(),

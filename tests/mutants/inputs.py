@@ -241,8 +241,8 @@ MUTANTS = {
             "dataparsers/test_polycam.py::test_depth_goes_with_its_image"),
     ],
     "nerfloom.dataparsers.projections": [
-        Mutant("projection-half-pixel", "factored", "cx / A + HALF_PIXEL", "cx / A",
-            "photographs of scans are shifted by half a pixel of the cameras' size",
+        Mutant("projection-exchanged", "factored", "[fx, fy, cx, cy]", "[fx, fy, cy, cx]",
+            "the principal point of scans has row and column exchanged",
             "dataparsers/test_projections.py::test_a_projection_comes_apart_into_what_it_was_made_of"),
         Mutant("projection-sign", "factored", "A.sign()[:, None, None] / B", "1 / B",
             "cameras whose projection was stored with the other sign look the other way",

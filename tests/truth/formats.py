@@ -190,10 +190,10 @@ def write_record3d(folder: Path) -> Path:
 
 
 def write_dtu(folder: Path) -> Path:
-    """Projections for images twice as large, whose pixels have their centres at whole numbers, and a sphere."""
+    """Projections for images twice as large, and a sphere."""
     write_photographs(folder / "image", [f"{index:06d}.png" for index in range(COUNT)])
     intrinsic, sphere = np.eye(3), np.diag([1.1 * RADIUS] * 3 + [1.0])
-    intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] = 2 * np.array(PINHOLE.intrinsics) - [0, 0, 0.5, 0.5]
+    intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] = 2 * np.array(PINHOLE.intrinsics)
     sphere[:3, 3] = CENTRE
     arrays = {f"world_mat_{index}": np.eye(4) for index in range(COUNT)}
     for index in range(COUNT):

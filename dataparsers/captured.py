@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 
 from nerfloom import Cameras, DataError, ParsedScene
+from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import Placement, estimate_near, held_out
 from nerfloom.data.dataset import existing_files
 from nerfloom.data.image_files import image_size
 from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
 from nerfloom.dataparsers.placing import Applied, placement_of
-from nerfloom.dataparsers.posed_images import Captured, PosedImages
+from nerfloom.dataparsers.posed_images import Captured, PosedImages, StatedRegion
+from nerfloom.dataparsers.region import distances
 from nerfloom.dataparsers.sparse_points import sparse_points
 from nerfloom.geometry.lenses import LENSES
 
@@ -58,6 +60,8 @@ def captured_scene(
     _check_flags(flags)
     images, reduction = _choose_files(images, flags.downscale_factor)
     images = images[existing_files(images.paths, split)]
+    if images.region is not None and images.masks is not None:
+        images = images[_with_mask(images, split)]
     names = list(images.names)
     chosen = held_out(names, split, flags.eval_interval) if division is None else division(names)
     if len(chosen) == 0:
@@ -69,12 +73,14 @@ def captured_scene(
     cameras = placed_cameras(images, placement)
     sparse = sparse_points(images, placement, cameras, chosen if split == "train" else None)
     near = min(estimate_near(cameras, sparse.sound), flags.far / 2) if flags.near is None else flags.near
+    box = _box(flags, images.region, placement)
+    shows_object = images.region is not None and images.masks is not None
     images = images[chosen]
     _check_masks(images.masks)
     return ParsedScene(
         image_paths=images.paths,
         cameras=cameras[chosen],
-        box=torch.tensor([[-1.0], [1.0]]).expand(2, 3) * flags.scene_scale,
+        box=box,
         near=near,
         far=flags.far,
         times=images.times,
@@ -87,6 +93,7 @@ def captured_scene(
         unbounded=True,
         poses=flags.poses,
         depth_paths=images.depths,
+        object_distances=_object_distances(flags, cameras, box) if shows_object else None,
     )
 
 
@@ -197,6 +204,35 @@ def _beside(folder: Path, paths: tuple[Path | None, ...] | None, step: int) -> t
     root = _shared_folder(folder, [path for path in paths if path is not None])
     reduced = [None if path is None else _reduced(path, root, step) for path in paths]
     return tuple(small if small and small.is_file() else path for small, path in zip(reduced, paths, strict=True))
+
+
+def _with_mask(images: PosedImages, split: Split) -> Tensor:
+    """Return the indices of images with a mask. Others would show the surroundings that masks call empty."""
+    masks = images.masks or ()
+    kept = [index for index, mask in enumerate(masks) if mask is not None]
+    if len(kept) < len(masks) and split == "train":
+        first = images.names[masks.index(None)]
+        missing = len(masks) - len(kept)
+        say(f"{images.folder}: {missing} of {len(masks)} images have no mask and are skipped, the first {first}")
+    return torch.tensor(kept, dtype=torch.int64)
+
+
+def _box(flags: Captured, region: StatedRegion | None, placement: Placement) -> Tensor:
+    """Return the region of interest (2, 3): the cube around the origin, or the box around the one that is stated."""
+    if region is None:
+        return torch.tensor([[-1.0], [1.0]]).expand(2, 3) * flags.scene_scale
+    half = region.half if region.is_ball else placement.transform[:, :3].abs() @ region.half
+    center, half = placement.points(region.center[None])[0], half * placement.scale * flags.scene_scale
+    return checked_box(torch.stack([center - half, center + half]).float(), "the region of interest and --scene-scale")
+
+
+def _object_distances(flags: Captured, cameras: Cameras, box: Tensor) -> tuple[float, float]:
+    """Return near and far for an object in `box`, within those of the flags."""
+    near, far = distances(cameras, box.double())
+    near, far = max(near, flags.near or 0.0), min(far, flags.far)
+    if near >= far:
+        raise DataError(f"--near {flags.near} and --far {flags.far} leave nothing of the object, from {near} to {far}")
+    return near, far
 
 
 def _check_masks(masks: tuple[Path | None, ...] | None) -> None:

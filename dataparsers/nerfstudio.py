@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -24,6 +23,7 @@ from nerfloom.data.suffixes import IMAGE_SUFFIXES
 from nerfloom.data.tracks import Tracks
 from nerfloom.dataparsers.captured import Division, captured_scene, checked_box, image_sizes
 from nerfloom.dataparsers.colmap_beside import names_in_model, tracks_beside
+from nerfloom.dataparsers.companions import companions
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
@@ -107,8 +107,8 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
         sizes=intrinsics.sizes,
         model=intrinsics.model,
         lens=intrinsics.lens,
-        masks=_companions(file.parent, frames, "mask_path", labels, IMAGE_SUFFIXES, split),
-        depths=_companions(file.parent, frames, "depth_file_path", labels, DEPTH_SUFFIXES, split),
+        masks=companions(file.parent, frames, "mask_path", labels, IMAGE_SUFFIXES, split),
+        depths=companions(file.parent, frames, "depth_file_path", labels, DEPTH_SUFFIXES, split),
         times=read_times(frames, labels),
         points=_points(file, content, split),
         tracks=_tracks(file, content, placed, poses),
@@ -117,23 +117,6 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
 
 def _has_exr(depths: tuple[Path | None, ...] | None) -> bool:
     return any(path is not None and path.suffix.lower() == ".exr" for path in depths or ())
-
-
-def _companions(
-    folder: Path,
-    frames: list[dict[str, Any]],
-    key: str,
-    labels: list[str],
-    endings: Sequence[str],
-    split: Split,
-) -> tuple[Path | None, ...] | None:
-    """Return files that accompany the frames' images; None for a frame without one, and None if no frame has one."""
-    named = [frame.get(key) for frame in frames]
-    if all(name is None for name in named):
-        return None
-    written = [file_name(name, key, label) for name, label in zip(named, labels, strict=True) if name is not None]
-    files = iter(on_disk(folder, written, f"files of '{key}'", endings, split != "train", shared=2))
-    return tuple(None if name is None else next(files) for name in named)
 
 
 def _points(file: Path, content: dict[str, Any], split: Split) -> Tensor | None:

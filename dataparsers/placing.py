@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from nerfloom import ParsedScene
@@ -51,6 +52,10 @@ def _placement(flags: Captured, images: PosedImages, split: Split, applied: Appl
     spread = camera_spread(images.poses, images.points if images.tracks is None else images.tracks.points)
     if spread is not None and spread < MIN_PARALLAX and split == "train" and images.model != "orthographic":
         say(warning(spread))
+    if images.region is not None:
+        rotation = place(images.poses, orientation, "none", False).transform[:, :3]
+        transform = torch.cat([rotation, -(rotation @ images.region.center)[:, None]], -1)
+        return Placement(transform, flags.scale_factor / float(images.region.half.max()))
     scaled = flags.auto_scale_poses and spread != 0  # distances of cameras in one position are rounding errors
     placement = place(images.poses, orientation, flags.center_method, scaled)
     if scaled and images.model != "orthographic":

@@ -28,10 +28,11 @@ class Captured(DataParser):
     """Up direction: the cameras' mean up direction (up), of photographs that lie on their side what is up then (auto),
     the axis of least spread of the cameras' positions (pca), or unchanged."""
     center_method: Center = "poses"
-    """Origin: the cameras' mean position (poses), the point that they look at (focus), or unchanged."""
+    """Origin: the cameras' mean position (poses), the point that they look at (focus), or unchanged. No effect on data
+    that states a region of interest (dtu, sdfstudio), which becomes the cube."""
     auto_scale_poses: bool = True
     """Scale camera positions to fit the cube from -1 to 1. If long lenses show less than half a scene unit of what most
-    cameras look at, it is enlarged until they show one."""
+    cameras look at, it is enlarged until they show one. No effect on data that states a region of interest."""
     placement: Path | None = None
     """dataparser_transforms.json of a run, ours or nerfstudio's, whose placement is taken instead of all of these."""
     eval_interval: int = 8
@@ -44,6 +45,18 @@ class Captured(DataParser):
     poses: PoseSource = "photographs"
     """Source of the poses: exact, estimated from the images (photographs), or tracked by the device; methods may refine
     them accordingly."""
+
+
+@dataclass(frozen=True)
+class StatedRegion:
+    """Region of interest that the input states, in its frame and units: a ball or a box."""
+
+    center: Tensor
+    """(3,) float64 centre."""
+    half: Tensor
+    """(3,) float64 half of the box's edges, which are parallel to the input's axes; of a ball, its radius."""
+    is_ball: bool
+    """Whether it is a ball, whose box in the scene has edges parallel to the scene's axes."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +90,9 @@ class PosedImages:
     """(K, 3) sparse points in the input's frame; None for those of `tracks`."""
     tracks: Tracks | None = None
     """Which images see which sparse points, in the input's frame; None if that is not known."""
+    region: StatedRegion | None = None
+    """Region of interest, by which the scene is then placed, and which holds the object that masks show; None if the
+    input states none."""
 
     def __getitem__(self, index: Tensor) -> PosedImages:
         """Return the images selected by an index tensor."""

@@ -102,7 +102,7 @@ def find_region(
         center, half, reason = -around.transform[:, 3].double(), 1 / around.scale, "around the cameras"
     near, far = NEAR * half / HALF_SIZE, FAR * half / HALF_SIZE
     if ends:
-        near, far = _distances(cameras, _cube(center, half) if box is None else box)
+        near, far = distances(cameras, _cube(center, half) if box is None else box)
     return Region(center, half, near, far, not ends, reason)
 
 
@@ -113,7 +113,7 @@ def _cube(center: Tensor, half: float) -> Tensor:
 def cube_at_origin(cameras: Cameras, half: float) -> Region:
     """Return a cube of half side `half` around the origin, with near and far for `cameras`."""
     center = torch.zeros(3, dtype=torch.float64)
-    return Region(center, half, *_distances(cameras, _cube(center, half)), False, "from --half-size")
+    return Region(center, half, *distances(cameras, _cube(center, half)), False, "from --half-size")
 
 
 def _opaque(images: Sequence[Path]) -> list[Tensor] | None:
@@ -135,10 +135,14 @@ def _opaque_pixels(path: Path) -> Tensor:
         return torch.ones(1, 1, dtype=torch.bool)
 
 
-def _distances(cameras: Cameras, box: Tensor) -> tuple[float, float]:
-    """Return near and far, from the smallest and the largest distance between `cameras` and points of `box` (2, 3).
+def distances(cameras: Cameras, box: Tensor) -> tuple[float, float]:
+    """Return near and far, from the smallest and the largest distance between cameras and points of a box.
 
     Near is at least a small fraction of the box that cameras inside it hardly resolve.
+
+    Args:
+        cameras: M cameras.
+        box: (2, 3) float64 minimum and maximum corner.
     """
     origins = cameras.camera_to_worlds[:, :, 3].double()
     nearest = (origins - torch.minimum(torch.maximum(origins, box[0]), box[1])).norm(dim=-1)

@@ -94,11 +94,12 @@ FORMATS = {
     "instant-ngp-data": "nerfstudio",
     "nerfstudio-data": "nerfstudio",
     "phototourism-data": "phototourism",
+    "sdfstudio-data": "sdfstudio",
 }
 """Data subcommand of nerfstudio -> data format here."""
 NO_FORMATS = (
     "arkitscenes-data", "dycheck-data", "mill19-data", "minimal-parser", "nerfosr-data", "nuscenes-data",
-    "scannet-data", "scannetpp-data", "sdfstudio-data", "sitcoms3d-data",
+    "scannet-data", "scannetpp-data", "sitcoms3d-data",
 )  # fmt: skip
 """Data subcommands of nerfstudio without a data format here."""
 _MESH = "use 'marching-cubes' (methods with density) or 'tsdf' (all methods) for meshes"

@@ -32,8 +32,8 @@ from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
 from nerfloom.data.sparse_depth import SparseDepth, sparse_depth
 
-Masks = Literal["auto", "ignored", "empty"]
-"""Meaning of masked-out pixels. ignored: unknown content. empty: background."""
+Masks = Literal["auto", "ignored", "empty", "off"]
+"""Meaning of masked-out pixels. ignored: unknown content. empty: background. off: as any others, masks are not read."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ def load_dataset(
         parsed: output of a data parser.
         split: name of the split in messages.
         memory: memory limit and cache folder; if None, half of the machine's memory and the user's cache folder.
-        masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
+        masks: meaning of masked-out pixels; auto: empty if the format says so, otherwise decided by `cuts_out`.
 
     Raises:
         DataError: if an image's size differs from its camera's, no image is readable, or the scene's distances are
@@ -232,6 +232,8 @@ def load_dataset(
             f"split '{split}': near is {parsed.near} and far is {parsed.far}; --near must be at least 0 and less than "
             "--far, which must be finite"
         )
+    if masks == "off":
+        parsed = replace(parsed, mask_paths=None)
     count = len(parsed.image_paths)
     reductions = 2 ** torch.arange(parsed.num_scales).repeat_interleave(count)  # all images at one size, then the next
     if parsed.num_scales > 1:
@@ -257,15 +259,14 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
             other files only the names are used.
         decoded: the pixels (`decoding.decode` or `decoding.from_arrays`).
         split: name of the split in messages.
-        masks: meaning of masked-out pixels; auto: decided by `cuts_out`.
+        masks: meaning of masked-out pixels; auto: empty if the format says so, otherwise decided by `cuts_out`.
 
     Raises:
         DataError: if no pixel has a ray, or a depth image is invalid.
     """
     cameras = parsed.cameras
-    kept, opaque, light = decoded.kept, None, None if decoded.pixels.shape[1] == 4 else decoded.light
-    if kept is not None and (masks == "empty" or (masks == "auto" and cuts_out(kept, cameras))):
-        kept, opaque = None, kept
+    light = None if decoded.pixels.shape[1] == 4 else decoded.light
+    parsed, kept, opaque = _with_masks(parsed, None if masks == "off" else decoded.kept, masks)
     names = tuple(path.name for path in parsed.image_paths)
     visible = pixels_with_rays(cameras, names, split)
     if visible is not None:
@@ -312,6 +313,21 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         scene_indices=parsed.scene_indices,
         source_images=parsed.source_images,
     )
+
+
+def _with_masks(
+    parsed: ParsedScene, kept: PixelSet | None, masks: Masks
+) -> tuple[ParsedScene, PixelSet | None, PixelSet | None]:
+    """Return the scene, its pixels that are kept and its pixels that are opaque, by the meaning of masks.
+
+    A scene of which masks show the object ends at its box.
+    """
+    shown = parsed.object_distances
+    if kept is None or masks in ("ignored", "off"):
+        return parsed, kept, None
+    if masks == "auto" and shown is None and not cuts_out(kept, parsed.cameras):
+        return parsed, kept, None
+    return parsed if shown is None else replace(parsed, near=shown[0], far=shown[1], unbounded=False), None, kept
 
 
 def cuts_out(kept: PixelSet, cameras: Cameras) -> bool:

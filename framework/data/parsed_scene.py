@@ -57,6 +57,9 @@ class ParsedScene:
     """M files of depth along the camera's axis, 0 where unknown; None for an image without depth."""
     depth_unit: float = 0.001
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
+    object_distances: tuple[float, float] | None = None
+    """Near and far for an object that lies in `box` and that masks cut out, so that masked-out pixels are background;
+    None if masks only hide pixels."""
     scene_indices: Tensor | None = None
     """(M,) int64 index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None

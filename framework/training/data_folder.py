@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 PARTS = re.compile(
     r"transforms(_train|_val|_test)?\.json|poses_bounds\.npy|(cameras|frames|images|points3D|rigs)\.(bin|txt)"
-    r"|metadata\.json|.+\.tsv|(images|masks)(_\d+)?|sparse|colmap|[0-9]|train|val|test|rgb|EXR_RGBD|keyframes"
+    r"|metadata\.json|meta_data\.json|cameras(_sphere)?\.npz|.+\.tsv|(image|mask)s?(_\d+)?|sparse|colmap|[0-9]"
+    r"|train|val|test|rgb|EXR_RGBD|keyframes"
 )
 """Names of files and folders inside a data folder that users may pass instead of the folder itself."""
 MAX_LEVELS = 3

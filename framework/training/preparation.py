@@ -16,7 +16,7 @@ from nerfloom.base.decisions import Decision
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.cameras.upright import sideways_up
-from nerfloom.data.dataset import Dataset
+from nerfloom.data.dataset import Dataset, cuts_out
 from nerfloom.data.pixels.batch import training_background
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.geometry.bounds import nested_boxes
@@ -106,8 +106,9 @@ def profile_of(
     """
     scene, decisions = model.scene, []
     if dataset.opaque is not None and config.masks == "auto":
-        reason = "they remove over half of the pixels, and differ between photographs"
-        decisions.append(Decision("masks", "masked-out pixels are empty", f"{reason} (else: --masks ignored)"))
+        cut = cuts_out(dataset.opaque, dataset.cameras)
+        reason = f"they {'remove over half of the pixels, and differ between photographs' if cut else 'show an object'}"
+        decisions.append(Decision("masks", "masked-out pixels are empty", f"{reason} (else: --masks ignored or off)"))
     if config.background == "auto":
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))

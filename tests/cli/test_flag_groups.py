@@ -27,7 +27,9 @@ FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tenso
 """Methods with settings for few images."""
 WITH_BACKGROUND = ("instant-ngp", "nerf-plus-plus", "vanilla-nerf")
 """Methods with settings of a background."""
-FORMATS = ("blender", "colmap", "dnerf", "llff", "nerfstudio", "phototourism", "polycam", "record3d")
+FORMATS = (
+    "blender", "colmap", "dnerf", "dtu", "llff", "nerfstudio", "phototourism", "polycam", "record3d", "sdfstudio",
+)  # fmt: skip
 QUICK = ("instant-ngp", "nerfacto", "vanilla-nerf", "blender", "nerfstudio")
 """Of which help is read in the fast set: they have every box, and a format few flags or many."""
 Capture = pytest.CaptureFixture[str]

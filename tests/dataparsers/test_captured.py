@@ -13,8 +13,10 @@ from nerfloom.data.parsed_scene import DataParser
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from tests.conftest import write_tiny
 from tests.dataparsers.captures import FX, poses, worst_miss, write_capture, write_images
+from tests.dataparsers.test_dtu import write_dtu
 from tests.dataparsers.test_polycam import write_polycam
 from tests.dataparsers.test_record3d import write_record3d
+from tests.dataparsers.test_sdfstudio import write_sdfstudio
 
 NAMES = [f"{index:03d}.png" for index in range(9)]
 EXACT = 2e-6
@@ -137,6 +139,8 @@ def test_each_folder_is_recognised_by_one_format(tmp_path: Path) -> None:
         "nerfstudio": write_capture(tmp_path / "nerfstudio"),
         "record3d": write_record3d(tmp_path / "record3d"),
         "polycam": write_polycam(tmp_path / "polycam"),
+        "dtu": write_dtu(tmp_path / "dtu"),
+        "sdfstudio": write_sdfstudio(tmp_path / "sdfstudio"),
     }
     inner = tmp_path / "record3d" / "EXR_RGBD"
     both = {"record3d": write_record3d(tmp_path / "both"), "polycam": write_polycam(tmp_path / "both")}
@@ -161,6 +165,7 @@ def test_each_folder_is_recognised_by_one_format(tmp_path: Path) -> None:
         ("record3d_door", "record3d"),
         ("lego", "blender"),
         ("bouncingballs", "dnerf"),
+        ("dtu_scan24", "dtu"),
     ],
 )
 def test_real_folders_are_recognised(real_data: Path, folder: str, expected: str) -> None:

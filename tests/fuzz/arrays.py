@@ -2,8 +2,10 @@
 
 import ast
 import io
+import math
 import pickle
 import struct
+import zipfile
 from random import Random
 
 import numpy as np
@@ -72,3 +74,39 @@ def _with_header(content: bytes, **entries: str) -> bytes:
 ARRAY = (
     other_shape, other_shape, other_kind, other_kind, other_order, other_version, long_header, pickled, archive, *RAW,
 )  # fmt: skip
+
+
+def entry(random: Random, content: bytes) -> bytes:
+    """An archive of arrays, one of which is damaged, or another's."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = {name: archive.read(name) for name in archive.namelist()}
+    except Exception:  # damaged before
+        return random.choice(RAW)(random, content)
+    name = random.choice(sorted(entries))
+    what = random.random()
+    if what < 0.2:
+        entries[random.choice(sorted(entries))] = entries.pop(name)
+    elif what < 0.5:
+        entries[name] = other_numbers(random, entries[name])
+    else:
+        entries[name] = random.choice(ARRAY)(random, entries[name])
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+        for name, held in entries.items():
+            archive.writestr(zipfile.ZipInfo(name), held)
+    return file.getvalue()
+
+
+def other_numbers(random: Random, content: bytes) -> bytes:
+    """Some of the last values of an array of float64 are others."""
+    values = bytearray(content)
+    for _ in range(random.choice((1, 1, 3, 16))):
+        start = len(values) - 8 * random.randrange(1, 17)
+        if start >= 0:
+            number = random.choice((0.0, -1.0, 1e-300, 1e300, -1e18, 1e5, math.nan, math.inf, 0.5))
+            struct.pack_into("<d", values, start, number)
+    return bytes(values)
+
+
+ARCHIVE = (entry, entry, entry, archive, *RAW[:2])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from fnmatch import fnmatch
 from random import Random
 
-from tests.fuzz.arrays import ARRAY
+from tests.fuzz.arrays import ARCHIVE, ARRAY
 from tests.fuzz.files import Files, Link
 from tests.fuzz.pictures import PICTURE
 from tests.fuzz.raw import RAW
@@ -24,6 +24,7 @@ KINDS: dict[str, Sequence[Mutation]] = {
     "tsv": (*TEXT, *TEXT, *RAW),
     "ply": (*TEXT, *RAW),
     "npy": ARRAY,
+    "npz": ARCHIVE,
     "png": PICTURE,
     "jpg": PICTURE,
 }

@@ -28,11 +28,13 @@ from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap
 from nerfloom.dataparsers.dnerf import DNeRF
+from nerfloom.dataparsers.dtu import Dtu
 from nerfloom.dataparsers.llff import Llff
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.dataparsers.phototourism import Phototourism
 from nerfloom.dataparsers.polycam import Polycam
 from nerfloom.dataparsers.record3d import Record3D
+from nerfloom.dataparsers.sdfstudio import SdfStudio
 from nerfloom.downloads import unpack as downloads
 from nerfloom.evaluation.lpips import SHAPES, read_weights
 from nerfloom.processing import polycam, record3d
@@ -50,9 +52,11 @@ from tests.conftest import write_tiny
 from tests.dataparsers.captures import write_capture
 from tests.dataparsers.captures import write_images as write_pictures
 from tests.dataparsers.sparse_models import make_capture, write_colmap, write_images
+from tests.dataparsers.test_dtu import write_dtu
 from tests.dataparsers.test_llff import poses_bounds
 from tests.dataparsers.test_polycam import write_polycam
 from tests.dataparsers.test_record3d import write_record3d
+from tests.dataparsers.test_sdfstudio import write_sdfstudio
 from tests.exr_files import NONE, RLE, ZIP, ZIPS, write_exr
 from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
@@ -64,6 +68,10 @@ MEMORY = 20e6
 """Bytes of pixels that may be held in memory; small inputs stay far below."""
 COUNT = 5
 """Photographs of a capture."""
+SDFSTUDIO = (
+    "camera_model", "height", "width", "worldtogt", "scene_box", "aabb", "rgb_path", "camtoworld", "intrinsics",
+    "foreground_mask", "mask_path", "sensor_depth_path", "frames",
+)  # fmt: skip
 CAPTURE = (
     "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h",
     "camera_angle_x", "camera_angle_y", "file_path", "transform_matrix", "mask_path", "depth_file_path", "time",
@@ -392,6 +400,8 @@ READERS: dict[str, Reader] = {
     "llff-ndc": Reader(write_llff, partial(parse, Llff(ndc=True)), ("poses_bounds.npy",)),
     "record3d": Reader(write_record3d, partial(parse, Record3D()), ("EXR_RGBD/metadata.json",), ("K", "w", "h")),
     "polycam": Reader(write_polycam, partial(parse, Polycam()), ("keyframes/cameras/*.json",), ("fx", "cx", "width")),
+    "dtu": Reader(partial(write_dtu, count=COUNT), partial(parse, Dtu()), ("cameras_sphere.npz",)),
+    "sdfstudio": Reader(write_sdfstudio, partial(parse, SdfStudio()), ("meta_data.json",), SDFSTUDIO),
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
     "splats": Reader(write_splats, read_splats, ("splat.*",)),

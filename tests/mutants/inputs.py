@@ -8,6 +8,10 @@ MUTANTS = {
         Mutant("depth-unit-without-scale", "_depths", "A * parsed.scale", "A",
             "depth images are in metres where the scene is not",
             "truth/test_captures.py::test_what_goes_with_a_photograph_goes_with_it_where_others_are_missing"),
+        Mutant("object-without-end", "_with_masks", "replace(A, near=B, far=C, unbounded=False)",
+            "replace(A, near=B, far=C)",
+            "a scan that masks cut out is learnt as an unbounded scene",
+            "dataparsers/test_dtu.py::test_masks_show_the_object_and_rays_run_where_it_is"),
         Mutant("mask-decides-empty", "cuts_out", "A > B", "A < B",
             "masks that hide a passer-by are taken for emptiness",
             "test_masks.py::test_masks_cut_out_if_they_take_most_and_from_each_photograph_other_pixels"),
@@ -205,6 +209,11 @@ MUTANTS = {
             "--scale-factor changes the scene's unit, but not its depth images'",
             "truth/test_captures.py::test_every_pixel_shows_what_its_ray_meets"),
     ],
+    "nerfloom.dataparsers.numbered": [
+        Mutant("cameras-by-order-first", "partners", "None not in A", "A is None",
+            "photographs get each other's cameras where one is missing",
+            "dataparsers/test_projections.py::test_what_belongs_together"),
+    ],
     "nerfloom.dataparsers.phototourism": [
         Mutant("phototourism-test-as-train", "Phototourism.parse", "A == 'train'", "A != 'test'",
             "the validation views of a collection are photographs that are learnt from",
@@ -214,6 +223,10 @@ MUTANTS = {
             "dataparsers/test_phototourism.py::test_splits_are_the_tables", which=1),
     ],
     "nerfloom.dataparsers.placing": [
+        Mutant("sphere-not-centred", "_placement", "-(A @ images.region.center)[:, None]",
+            "(A @ images.region.center)[:, None]",
+            "the object of a scan is twice as far from the box as from the world's origin",
+            "dataparsers/test_dtu.py::test_the_sphere_becomes_the_box"),
         Mutant("scale-factor-before-transform", "_placement", "A * flags.scale_factor", "A / flags.scale_factor",
             "--scale-factor 2 halves the scene",
             "dataparsers/test_nerfstudio.py::test_rays_meet_the_points_that_the_files_cameras_see"),
@@ -226,6 +239,14 @@ MUTANTS = {
         Mutant("polycam-depth-unit", "Polycam.parse", "replace(A, depth_unit=B)", "replace(A, depth_unit=1 / B)",
             "Polycam's depth is a million times too far",
             "dataparsers/test_polycam.py::test_depth_goes_with_its_image"),
+    ],
+    "nerfloom.dataparsers.projections": [
+        Mutant("projection-exchanged", "factored", "[fx, fy, cx, cy]", "[fx, fy, cy, cx]",
+            "the principal point of scans has row and column exchanged",
+            "dataparsers/test_projections.py::test_a_projection_comes_apart_into_what_it_was_made_of"),
+        Mutant("projection-sign", "factored", "A.sign()[:, None, None] / B", "1 / B",
+            "cameras whose projection was stored with the other sign look the other way",
+            "dataparsers/test_projections.py::test_a_projection_comes_apart_into_what_it_was_made_of"),
     ],
     "nerfloom.dataparsers.record3d": [
         Mutant("record3d-focal-exchanged", "_intrinsics", "[A, B, C, D]", "[A, B, D, C]",
@@ -240,6 +261,11 @@ MUTANTS = {
     "nerfloom.dataparsers.rotations": [
         Mutant("record3d-quaternion-order", "rotations", "(A[:, :3], A[:, 3])", "(A[:, 1:], A[:, 0])",
             "Record3D's rotations are taken for w, x, y, z", "dataparsers/test_record3d.py::test_rotations_by_hand"),
+    ],
+    "nerfloom.dataparsers.sdfstudio": [
+        Mutant("sdfstudio-depth-unit", "SdfStudio.parse", "1 / A[1]", "A[1]",
+            "sensor depths of sdfstudio's scenes are off by the square of their scale",
+            "dataparsers/test_sdfstudio.py::test_masks_and_depths_go_with_their_images"),
     ],
     "nerfloom.dataparsers.sparse_points": [
         Mutant("sparse-points-not-placed", "sparse_points", "placement.points(A.points)", "A.points",

@@ -22,7 +22,7 @@ ELSEWHERE = {
     r"ns-train --load-config": "tests/cli/test_train_command.py",
     r"ns-train --resume": "tests/training/test_trainer.py",
     r"ns-train .*--vis viewer": "tests/viewer/test_training.py",
-    r"ns-train .* (blender|nerfstudio|colmap) --": "tests/truth/test_captures.py",
+    r"ns-train .* (blender|nerfstudio|colmap|dtu) --": "tests/truth/test_captures.py",
     r"ns-eval .*--eval-appearance half": "tests/truth/test_training.py",
     r"ns-render (camera-path|time) ": "tests/cli/test_render_command.py",
     r"ns-process-data (polycam|record3d) ": "tests/truth/test_processing.py",

@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from nerfloom import DataParser
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.colmap import Colmap
+from nerfloom.dataparsers.dtu import Dtu
 from nerfloom.dataparsers.llff import Llff
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.dataparsers.phototourism import Phototourism
 from nerfloom.dataparsers.polycam import Polycam
 from nerfloom.dataparsers.record3d import Record3D
+from nerfloom.dataparsers.sdfstudio import SdfStudio
 from tests.dataparsers.sparse_models import Capture, write_colmap
 from tests.truth.ball import (
     CENTRE,
@@ -28,6 +30,7 @@ from tests.truth.ball import (
     RADIUS,
     WIDTH,
     Lens,
+    depth,
     opencv_pose,
     pose_of,
     surface,
@@ -186,6 +189,39 @@ def write_record3d(folder: Path) -> Path:
     return folder
 
 
+def write_dtu(folder: Path) -> Path:
+    """Projections for images twice as large, and a sphere."""
+    write_photographs(folder / "image", [f"{index:06d}.png" for index in range(COUNT)])
+    intrinsic, sphere = np.eye(3), np.diag([1.1 * RADIUS] * 3 + [1.0])
+    intrinsic[[0, 1, 0, 1], [0, 1, 2, 2]] = 2 * np.array(PINHOLE.intrinsics)
+    sphere[:3, 3] = CENTRE
+    arrays = {f"world_mat_{index}": np.eye(4) for index in range(COUNT)}
+    for index in range(COUNT):
+        arrays[f"world_mat_{index}"][:3] = intrinsic @ opencv_pose(index)
+        arrays[f"scale_mat_{index}"] = sphere
+    np.savez(folder / "cameras_sphere.npz", **arrays)
+    return folder
+
+
+def write_sdfstudio(folder: Path) -> Path:
+    """In another frame and unit than the capture's, which the file tells; depth is in the file's."""
+    write_photographs(folder, NAMES)
+    fx, fy, cx, cy = PINHOLE.intrinsics
+    frames = []
+    for index, name in enumerate(NAMES):
+        np.save(folder / f"{index}_depth.npy", (depth(index) * APPLIED_SCALE).astype(np.float32))
+        pose = applied(pose_of(index)) @ np.diag([1.0, -1, -1, 1])
+        intrinsics = [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        names = {"rgb_path": name, "sensor_depth_path": f"{index}_depth.npy"}
+        frames.append({**names, "camtoworld": pose.tolist(), "intrinsics": intrinsics})
+    back = np.linalg.inv(np.diag([APPLIED_SCALE] * 3 + [1]) @ APPLIED)
+    centre = APPLIED_SCALE * (APPLIED[:3, :3] @ CENTRE + APPLIED[:3, 3])
+    box = {"aabb": [(centre - 0.3).tolist(), (centre + 0.3).tolist()], "near": 0.1, "far": 2.0, "radius": 0.3}
+    content = {"width": WIDTH, "height": HEIGHT, "worldtogt": back.tolist(), "scene_box": box, "frames": frames}
+    (folder / "meta_data.json").write_text(json.dumps(content))
+    return folder
+
+
 @dataclass(frozen=True)
 class Format:
     """A capture on the disk, and who reads it."""
@@ -259,6 +295,10 @@ FORMATS: dict[str, Format] = {
     "blender, twice as large": Format(
         Blender(near=1.2, far=2.8, scale_factor=2.0), write_blender, REST[2:], REST[:2], HELD
     ),
+    "dtu": Format(
+        Dtu(), write_dtu, tuple(f"{int(stem):06d}" for stem in REST), ("000000", "000008"), ("000000", "000008")
+    ),
+    "sdfstudio": _every_eighth(SdfStudio(), write_sdfstudio, 1000.0),
     "polycam": _every_eighth(Polycam(), write_polycam, 1000.0),
     "record3d": Format(
         Record3D(), write_record3d, tuple(str(int(stem)) for stem in REST), ("0", "8"), ("0", "8")

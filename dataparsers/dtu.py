@@ -21,7 +21,7 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.base.arrays import read_small_arrays
 from nerfloom.base.console import say
 from nerfloom.base.splits import Split
-from nerfloom.cameras.cameras import LARGEST_SIDE, check_pose
+from nerfloom.cameras.cameras import MAX_SIDE, check_pose
 from nerfloom.data.image_files import one_line
 from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.captured import captured_scene, has_transforms, image_sizes
@@ -69,8 +69,8 @@ class Dtu(Captured):
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
         if path is None:
             raise DataError("the dtu format needs a folder: --data DIR")
-        if self.camera_width is not None and not 1 <= self.camera_width <= LARGEST_SIDE:
-            raise DataError(f"--camera-width is {self.camera_width}; it must be from 1 to {LARGEST_SIDE} pixels")
+        if self.camera_width is not None and not 1 <= self.camera_width <= MAX_SIDE:
+            raise DataError(f"--camera-width is {self.camera_width}; it must be from 1 to {MAX_SIDE} pixels")
         quiet = split != "train"
         file = path / (self.cameras_path or _first(path, CAMERAS))
         views = read_views(file)
@@ -192,7 +192,7 @@ def _stated_size(matrix: Tensor | None) -> tuple[float, float] | None:
         return None
     across, down = float(matrix[0, 0]), float(matrix[1, 1])
     maps = abs(float(matrix[0, 2]) + 1) < SIMILAR and abs(float(matrix[1, 2]) + 1) < SIMILAR
-    if not maps or not min(across, down) > 2 / LARGEST_SIDE or max(across, down) > 2:
+    if not maps or not min(across, down) > 2 / MAX_SIDE or max(across, down) > 2:
         return None
     return 2 / across, 2 / down
 

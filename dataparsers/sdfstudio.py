@@ -15,18 +15,19 @@ from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
 from nerfloom.base.errors import shown
+from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import Orientation
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.data.scene import PoseSource
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
-from nerfloom.dataparsers.captured import EXTREME, captured_scene, has_transforms, image_sizes, sizes_of
+from nerfloom.dataparsers.captured import MAX_MAGNITUDE, captured_scene, has_transforms, image_sizes, sizes_of
 from nerfloom.dataparsers.companions import companions
 from nerfloom.dataparsers.placing import Applied, from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages, StatedRegion
 from nerfloom.dataparsers.projections import check_skew
-from nerfloom.dataparsers.reading import file_name, numbers, read_json, rigid, side_or_none
+from nerfloom.dataparsers.reading import file_name, numbers, rigid, side_or_none
 
 META = "meta_data.json"
 """File that identifies the format."""
@@ -51,7 +52,7 @@ class SdfStudio(Captured):
         if path is None:
             raise DataError("the sdfstudio format needs a folder: --data DIR")
         file = path / META
-        content = read_json(file)
+        content = read_object(file)
         applied = _from_gt(content, file)
         scene = captured_scene(self, _posed_images(file, content, split), split, applied=applied)
         return replace(from_original(scene, *applied), depth_unit=1 / applied[1])
@@ -112,7 +113,7 @@ def _region(content: dict[str, Any], file: Path) -> StatedRegion | None:
         raise DataError(f"{file}: 'aabb' is {shown(corners)}; it must be two corners")
     low, high = torch.tensor([numbers(corner, 3, "aabb", str(file)) for corner in corners], dtype=torch.float64)
     center, half = (low + high) / 2, (high - low) / 2
-    if not bool((half > 1 / EXTREME).all()) or not bool((center.abs() + half < EXTREME).all()):
+    if not bool((half > 1 / MAX_MAGNITUDE).all()) or not bool((center.abs() + half < MAX_MAGNITUDE).all()):
         raise DataError(f"{file}: 'aabb' is {shown(corners)}; it must be the lower and the upper corner of a box")
     return StatedRegion(center, half, is_ball=False)
 
@@ -126,7 +127,7 @@ def _from_gt(content: dict[str, Any], file: Path) -> Applied:
         raise DataError(f"{file}: 'worldtogt' is {shown(rows)}; it must be a 4x4 matrix")
     matrix = torch.tensor([numbers(row, 4, "worldtogt", str(file)) for row in rows[:3]], dtype=torch.float64)
     scale = float(matrix[:, :3].norm()) / math.sqrt(3)
-    if not 1 / EXTREME < scale < EXTREME:
+    if not 1 / MAX_MAGNITUDE < scale < MAX_MAGNITUDE:
         raise DataError(f"{file}: 'worldtogt' scales by {scale:.3g}: out of range")
     name = f"{file}: 'worldtogt', divided by its scale"
     back: Tensor = torch.linalg.inv(rigid(torch.cat([matrix[:, :3] / scale, matrix[:, 3:]], -1).tolist(), name, name))

@@ -128,8 +128,9 @@ def _notes(flags: GeometryFlags, found: Geometry, surface: Surface, reference: S
     left_out, reference_left_out = found.left_out.describe(), found.reference_left_out.describe()
     lines = [
         f"surface: {source}, {surface.describe()}; reference: {flags.reference}, {reference.describe()}",
-        f"lengths in the input's unit, of which the reference's longest side has {found.side:.6g}; accuracy is from the "
-        "surface to the reference, completeness back, and Chamfer the mean of both",
+        f"lengths are in the input's unit; the reference's longest side is {found.side:.6g}",
+        "accuracy: distance of the surface from the reference; completeness: of the reference from the surface; "
+        "Chamfer: the mean of both",
         f"judged: {seen}; surface: {left_out}; reference: {reference_left_out}",
     ]
     if reference.faces is None:

@@ -24,7 +24,7 @@ APART = 3.0
 STEEPEST = 20.0
 """Maximum change of depth across a ray, tangent of the angle between ray and normal: that of 87 degrees."""
 UNKNOWN_SLOPE = 2.0
-"""That tangent for points without normals."""
+"""That tangent where it is unknown which side of a surface is its back."""
 ORIENTED = 0.9
 """If this fraction of what cameras see first faces them, what faces away is the back of something."""
 TRIED = 16
@@ -66,7 +66,7 @@ def count_sightings(points: Samples, occluders: Samples, cameras: Cameras, shown
         buffer = _DepthBuffer.of(occluders, camera)
         at, counted = _project(points, camera), shown(index)
         kept = at.inside if counted is None else at.inside & counted.reshape(-1)[at.cell(1, camera)]
-        visible = kept & (at.distance <= buffer.behind(at))
+        visible = kept & (at.distance <= buffer.behind(at, STEEPEST if outward else UNKNOWN_SLOPE))
         if outward:
             visible &= outward * at.cosine < 0
         counts += torch.stack([at.inside, kept, visible])
@@ -139,12 +139,17 @@ class _DepthBuffer:
         near = max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1)
         return cls(camera, width, max_pool2d(-near, 3, 1, 1).reshape(-1), first)
 
-    def behind(self, at: _Projected) -> Tensor:
-        """Return the distance (N,) beyond which each of several points is hidden, scene units."""
+    def behind(self, at: _Projected, steepest: float) -> Tensor:
+        """Return the distance (N,) beyond which each of several points is hidden, scene units.
+
+        Args:
+            at: the points.
+            steepest: maximum change of depth across a ray.
+        """
         away = torch.ones_like(at.distance) if self.camera.model == "orthographic" else at.distance
         across = self.width / float(self.camera.fx) * away
         slope = (1 - at.cosine.square()).clamp(min=0).sqrt() / at.cosine.abs()
-        slope = slope.nan_to_num(nan=UNKNOWN_SLOPE).clamp(max=STEEPEST)
+        slope = slope.nan_to_num(nan=steepest).clamp(max=steepest)
         return self.nearest[at.cell(self.width, self.camera)] + across * (1 + 2 * slope)
 
 

@@ -23,7 +23,7 @@ def draw_on_triangles(corners: Tensor, count: int, seed: int = 0) -> tuple[Tenso
     """Draw points on triangles, evenly by area.
 
     The area is divided into `count` equal parts, in the order of the triangles, with a point in each. So a triangle's
-    number of points differs from its share by less than one. The same seed gives the same points.
+    number of points differs from its share by less than two. The same seed gives the same points.
 
     Args:
         corners: (F, 3, 3) float64 corners of triangles with a positive total area.

@@ -20,8 +20,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from benchmarks.exact_surfaces import surface_sample, visible_from
 from benchmarks.children import output_of
+from benchmarks.exact_surfaces import surface_sample, visible_from
 from nerfloom.base.child import python_command
 from nerfloom.base.console import say
 from nerfloom.base.errors import NerfloomError

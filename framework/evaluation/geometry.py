@@ -28,7 +28,7 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.evaluation.surfaces import DENSE, Samples, Surface, drawn, nearest
 from nerfloom.evaluation.visibility import Shown, count_sightings
 
-NUM_POINTS = 200_000
+NUM_POINTS = 100_000
 """Number of points on each surface."""
 F_SCORE_AT = (0.0025, 0.01)
 """Default distances of F-scores, in sides of the reference's bounding box."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from nerfloom.base.console import track
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.triangles import area_vectors, draw_on_triangles, nearest_on_triangles
@@ -18,7 +19,7 @@ DENSE = 500_000
 """Number of points on a mesh where nearest faces are looked for, and that hide what is behind them."""
 CANDIDATES = 8
 """Number of nearest points on a mesh whose faces are compared exactly."""
-AT_ONCE = 2**16
+AT_ONCE = 2**14
 """Number of positions whose nearest points are looked for at once."""
 
 
@@ -190,7 +191,8 @@ def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]
     owners = torch.cat([owners, bare.nonzero()[:, 0]])
     tree = _tree(places)
     distances, normals = [], []
-    for part in positions.split(AT_ONCE):
+    parts = positions.split(AT_ONCE)
+    for part in track(parts, "Measuring distances", total=len(parts)):
         found = torch.from_numpy(tree.query(part.numpy(), k=CANDIDATES, workers=-1)[1]).reshape(-1)
         repeated = part.repeat_interleave(CANDIDATES, dim=0)
         of_faces, away = nearest_on_triangles(repeated, corners[owners[found]])

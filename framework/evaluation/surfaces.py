@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +20,8 @@ DENSE = 500_000
 """Number of points on a mesh where nearest faces are looked for, and that hide what is behind them."""
 CANDIDATES = 8
 """Number of nearest points on a mesh whose faces are compared exactly."""
+UNIT = 1e-6
+"""Maximum deviation of a normal's length from 1."""
 AT_ONCE = 2**14
 """Number of positions whose nearest points are looked for at once."""
 
@@ -104,29 +107,26 @@ def usable(surface: Surface, name: str) -> tuple[Surface, list[str]]:
     finite = surface.points.isfinite().all(-1)
     notes = [] if finite.all() else [f"{int((~finite).sum()):,} points with coordinates that are not finite"]
     if surface.faces is None:
-        normals = surface.normals
-        if normals is not None and not bool((normals[finite].norm(dim=-1) > 0).all()):
-            normals = None
-            notes.append("all normals, as some are zero or not finite")
-        kept = Surface(surface.points[finite], None, None if normals is None else normalize(normals[finite], dim=-1))
-        if not len(kept.points) or not kept.side > 0:
-            raise DataError(f"{name} has no two points at different finite positions")
+        kept, normals = Surface(surface.points[finite]), surface.normals
+        members = finite
+    else:
+        held = finite[surface.faces].all(-1)
+        areas = area_vectors(surface.points[surface.faces]).norm(dim=-1)
+        real = (areas > 0) & areas.isfinite()
+        if (flat := int((held & ~real).sum())) > 0:
+            notes.append(f"{flat:,} faces without a finite area")
+        kept, normals = Surface(surface.points, surface.faces[held & real]), surface.normals
+        members = torch.zeros_like(finite).index_fill_(0, surface.faces[held & real].reshape(-1), True)
+        if not bool(members.any()):
+            raise DataError(f"{name} has no face with an area")
+    if not bool(members.any()) or not 0 < kept.side < math.inf:
+        raise DataError(f"{name} has no two points at a finite distance")
+    if normals is None:
         return kept, notes
-    held = finite[surface.faces].all(-1)
-    faces = surface.faces[held]
-    flat = ~(area_vectors(surface.points[faces]).norm(dim=-1) > 0)
-    if flat.any():
-        notes.append(f"{int(flat.sum()):,} faces without area")
-    faces = faces[~flat]
-    if not len(faces):
-        raise DataError(f"{name} has no face with an area")
-    normals = surface.normals
-    if normals is not None:
-        normals = normalize(normals, dim=-1)
-        if not bool((normals[faces.unique()].norm(dim=-1) > 0.5).all()):
-            normals = None
-            notes.append("normals at vertices, as some are zero or not finite; the faces' are used")
-    return Surface(surface.points, faces, normals), notes
+    normals = normalize(normals, dim=-1)
+    if not bool(((normals[members].norm(dim=-1) - 1).abs() < UNIT).all()):
+        return kept, [*notes, "all normals, as some are zero or not finite"]
+    return replace(kept, normals=normals[finite] if kept.faces is None else normals), notes
 
 
 def drawn(surface: Surface, count: int, seed: int = 0) -> Samples:

@@ -42,12 +42,12 @@ def mix(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
 
 
 def blend(a: Colour, b: Colour, weight: Tensor) -> Tensor:
-    """Return colours (3, R) between two colours, for weights (R,) in [0, 1]."""
+    """Return colours (3, R) between `a` (`weight` 0) and `b` (`weight` 1), for weights (R,)."""
     return torch.stack([x + (y - x) * weight for x, y in zip(a, b, strict=True)])
 
 
 def wave(x: Tensor, sharpness: float) -> Tensor:
-    """Return a square wave of period 2 pi with linear flanks, in [-1, 1]."""
+    """Return a square wave of `x` of period 2 pi, in [-1, 1], with flanks of slope `sharpness`."""
     return (x.sin() * sharpness).clamp(-1.0, 1.0)
 
 

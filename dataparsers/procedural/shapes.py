@@ -100,7 +100,11 @@ class Box(Shape):
         return face * p.sign()
 
     def interval(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parameters at which lines enter and leave; they miss where the first is not less."""
+        """Return the parameters at which lines enter and leave; they miss where the first is not less.
+
+        Args:
+            offset, direction: the lines.
+        """
         inverse = 1.0 / torch.where(direction.abs() < 1e-12, 1e-12, direction)
         middle, reach = -offset * inverse, inverse.abs() * self._column(offset)
         return (middle - reach).amax(0), (middle + reach).amin(0)

@@ -28,7 +28,7 @@ class Triangles(NamedTuple):
 
 
 def joined(parts: Sequence[Triangles]) -> Triangles:
-    """Return surfaces as one."""
+    """Return the surfaces `parts` as one."""
     starts = torch.tensor([0, *(len(part.vertices) for part in parts)]).cumsum(0)
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
     return Triangles(torch.cat([p.vertices for p in parts]), torch.cat([p.normals for p in parts]), torch.cat(faces))
@@ -51,7 +51,7 @@ def of_sphere(shape: Sphere, deviation: float) -> Triangles:
 
 
 def of_torus(shape: Torus, deviation: float) -> Triangles:
-    """Return the surface of a whole ring around y; `deviation` as in `of_sphere`."""
+    """Return the surface of the whole ring `shape` around y; `deviation` as in `of_sphere`."""
     along = _angles(_divisions(shape.major + shape.minor, deviation / 2))
     around = _angles(_divisions(shape.minor, deviation / 2))
     out = torch.stack([along.cos(), torch.zeros_like(along), along.sin()], -1)
@@ -60,13 +60,13 @@ def of_torus(shape: Torus, deviation: float) -> Triangles:
     return _grid(shape.major * out[:, None] + shape.minor * normals, normals, wraps=(True, True))
 
 
-def of_box(shape: Box, deviation: float = 0.0) -> Triangles:
-    """Return the surface of a cuboid, which is exact."""
+def of_box(shape: Box) -> Triangles:
+    """Return the surface of the cuboid `shape`, which is exact."""
     return joined([_rectangle(shape.half, axis, sign) for axis in range(3) for sign in (-1, 1)])
 
 
 def of_bored_box(shape: BoredBox, deviation: float) -> Triangles:
-    """Return the surface of a cuboid with a round hole along z; `deviation` as in `of_sphere`."""
+    """Return the surface of the cuboid `shape` with a round hole along z; `deviation` as in `of_sphere`."""
     x, y, z = shape.half
     corner = math.atan2(y, x)
     # The four corners are among the directions in which the faces around the hole are divided.

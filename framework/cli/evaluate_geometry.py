@@ -11,7 +11,7 @@ from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.evaluation.geometry import Geometry, Views, judge_surface, region_of
 from nerfloom.evaluation.surface_files import read_mesh, read_points
 from nerfloom.evaluation.surfaces import Surface, point_spacing, usable
-from nerfloom.export.surface import kind_for, surface_mesh
+from nerfloom.export.surface import SurfaceKind, kind_for, surface_mesh
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def read_reference(flags: GeometryFlags) -> Surface | None:
-    """Return the reference; None if the flags name none.
+    """Return the reference that `flags` name; None if they name none.
 
     Raises:
         DataError: if its file cannot be used.
@@ -50,11 +50,9 @@ def evaluate_geometry(
         DataError: if the file of the mesh cannot be used.
     """
     start = time.monotonic()
-    if mesh is None:
-        kind = kind_for(loaded.model) if flags.surface == "auto" else flags.surface
-        surface, source = _made(flags, loaded, reference, kind), kind
-    else:
-        surface, source = read_mesh(mesh), str(mesh)
+    kind = kind_for(loaded.model) if flags.surface == "auto" else flags.surface
+    surface = _made(flags, loaded, reference, kind) if mesh is None else read_mesh(mesh)
+    source = kind if mesh is None else str(mesh)
     views = None if flags.min_views == 0 else _views(loaded, flags.min_views)
     found = judge_surface(surface, reference, views, flags.f_score_at, flags.crop)
     console.print(_table(found))
@@ -73,7 +71,7 @@ def evaluate_geometry(
     return content, found.warning
 
 
-def _made(flags: GeometryFlags, loaded: Loaded, reference: Surface, kind: Any) -> Surface:
+def _made(flags: GeometryFlags, loaded: Loaded, reference: Surface, kind: SurfaceKind) -> Surface:
     """Return the surface that an export finds."""
     low = high = None
     if flags.crop is not None:

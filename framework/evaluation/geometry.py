@@ -47,7 +47,7 @@ class Distances:
 
     @classmethod
     def of(cls, distances: Tensor) -> Distances:
-        """Return the statistics of distances (N,)."""
+        """Return the statistics of `distances` (N,)."""
         return cls(float(distances.mean()), float(distances.median()))
 
 
@@ -210,7 +210,7 @@ def judge_surface(
 
 
 def region_of(reference: Surface, crop: float) -> tuple[Tensor, Tensor]:
-    """Return the corners (3,) of a reference's bounding box, enlarged on all sides by `crop` sides."""
+    """Return the corners (3,) of the bounding box of `reference`, enlarged on all sides by `crop` of its longest."""
     used = reference.points if reference.faces is None else reference.points[reference.faces.reshape(-1)]
     return used.amin(0) - crop * reference.side, used.amax(0) + crop * reference.side
 

@@ -149,7 +149,7 @@ def drawn(surface: Surface, count: int, seed: int = 0) -> Samples:
 
 
 def point_spacing(points: Tensor) -> float:
-    """Return the distance between neighbours among points (N, 3) on a surface: twice the median to the nearest.
+    """Return the distance between neighbours among `points` (N, 3) on a surface: twice the median to the nearest.
 
     Points at random places, N in an area, are half of sqrt(area / N) from the nearest in the mean.
     """
@@ -190,7 +190,7 @@ def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]
     places = torch.cat([(weights[:, None] @ corners[owners])[:, 0], corners[bare].mean(1)])
     owners = torch.cat([owners, bare.nonzero()[:, 0]])
     tree = _tree(places)
-    distances, normals = [], []
+    shortest_of, normals_of = list[Tensor](), list[Tensor]()
     parts = positions.split(AT_ONCE)
     for part in track(parts, "Measuring distances", total=len(parts)):
         found = torch.from_numpy(tree.query(part.numpy(), k=CANDIDATES, workers=-1)[1]).reshape(-1)
@@ -198,11 +198,11 @@ def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]
         of_faces, away = nearest_on_triangles(repeated, corners[owners[found]])
         shortest, chosen = away.view(-1, CANDIDATES).min(-1)
         chosen += torch.arange(len(part)) * CANDIDATES
-        distances.append(shortest)
+        shortest_of.append(shortest)
         there = surface.at(owners[found][chosen], of_faces[chosen]).normals
         assert there is not None
-        normals.append(there)
-    return torch.cat(distances), torch.cat(normals)
+        normals_of.append(there)
+    return torch.cat(shortest_of), torch.cat(normals_of)
 
 
 def _tree(points: Tensor) -> Any:

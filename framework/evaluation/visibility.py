@@ -1,6 +1,6 @@
-"""Which points of a surface cameras see: inside the image, at a pixel that counts, and not hidden by the surface.
+"""Visibility of the points of a surface to cameras.
 
-Many points of the surface are drawn into a depth buffer of each camera, whose cells are wide enough to hold several. A
+A camera sees a point that is inside its image, at a pixel that counts, and not hidden by the surface itself. Many points of the surface are drawn into a depth buffer of each camera, whose cells are wide enough to hold several. A
 point is hidden if it lies behind the nearest in its cell by more than the surface's slope there explains.
 """
 
@@ -36,7 +36,7 @@ Shown = Callable[[int], "Tensor | None"]
 
 @dataclass(frozen=True)
 class Sightings:
-    """How many cameras see each of N points."""
+    """Numbers of cameras that see each of N points."""
 
     inside: Tensor
     """(N,) number of cameras whose image contains the point."""

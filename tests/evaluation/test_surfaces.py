@@ -32,8 +32,8 @@ def test_faces_that_cannot_be_used_are_left_out_and_counted() -> None:
     [
         (Surface(torch.zeros(0, 3).double(), torch.zeros(0, 3).long()), "no face with an area"),
         (Surface(torch.full((3, 3), torch.nan).double(), torch.tensor([[0, 1, 2]])), "no face with an area"),
-        (Surface(torch.full((3, 3), 1e300).double() * torch.eye(3), torch.tensor([[0, 1, 2]])), "no face with an area"),
-        (Surface(torch.tensor([[1e308, 0, 0], [-1e308, 0, 0]]).double()), "no two points"),
+        (Surface(1e300 * torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]])), "no face with an area"),
+        (Surface(1e308 * torch.tensor([[1.0, 0, 0], [-1, 0, 0]], dtype=torch.float64)), "no two points"),
         (Surface(torch.zeros(0, 3).double()), "no two points"),
         (Surface(torch.ones(5, 3).double()), "no two points"),
     ],

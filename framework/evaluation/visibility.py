@@ -1,7 +1,8 @@
 """Visibility of the points of a surface to cameras.
 
-A camera sees a point that is inside its image, at a pixel that counts, and not hidden by the surface itself. Many points of the surface are drawn into a depth buffer of each camera, whose cells are wide enough to hold several. A
-point is hidden if it lies behind the nearest in its cell by more than the surface's slope there explains.
+A camera sees a point that is inside its image, at a pixel that counts, and not hidden by the surface itself. Many
+points of the surface are drawn into a depth buffer of each camera, whose cells are wide enough to hold several. A point
+is hidden if it lies behind the nearest in its cell by more than the surface's slope there explains.
 """
 
 from __future__ import annotations

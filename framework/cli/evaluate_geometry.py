@@ -55,7 +55,8 @@ def evaluate_geometry(
     source = kind if mesh is None else str(mesh)
     views = None if flags.min_views == 0 else _views(loaded, flags.min_views)
     found = judge_surface(surface, reference, views, flags.f_score_at, flags.crop)
-    console.print(_table(found))
+    console.print(_distances(found))
+    console.print(_f_scores(found))
     for line in _notes(flags, found, surface, reference, source):
         say(line)
     content = {
@@ -98,26 +99,29 @@ def _views(loaded: Loaded, least: int) -> Views:
     return Views(dataset.cameras.to("cpu"), loaded.placement, kept, opaque, least)
 
 
-def _table(found: Geometry) -> Table:
-    """Return the metrics as a table, lengths in the input's unit and in per cent of the reference's side."""
+def _distances(found: Geometry) -> Table:
+    """Return distances as a table, in the input's unit and in per cent of the reference's side."""
     from rich.table import Table
 
-    table = Table("", "mean", "median", "mean, % of side")
-    rows = {"accuracy": found.accuracy, "completeness": found.completeness}
-    for name, distances in rows.items():
-        table.add_row(name, *_lengths(distances.mean, distances.median), f"{100 * distances.mean / found.side:.3f}")
-    table.add_row("Chamfer distance", *_lengths(found.chamfer), "", f"{100 * found.chamfer / found.side:.3f}")
-    for score in found.f_scores:
-        shares = f"precision {score.precision:.1%}, recall {score.recall:.1%}"
-        at = f"{score.distance:.4g} ({100 * score.distance / found.side:.2g} %)"
-        table.add_row(f"F-score at {at}", f"{score.f_score:.1%}", shares, "")
-    if found.normals is not None:
-        table.add_row("normals", f"{found.normals.degrees:.2f}°", f"|cos| {found.normals.cosine:.4f}", "")
+    table = Table("", "mean", "% of side", "median")
+    for name, mean, median in (
+        ("accuracy", found.accuracy.mean, f"{found.accuracy.median:.4g}"),
+        ("completeness", found.completeness.mean, f"{found.completeness.median:.4g}"),
+        ("Chamfer distance", found.chamfer, ""),
+    ):
+        table.add_row(name, f"{mean:.4g}", f"{100 * mean / found.side:.3f}", median)
     return table
 
 
-def _lengths(*values: float) -> list[str]:
-    return [f"{value:.4g}" for value in values]
+def _f_scores(found: Geometry) -> Table:
+    """Return F-scores as a table, by their distances."""
+    from rich.table import Table
+
+    table = Table("distance", "% of side", "F-score", "precision", "recall")
+    for score in found.f_scores:
+        shares = (f"{share:.1%}" for share in (score.f_score, score.precision, score.recall))
+        table.add_row(f"{score.distance:.4g}", f"{100 * score.distance / found.side:.3g}", *shares)
+    return table
 
 
 def _notes(flags: GeometryFlags, found: Geometry, surface: Surface, reference: Surface, source: str) -> list[str]:
@@ -135,5 +139,5 @@ def _notes(flags: GeometryFlags, found: Geometry, surface: Surface, reference: S
         apart = point_spacing(reference.points)
         lines.append(f"the reference's points are some {apart:.3g} apart; smaller distances cannot be told by them")
     if found.normals is None:
-        lines.append("normals: the reference has none")
-    return lines
+        return ["normals: the reference has none", *lines]
+    return [f"normals: {found.normals.degrees:.2f} degrees in the mean, |cos| {found.normals.cosine:.4f}", *lines]

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,23 @@ def test_a_mesh_is_judged(ball: Path, tmp_path: Path) -> None:
     assert "reference's longest side is 2" in said
     assert "5,120 faces, 2,562 vertices" in said
     assert "what 1 or more training cameras see" in said
+
+
+@pytest.mark.medium
+def test_normals_in_the_file_do_not_flatter_a_mesh(ball: Path, tmp_path: Path) -> None:
+    """A coarse sphere with the normals of a smooth one: judged by its faces."""
+    coarse = sphere(1.0, level=1)
+    assert coarse.faces is not None
+    mesh = Mesh(coarse.points, coarse.faces, torch.nn.functional.normalize(coarse.points, dim=-1))
+    write_mesh(tmp_path / "with.ply", mesh)
+    write_mesh(tmp_path / "bare.ply", replace(mesh, normals=None))
+    reference = written(tmp_path / "true.ply")
+    both = [
+        judge(ball, tmp_path, "--reference-mesh", reference, "--mesh", tmp_path / f"{n}.ply")[0]
+        for n in ("with", "bare")
+    ]
+    assert both[0]["normals"] == both[1]["normals"]
+    assert both[0]["normals"]["degrees"] > 8
 
 
 @pytest.mark.medium

@@ -27,8 +27,8 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import NerfloomError
 from nerfloom.data.ply import read_points
 from nerfloom.evaluation.surface_files import read_mesh
-from nerfloom.evaluation.surfaces import DENSE, Surface, drawn, nearest
-from nerfloom.evaluation.visibility import count_sightings
+from nerfloom.evaluation.surfaces import Surface, drawn, nearest
+from nerfloom.evaluation.visibility import OCCLUDERS, count_sightings
 from nerfloom.export.mesh import Mesh, closedness
 from nerfloom.kernels import native
 from nerfloom.training.machine import machine
@@ -114,7 +114,7 @@ class Truth:
         if self.distance is not None:
             samples = drawn(mesh, MESH_POINTS)
             there, back = self.distance(samples.positions).abs(), nearest(self.points, mesh)[0]
-            places = [part.placed(self.placement) for part in (samples, drawn(mesh, DENSE, seed=1))]
+            places = [part.placed(self.placement) for part in (samples, drawn(mesh, OCCLUDERS, seed=1))]
             seen = count_sightings(places[0], places[1], self.cameras, lambda index: None, "Looking").seen > 0
             return {
                 "mesh to surface": _rounded(there),

@@ -25,8 +25,8 @@ from torch import Tensor
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
-from nerfloom.evaluation.surfaces import DENSE, Samples, Surface, drawn, nearest
-from nerfloom.evaluation.visibility import Shown, count_sightings
+from nerfloom.evaluation.surfaces import Samples, Surface, drawn, nearest
+from nerfloom.evaluation.visibility import OCCLUDERS, Shown, count_sightings
 
 NUM_POINTS = 100_000
 """Number of points on each surface."""
@@ -232,7 +232,7 @@ def _counted(
     seen = torch.ones(len(points.positions), dtype=torch.bool)
     unseen = [0, 0, 0]
     if views is not None and pixels is not None and len(seen):
-        places = [part.placed(views.placement) for part in (points, drawn(surface, DENSE, seed=1))]
+        places = [part.placed(views.placement) for part in (points, drawn(surface, OCCLUDERS, seed=1))]
         found = count_sightings(places[0], places[1], views.cameras, pixels, f"Looking at {name}")
         inside, shown, seen = (number >= views.least for number in (found.inside, found.shown, found.seen))
         unseen = [int(part.sum()) for part in (~inside, inside & ~shown, shown & ~seen)]

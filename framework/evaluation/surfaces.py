@@ -16,8 +16,8 @@ from nerfloom.base.errors import DataError
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.triangles import area_vectors, draw_on_triangles, nearest_on_triangles
 
-DENSE = 500_000
-"""Number of points on a mesh where nearest faces are looked for, and that hide what is behind them."""
+DENSE = 200_000
+"""Number of points on a mesh where nearest faces are looked for."""
 CANDIDATES = 8
 """Number of nearest points on a mesh whose faces are compared exactly."""
 UNIT = 1e-6

@@ -20,10 +20,17 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.evaluation.surfaces import Samples
 from nerfloom.geometry.lenses import project
 
-APART = 3.0
+OCCLUDERS = 1_000_000
+"""Number of points that hide what is behind them."""
+APART = 2.0
 """Width of a depth buffer's cells, in distances between neighbouring points."""
-STEEPEST = 20.0
-"""Maximum change of depth across a ray, tangent of the angle between ray and normal: that of 87 degrees."""
+MOST_CELLS = 4_000_000
+"""Maximum number of cells of a depth buffer."""
+NEAR = 0.1
+"""Fraction of the points that are nearer than the distance for which cells are made."""
+STEEPEST = 4.0
+"""Maximum change of depth across a ray, tangent of the angle between ray and normal: that of 76 degrees. Some of what
+cameras see at larger angles only counts as hidden; with a larger maximum, what is behind thin walls would not."""
 UNKNOWN_SLOPE = 2.0
 """That tangent where it is unknown which side of a surface is its back."""
 ORIENTED = 0.9
@@ -66,7 +73,7 @@ def count_sightings(points: Samples, occluders: Samples, cameras: Cameras, shown
         camera = cameras[index : index + 1]
         buffer = _DepthBuffer.of(occluders, camera)
         at, counted = _project(points, camera), shown(index)
-        kept = at.inside if counted is None else at.inside & counted.reshape(-1)[at.cell(1, camera)]
+        kept = at.inside if counted is None else at.inside & counted.reshape(-1)[at.cell(1.0, camera)]
         visible = kept & (at.distance <= buffer.behind(at, STEEPEST if outward else UNKNOWN_SLOPE))
         if outward:
             visible &= outward * at.cosine < 0
@@ -89,10 +96,11 @@ class _Projected:
     cosine: Tensor
     """(N,) cosine between ray and normal; NaN for points without normals."""
 
-    def cell(self, width: int, camera: Cameras) -> Tensor:
+    def cell(self, width: float, camera: Cameras) -> Tensor:
         """Return the cell (N,) of `width` pixels that holds each point, counted row by row; 0 outside of the image."""
-        number = (self.row / width).floor() * -(-camera.sizes[0][1] // width) + (self.column / width).floor()
-        return number.where(self.inside, 0).long()
+        columns = math.ceil(camera.sizes[0][1] / width)
+        column, row = ((place / width).where(self.inside, 0).long() for place in (self.column, self.row))
+        return row * columns + column.clamp(max=columns - 1)
 
 
 def _project(points: Samples, camera: Cameras) -> _Projected:
@@ -115,7 +123,7 @@ class _DepthBuffer:
     """The distance to the nearest of many points in each cell of an image."""
 
     camera: Cameras
-    width: int
+    width: float
     """Width of a cell, pixels."""
     nearest: Tensor
     """(C,) distance, scene units; inf where there is no point."""
@@ -125,13 +133,14 @@ class _DepthBuffer:
     @classmethod
     def of(cls, occluders: Samples, camera: Cameras) -> _DepthBuffer:
         at = _project(occluders, camera)
-        distance = at.distance[at.inside]
-        width = 1
+        distance, (height, wide) = at.distance[at.inside], camera.sizes[0]
+        width = (height * wide / MOST_CELLS) ** 0.5
         if len(distance):
             apart = occluders.spacing * float(camera.fx)  # pixels, at a distance of 1
-            away = 1.0 if camera.model == "orthographic" else float(distance.median())
-            width = max(1, math.ceil(APART * apart / away))
-        rows, columns = (-(-side // width) for side in camera.sizes[0])
+            nearer = float(distance.kthvalue(1 + int(NEAR * (len(distance) - 1))).values)
+            width = max(APART * apart / (1.0 if camera.model == "orthographic" else nearer), width)
+        width = min(width, float(min(height, wide)))
+        rows, columns = (math.ceil(side / width) for side in (height, wide))
         cells = at.cell(width, camera)[at.inside]
         nearest = distance.new_full((rows * columns,), torch.inf)
         nearest.scatter_reduce_(0, cells, distance, "amin")

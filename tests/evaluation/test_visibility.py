@@ -11,8 +11,8 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.dataparsers.procedural.scene import trace_rows
 from nerfloom.dataparsers.procedural.solids import SOLIDS, poses_around, surface
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE
-from nerfloom.evaluation.surfaces import DENSE, Surface, drawn
-from nerfloom.evaluation.visibility import Shown, Sightings, count_sightings
+from nerfloom.evaluation.surfaces import Surface, drawn
+from nerfloom.evaluation.visibility import OCCLUDERS, Shown, Sightings, count_sightings
 from nerfloom.testing.ball import cameras_at
 from tests.evaluation.surfaces import sphere, square, together
 
@@ -26,7 +26,7 @@ def everything(index: int) -> Tensor | None:
 
 def sighted(surface: Surface, cameras: Cameras, shown: Shown = everything) -> tuple[Tensor, Sightings]:
     """Points of a surface, and how many cameras see them."""
-    points, occluders = drawn(surface, COUNT), drawn(surface, DENSE, seed=1)
+    points, occluders = drawn(surface, COUNT), drawn(surface, OCCLUDERS, seed=1)
     return points.positions, count_sightings(points, occluders, cameras, shown, "Looking")
 
 
@@ -39,13 +39,15 @@ def around(distance: float, *signs: float, angle: float = 60.0, size: int = 400)
 
 
 @pytest.mark.medium
-def test_a_camera_sees_its_cap_of_a_sphere() -> None:
-    """From a distance D of a sphere of radius R, the share (1 - R / D) / 2."""
-    for distance in (2.0, 4.0, 20.0):
-        points, found = sighted(sphere(), around(distance, 1.0))
-        assert share(found.seen) == pytest.approx((1 - 1 / distance) / 2, abs=0.003)
-        seen = points[:, 0] > 1 / distance
-        assert float(((found.seen > 0) == seen).double().mean()) > 0.99
+@pytest.mark.parametrize("distance", [2.0, 4.0, 20.0])
+def test_a_camera_sees_its_cap_of_a_sphere(distance: float) -> None:
+    """From a distance D of a sphere of radius R, the share (1 - R / D) / 2; all of it but for its rim."""
+    points, found = sighted(sphere(), around(distance, 1.0))
+    rays = torch.nn.functional.normalize(points - torch.tensor([distance, 0, 0]), dim=-1)
+    cosine = -(rays * points).sum(-1)  # between ray and normal
+    assert share(found.seen) == pytest.approx((1 - 1 / distance) / 2, abs=0.02)
+    assert float((found.seen[cosine > 0.2] > 0).double().mean()) > 0.999
+    assert float((found.seen[cosine < -0.02] > 0).double().mean()) == 0
 
 
 @pytest.mark.medium
@@ -62,17 +64,17 @@ def test_normals_may_point_anywhere(change: str) -> None:
     _, found = sighted(surface, around(4.0, 1.0))
     # Without a side that is the back, a strip behind the horizon cannot be told from one before it.
     exact = change in ("as it is", "inside out")
-    assert share(found.seen) == pytest.approx(0.375, abs=0.003 if exact else 0.05)
+    assert share(found.seen) == pytest.approx(0.375, abs=0.02 if exact else 0.05)
 
 
 @pytest.mark.medium
 def test_several_cameras() -> None:
     """Two on opposite sides see two caps; none of the points is seen by both."""
     _, found = sighted(sphere(), around(4.0, 1.0, -1.0))
-    assert share(found.seen) == pytest.approx(0.75, abs=0.005)
+    assert share(found.seen) == pytest.approx(0.75, abs=0.03)
     assert share(found.seen, least=2) == 0
     _, twice = sighted(sphere(), around(4.0, 1.0, 1.0))
-    assert share(twice.seen, least=2) == pytest.approx(0.375, abs=0.003)
+    assert share(twice.seen, least=2) == pytest.approx(0.375, abs=0.02)
 
 
 @pytest.mark.medium
@@ -102,15 +104,28 @@ def test_what_is_behind_is_hidden() -> None:
 
 
 @pytest.mark.medium
+def test_walls_within_walls_are_hidden_from_all_sides() -> None:
+    """A sphere within another, its surface turned inwards, as in matter that is hollow: no camera sees it."""
+    inner = sphere(0.9)
+    assert inner.faces is not None
+    hollow = together(sphere(), replace(inner, faces=inner.faces.flip(-1)))
+    positions = torch.nn.functional.normalize(torch.randn(24, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    points, found = sighted(hollow, cameras_at(4 * positions, 40.0, 200))
+    within = points.norm(dim=-1) < 0.95
+    assert share(found.seen[within]) < 0.001
+    assert share(found.seen[~within]) > 0.99
+
+
+@pytest.mark.medium
 def test_cameras_of_every_model_see_the_same_cap() -> None:
     made = around(4.0, 1.0)
     fisheye = replace(made, model="fisheye", fx=made.fx / 2, fy=made.fy / 2)
     lens = torch.tensor([[0.05, 0, 0, 0, 0, 0, 0, 0, 0]])
     for cameras in (replace(made, model="opencv", lens=lens), fisheye):
         _, found = sighted(sphere(), cameras)
-        assert share(found.seen) == pytest.approx(0.375, abs=0.004)
+        assert share(found.seen) == pytest.approx(0.375, abs=0.02)
     parallel = replace(made, model="orthographic", fx=made.fx / 4, fy=made.fy / 4)
-    assert share(sighted(sphere(), parallel)[1].seen) == pytest.approx(0.5, abs=0.005)
+    assert share(sighted(sphere(), parallel)[1].seen) == pytest.approx(0.5, abs=0.03)
 
 
 @pytest.mark.slow
@@ -123,9 +138,9 @@ def test_solids_as_rays_see_them() -> None:
     middle, sizes = torch.full((12,), 200.0), torch.full((12,), 400)
     cameras = Cameras(poses, focal, focal, middle, middle, sizes, sizes)
     points = drawn(reference, 4000)
-    occluders = drawn(reference, DENSE, seed=1)
+    occluders = drawn(reference, OCCLUDERS, seed=1)
     assert points.normals is not None
-    wrong = []
+    missed, extra = [], []
     for index in range(12):
         camera = cameras[index : index + 1]
         found = count_sightings(points, occluders, camera, everything, "Looking").seen > 0
@@ -133,8 +148,10 @@ def test_solids_as_rays_see_them() -> None:
         eye = camera.camera_to_worlds[0, :, 3].double()
         towards = points.positions - eye
         length = towards.norm(dim=-1)
-        hit = trace_rows(eye[:, None], (towards / length[:, None]).T.contiguous(), 0.0, colour=False, parts=SOLIDS)
-        seen = hit.depth > length - 1e-3
-        wrong.append(float((found != seen).double().mean()))
-    assert max(wrong) < 0.03
-    assert sum(wrong) / 12 < 0.015
+        directions = (towards / length[:, None]).T.contiguous()
+        seen = trace_rows(eye[:, None], directions, 0.0, colour=False, parts=SOLIDS).depth > length - 1e-3
+        steep = -(directions.T * points.normals).sum(-1) < 0.3
+        missed.append(float((seen & ~found & ~steep).double().mean()))
+        extra.append(float((found & ~seen).double().mean()))
+    assert max(missed) < 0.01
+    assert max(extra) < 0.01

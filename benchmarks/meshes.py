@@ -20,19 +20,16 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from benchmarks.chamfer import (
-    distances_to_mesh,
-    mesh_sample,
-    seen_samples,
-    surface_sample,
-    visible_from,
-)
 from benchmarks.children import output_of
+from benchmarks.exact_surfaces import surface_sample, visible_from
 from nerfloom.base.child import python_command
 from nerfloom.base.console import say
 from nerfloom.base.errors import NerfloomError
 from nerfloom.data.ply import read_points
-from nerfloom.export.mesh import Mesh
+from nerfloom.evaluation.surface_files import read_mesh
+from nerfloom.evaluation.surfaces import Surface, drawn, nearest
+from nerfloom.evaluation.visibility import OCCLUDERS, count_sightings
+from nerfloom.export.mesh import Mesh, closedness
 from nerfloom.kernels import native
 from nerfloom.training.machine import machine
 from nerfloom.training.run import read_run
@@ -95,9 +92,10 @@ class Truth:
     def __init__(self, run: Path) -> None:
         loaded = read_run(run)
         parsed = loaded.parse("train")
-        placement = parsed.placement
+        self.placement = placement = parsed.placement
         poses = placement.original_poses(parsed.cameras.camera_to_worlds)
-        self.eyes = poses[:: max(len(poses) // EYES, 1), :, 3]
+        step = max(len(poses) // EYES, 1)
+        self.cameras, eyes = parsed.cameras[::step], poses[::step, :, 3]
         self.size = float((poses[:, :, 3] - poses[:, :, 3].mean(0)).norm(dim=-1).mean())
         self.distance = loaded.parser.signed_distance if isinstance(loaded.parser, KnowsItsSurface) else None
         self.sparse: Tensor | None = None
@@ -109,16 +107,15 @@ class Truth:
         if self.distance is not None:
             torch.manual_seed(0)
             self.points, normals = surface_sample(self.distance, parsed.box, SURFACE_POINTS)
-            self.visible = visible_from(self.distance, self.points, normals, self.eyes)
+            self.visible = visible_from(self.distance, self.points, normals, eyes)
 
-    def of_mesh(self, mesh: Mesh) -> dict[str, Any]:
+    def of_mesh(self, mesh: Surface) -> dict[str, Any]:
         """Return the distances between `mesh` and the known surface."""
         if self.distance is not None:
-            samples, faces = mesh_sample(mesh, MESH_POINTS)
-            a, b, c = (mesh.vertices[mesh.faces[faces, corner]] for corner in range(3))
-            normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-            there, back = self.distance(samples).abs(), distances_to_mesh(self.points, mesh)
-            seen = seen_samples(samples, normals, self.eyes)
+            samples = drawn(mesh, MESH_POINTS)
+            there, back = self.distance(samples.positions).abs(), nearest(self.points, mesh)[0]
+            places = [part.placed(self.placement) for part in (samples, drawn(mesh, OCCLUDERS, seed=1))]
+            seen = count_sightings(places[0], places[1], self.cameras, lambda index: None, "Looking").seen > 0
             return {
                 "mesh to surface": _rounded(there),
                 "surface to mesh": _rounded(back),
@@ -130,18 +127,16 @@ class Truth:
                 ),
             }
         if self.sparse is not None:
-            return {"sparse points to mesh": _rounded(distances_to_mesh(self.sparse, mesh))}
+            return {"sparse points to mesh": _rounded(nearest(self.sparse, mesh)[0])}
         return {}
 
     def of_points(self, run: Path, folder: Path) -> dict[str, Any]:
         """Return the distances of sparse points from the point cloud of `run`, made in `folder`; empty without them."""
         if self.sparse is None:
             return {}
-        from scipy.spatial import cKDTree
-
         output_of(python_command("nerfloom.cli.export", "pointcloud", run, "--output-dir", folder))
         cloud = read_points(folder / "point_cloud.ply")
-        distances = torch.from_numpy(cKDTree(cloud.numpy()).query(self.sparse.numpy(), workers=-1)[0])
+        distances = nearest(self.sparse, Surface(cloud))[0]
         return {
             "sparse points in the box": len(self.sparse),
             "mean distance of the cameras from their middle, units of the input": round(self.size, 4),
@@ -151,8 +146,6 @@ class Truth:
 
 def _row(run: Path, kind: str, resolution: int, folder: Path, truth: Truth) -> dict[str, Any]:
     """Make one mesh, and return its row."""
-    import trimesh
-
     output = folder / f"{kind}-{resolution}"
     command = python_command("nerfloom.cli.export", kind, run, "--resolution", resolution, "--output-dir", output)
     start = time.monotonic()
@@ -165,8 +158,8 @@ def _row(run: Path, kind: str, resolution: int, folder: Path, truth: Truth) -> d
             last = log.read().decode(errors="replace").strip().splitlines()[-1:]
             raise NerfloomError(f"ns-export {kind} failed: {' '.join(last)}")
     elapsed = time.monotonic() - start
-    read: Any = trimesh.load(output / "mesh.ply", process=False)
-    mesh = Mesh(torch.from_numpy(read.vertices.copy()).double(), torch.from_numpy(read.faces.copy()).long())
+    mesh = read_mesh(output / "mesh.ply")
+    assert mesh.faces is not None
     return {
         "export": kind,
         "resolution": resolution,
@@ -174,7 +167,7 @@ def _row(run: Path, kind: str, resolution: int, folder: Path, truth: Truth) -> d
         "CPU seconds": round(usage.ru_utime + usage.ru_stime, 1),
         "peak memory, MB": round(usage.ru_maxrss / 1000),
         "faces": len(mesh.faces),
-        "watertight": bool(read.is_watertight),
+        "watertight": closedness(Mesh(mesh.points, mesh.faces)).watertight,
         "file, MB": round((output / "mesh.ply").stat().st_size / 1e6, 1),
         **truth.of_mesh(mesh),
     }

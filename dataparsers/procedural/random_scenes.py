@@ -47,7 +47,7 @@ def random_parts(seed: int, scene: int) -> Parts:
 
 def _random_part(random: np.random.Generator) -> Part:
     size = random.uniform(0.0, 1.0)
-    shape: Shape = Sphere(0.25 + 0.25 * size) if random.random() < 0.5 else Box(0.2 + 0.2 * size)
+    shape: Shape = Sphere(0.25 + 0.25 * size) if random.random() < 0.5 else Box((0.2 + 0.2 * size,) * 3)
     direction = random.normal(size=3)
     distance = (MAX_REACH - shape.bound) * random.uniform() ** (1 / 3)  # uniform in the ball where it fits
     x, y, z = (distance * direction / np.linalg.norm(direction)).tolist()

@@ -41,13 +41,13 @@ def mix(a: Tensor, b: Tensor, weight: Tensor) -> Tensor:
     return a + (b - a) * weight
 
 
-def _blend(a: Colour, b: Colour, weight: Tensor) -> Tensor:
-    """Return colours (3, R) between two colours, for weights (R,) in [0, 1]."""
+def blend(a: Colour, b: Colour, weight: Tensor) -> Tensor:
+    """Return colours (3, R) between `a` (`weight` 0) and `b` (`weight` 1), for weights (R,)."""
     return torch.stack([x + (y - x) * weight for x, y in zip(a, b, strict=True)])
 
 
-def _wave(x: Tensor, sharpness: float) -> Tensor:
-    """Return a square wave of period 2 pi with linear flanks, in [-1, 1]."""
+def wave(x: Tensor, sharpness: float) -> Tensor:
+    """Return a square wave of `x` of period 2 pi, in [-1, 1], with flanks of slope `sharpness`."""
     return (x.sin() * sharpness).clamp(-1.0, 1.0)
 
 
@@ -55,11 +55,11 @@ def _plinth_texture(p: Tensor) -> Tensor:
     """Return a fine checkerboard inside a ring of tick marks, and a fluted rim."""
     radius = (p[0] ** 2 + p[1] ** 2).sqrt()
     angle = torch.atan2(p[1], p[0])
-    cells = _wave(p[0] * (math.pi / 0.08), 8.0) * _wave(p[1] * (math.pi / 0.08), 8.0)
-    floor = _blend(_CREAM, _SAND, 0.5 + 0.5 * cells)
-    ticks = _blend(_SLATE, _CREAM, 0.5 + 0.5 * _wave(angle * 90.0, 3.0))
+    cells = wave(p[0] * (math.pi / 0.08), 8.0) * wave(p[1] * (math.pi / 0.08), 8.0)
+    floor = blend(_CREAM, _SAND, 0.5 + 0.5 * cells)
+    ticks = blend(_SLATE, _CREAM, 0.5 + 0.5 * wave(angle * 90.0, 3.0))
     band = smoothstep(0.985, 0.995, radius) * (1.0 - smoothstep(1.065, 1.075, radius))
-    border = _blend(_SLATE, _TEAL, smoothstep(-0.04, 0.04, p[2]) * (0.5 + 0.5 * _wave(angle * 60.0, 1.5)))
+    border = blend(_SLATE, _TEAL, smoothstep(-0.04, 0.04, p[2]) * (0.5 + 0.5 * wave(angle * 60.0, 1.5)))
     return mix(mix(floor, border, smoothstep(0.955, 0.965, radius)), ticks, band * (p[2] > 0.0))
 
 
@@ -90,21 +90,21 @@ def _box_texture(p: Tensor, half: float) -> Tensor:
         return _GLYPHS.to(p).flatten()[(face * size + row) * size + column]
 
     value = mix(mix(ink(0, 0), ink(1, 0), wx), mix(ink(0, 1), ink(1, 1), wx), wy)
-    return _blend(_TEAL, _CREAM, value)
+    return blend(_TEAL, _CREAM, value)
 
 
 def _ring_texture(p: Tensor, major: float) -> Tensor:
     """Return stripes that wind around the tube like a twisted rope."""
     along = torch.atan2(p[2], p[0])
     around = torch.atan2(p[1], (p[0] ** 2 + p[2] ** 2).sqrt() - major)
-    return _blend(_OCHRE, _CREAM, 0.5 + 0.5 * _wave(16.0 * along + 2.0 * around, 4.0))
+    return blend(_OCHRE, _CREAM, 0.5 + 0.5 * wave(16.0 * along + 2.0 * around, 4.0))
 
 
 def _bob_texture(p: Tensor) -> Tensor:
     """Return the pattern of a gyroid's level set, a smooth labyrinth."""
     x, y, z = p * 60.0
     value = x.sin() * y.cos() + y.sin() * z.cos() + z.sin() * x.cos()
-    return _blend(_SLATE, _CREAM, smoothstep(-0.3, 0.3, value))
+    return blend(_SLATE, _CREAM, smoothstep(-0.3, 0.3, value))
 
 
 # ---- The scene ------------------------------------------------------------------------------------------------
@@ -134,20 +134,20 @@ Parts = Mapping[str, Part]
 """The solids of a scene by name."""
 _TOP = -0.45  # height of the plinth's upper face
 _BALL_ORBIT, _BALL_ANGLE = 0.56, math.radians(197.0)
-_BALL, _CUBE, _RING = Sphere(0.36), Box(0.26), Torus(0.27, 0.085)
+_BALL, _CUBE, _RING = Sphere(0.36), Box((0.26, 0.26, 0.26)), Torus(0.27, 0.085)
 _BALL_CENTRE = (_BALL_ORBIT * math.cos(_BALL_ANGLE), _BALL_ORBIT * math.sin(_BALL_ANGLE), _TOP + _BALL.radius)
 
 PARTS: dict[str, Part] = {
     "plinth": Part(  # all other parts are above it
         Cylinder(1.15, 0.08), (0.0, 0.0, _TOP - 0.08), 0.0, _plinth_texture, 0.0, shadow=False
     ),
-    "ball": Part(_BALL, _BALL_CENTRE, 0.0, lambda p: _blend(_RED, _RED, p[0]), 1.0),
-    "box": Part(_CUBE, (0.60, -0.10, _TOP + 0.26), 0.45, lambda p: _box_texture(p, _CUBE.half), 0.0),
+    "ball": Part(_BALL, _BALL_CENTRE, 0.0, lambda p: blend(_RED, _RED, p[0]), 1.0),
+    "box": Part(_CUBE, (0.60, -0.10, _TOP + 0.26), 0.45, lambda p: _box_texture(p, _CUBE.half[0]), 0.0),
     "ring": Part(_RING, (0.08, 0.62, _TOP + 0.355), -0.35, lambda p: _ring_texture(p, _RING.major), 0.0),
     "arch": Part(
-        Torus(1.02, 0.018, half=True), (0.0, 0.0, _TOP - 0.08), 2.36, lambda p: _blend(_BRASS, _BRASS, p[0]), 0.4
+        Torus(1.02, 0.018, half=True), (0.0, 0.0, _TOP - 0.08), 2.36, lambda p: blend(_BRASS, _BRASS, p[0]), 0.4
     ),
-    "string": Part(Cylinder(0.015, 0.11), (0.0, 0.0, 0.39), 0.0, lambda p: _blend(_BRASS, _BRASS, p[0]), 0.0),
+    "string": Part(Cylinder(0.015, 0.11), (0.0, 0.0, 0.39), 0.0, lambda p: blend(_BRASS, _BRASS, p[0]), 0.0),
     "bob": Part(Sphere(0.13), (0.0, 0.0, 0.16), 0.0, _bob_texture, 0.0),
 }
 """The solids of the embedded scene by name; the ball and the box can move."""
@@ -265,7 +265,7 @@ def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
 
 def _surroundings(d: Tensor) -> Tensor:
     """Return the light (3, R) from unit directions (3, R): a studio sky with two soft lamps over warm ground."""
-    sky = _blend((0.75, 0.72, 0.68), (0.16, 0.30, 0.52), smoothstep(0.0, 0.9, d[2]))
+    sky = blend((0.75, 0.72, 0.68), (0.16, 0.30, 0.52), smoothstep(0.0, 0.9, d[2]))
     light = mix(sky, d.new_tensor(_GROUND)[:, None], smoothstep(0.05, -0.15, d[2]))
     side = d.new_tensor((0.60, 0.62, 0.50))[:, None]
     lamp = smoothstep(0.86, 0.93, dot(d, side)) + smoothstep(0.90, 0.95, d[2])
@@ -286,7 +286,7 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_ind
     # Ambient occlusion: free distance along the normal, relative to that above a plane.
     rooms = [(_distance(poses, p + h * normal) / h).clamp(0.0, 1.0) for h in (0.06, 0.2)]
     room = rooms[0] + rooms[1]
-    ambient = _blend(_GROUND, _SKY, 0.5 + 0.5 * normal[2]) * (0.15 + 0.425 * room)
+    ambient = blend(_GROUND, _SKY, 0.5 + 0.5 * normal[2]) * (0.15 + 0.425 * room)
     light = albedo * (p.new_tensor(_SUN)[:, None] * (facing * sun) + ambient)
 
     shiny = (gloss > 0.0).nonzero()[:, 0]

@@ -82,34 +82,99 @@ class Sphere(Shape):
 
 @dataclass(frozen=True)
 class Box(Shape):
-    """A cube with axis-aligned faces; `half` is half its edge length."""
+    """A cuboid with axis-aligned faces; `half` is half the length of its edges along x, y and z."""
 
-    half: float
+    half: tuple[float, float, float]
 
     @property
     def bound(self) -> float:
-        return self.half * math.sqrt(3.0)
+        return math.hypot(*self.half)
 
     def distance(self, p: Tensor) -> Tensor:
-        q = p.abs() - self.half
+        q = p.abs() - self._column(p)
         outside = q.clamp(min=0.0)
         return dot(outside, outside).sqrt() + q.amax(0).clamp(max=0.0)
 
     def normal(self, p: Tensor) -> Tensor:
-        face = torch.nn.functional.one_hot(p.abs().argmax(0), 3).T
+        face = torch.nn.functional.one_hot((p.abs() - self._column(p)).argmax(0), 3).T
         return face * p.sign()
 
-    def _interval(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def interval(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the parameters at which lines enter and leave; they miss where the first is not less.
+
+        Args:
+            offset, direction: the lines.
+        """
         inverse = 1.0 / torch.where(direction.abs() < 1e-12, 1e-12, direction)
-        middle, reach = -offset * inverse, inverse.abs() * self.half
+        middle, reach = -offset * inverse, inverse.abs() * self._column(offset)
         return (middle - reach).amax(0), (middle + reach).amin(0)
 
     def enter(self, offset: Tensor, direction: Tensor, start: Tensor) -> Tensor:
-        return _enter_interval(*self._interval(offset, direction), start)
+        return _enter_interval(*self.interval(offset, direction), start)
 
     def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:
-        near, far = self._interval(offset, direction)
+        near, far = self.interval(offset, direction)
         return ((0.5 * (near + far)).clamp(-self.bound, self.bound),)
+
+    def _column(self, like: Tensor) -> Tensor:
+        return like.new_tensor(self.half)[:, None]
+
+
+@dataclass(frozen=True)
+class BoredBox(Shape):
+    """A cuboid with a round hole along z.
+
+    Args:
+        half: half the length of its edges along x, y and z.
+        radius: radius of the hole, less than half the edges along x and y.
+    """
+
+    half: tuple[float, float, float]
+    radius: float
+
+    @property
+    def bound(self) -> float:
+        return math.hypot(*self.half)
+
+    @property
+    def _box(self) -> Box:
+        return Box(self.half)
+
+    def distance(self, p: Tensor) -> Tensor:
+        wall = self.radius - (p[0] ** 2 + p[1] ** 2).sqrt()  # positive in the hole
+        above = (p[2].abs() - self.half[2]).clamp(min=0.0)
+        in_hole = (wall.clamp(min=0.0) ** 2 + above**2).sqrt()
+        return torch.where(wall > 0.0, in_hole, torch.maximum(self._box.distance(p), wall))
+
+    def normal(self, p: Tensor) -> Tensor:
+        radius = (p[0] ** 2 + p[1] ** 2).sqrt()
+        on_wall = (radius - self.radius).abs() < self._box.distance(p).abs()
+        inwards = torch.stack([-p[0], -p[1], torch.zeros_like(radius)]) / radius.clamp(min=1e-12)
+        return torch.where(on_wall, inwards, self._box.normal(p))
+
+    def _hole(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the parameters at which lines enter and leave the hole, an endless cylinder; equal where they miss."""
+        a = (direction[0] ** 2 + direction[1] ** 2).clamp(min=1e-20)  # for vertical lines, a very long interval
+        b = offset[0] * direction[0] + offset[1] * direction[1]
+        c = offset[0] ** 2 + offset[1] ** 2 - self.radius**2
+        half = (b * b - a * c).clamp(min=0.0).sqrt()
+        return (-b - half) / a, (-b + half) / a
+
+    def enter(self, offset: Tensor, direction: Tensor, start: Tensor) -> Tensor:
+        near, far = self._box.interval(offset, direction)
+        hole_near, hole_far = self._hole(offset, direction)
+        in_hole = (near > hole_near) & (near < hole_far)
+        outer = torch.where((near < far) & ~in_hole & (near > start), near, math.inf)
+        # Out of the hole into its wall.
+        met = (hole_near < hole_far) & (hole_far > near) & (hole_far < far) & (hole_far > start)
+        return torch.minimum(outer, torch.where(met, hole_far, math.inf))
+
+    def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:
+        near, far = self._box.interval(offset, direction)
+        hole_near, hole_far = self._hole(offset, direction)
+        before, behind = torch.minimum(far, hole_near), torch.maximum(near, hole_far)
+        middles = (0.5 * (near + before), 0.5 * (behind + far))  # of the parts before and behind the hole
+        return tuple(middle.clamp(-self.bound, self.bound) for middle in middles)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Views of the embedded scene, and the data set made of them."""
+"""Views of solids, such as the embedded scene, and the data set made of them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,13 +49,14 @@ def _pixel_grid(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def _render_geometry(
-    camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float
+    camera_to_world: npt.ArrayLike, camera_angle_x: float, size: tuple[int, int], time: float, parts: Parts
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Return depth (H, W) and normals (H, W, 3) at the pixel centres, computed in float64."""
     column, row = _pixel_grid(size)
     depth, normals = [], []
     for x, y in zip(column.split(_CHUNK_RAYS), row.split(_CHUNK_RAYS), strict=True):
-        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x + 0.5, y + 0.5), time, colour=False)
+        rays = _camera_rays(camera_to_world, camera_angle_x, size, x + 0.5, y + 0.5)
+        hit = trace_rows(*rays, time, colour=False, parts=parts)
         depth.append(hit.depth)
         normals.append(hit.normals)
     shape = size[::-1]
@@ -107,7 +108,7 @@ def render_view(
         width, height: size of the image, pixels.
         time: in [0, 1].
         supersample: rays along each side of a pixel.
-        geometry: whether to compute depth and normals; of the embedded scene only.
+        geometry: whether to compute depth and normals.
         parts: the solids of the scene.
 
     Returns:
@@ -119,7 +120,7 @@ def render_view(
     rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample, parts)
     if not geometry:
         return rgba, None, None
-    return rgba, *_render_geometry(camera_to_world, camera_angle_x, size, time)
+    return rgba, *_render_geometry(camera_to_world, camera_angle_x, size, time, parts)
 
 
 def camera_pose(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
@@ -170,10 +171,7 @@ def write_dataset(
     seed: int = 0,
     progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
-    """Write a data set in NeRF-Synthetic's format, completely or not at all.
-
-    Each split has `transforms_{split}.json` and RGBA images; val and test also have `r_000_geometry.npz` with the exact
-    depth (H, W) along the ray, inf for background, and the world normals (H, W, 3).
+    """Write a data set of the embedded scene, completely or not at all; its files are those of `write_views`.
 
     Args:
         folder: folder to create. If another process creates it meanwhile, its content is kept.
@@ -187,12 +185,39 @@ def write_dataset(
         OSError: if the folder cannot be written.
     """
     counts = counts or {"train": 80, "val": 8, "test": 16}
+    poses = {split: camera_poses(split, count, seed) for split, count in counts.items()}
     with complete_folder(folder) as temporary:
-        jobs = [job for split, count in counts.items() for job in _lay_out(temporary, split, count, moving, seed)]
-        with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
-            done = pool.map(lambda job: _write_view(*job, size=size), jobs)
-            for _ in progress(done, "Rendering the embedded scene", len(jobs)):
-                pass
+        write_views(
+            temporary, poses, PARTS, size, moving, lambda jobs, n: progress(jobs, "Rendering the embedded scene", n)
+        )
+
+
+def write_views(
+    folder: Path,
+    poses: Mapping[str, Sequence[npt.NDArray[np.float64]]],
+    parts: Parts,
+    size: int,
+    moving: bool = False,
+    progress: Callable[[Any, int], Any] = lambda jobs, total: jobs,
+) -> None:
+    """Write images of solids in NeRF-Synthetic's format.
+
+    Each split has `transforms_{split}.json` and RGBA images; val and test also have `r_000_geometry.npz` with the exact
+    depth (H, W) along the ray, inf for background, and the world normals (H, W, 3).
+
+    Args:
+        folder: folder to write to.
+        poses: camera-to-world matrices (4, 4) of each split.
+        parts: the solids.
+        size: width and height of the images, pixels.
+        moving: whether each frame has a time; otherwise the scene is static, at time 0.
+        progress: wrapper of the iteration over views, called with the iterable and the number of views.
+    """
+    jobs = [job for split, of_split in poses.items() for job in _lay_out(folder, split, of_split, moving)]
+    with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
+        done = pool.map(lambda job: _write_view(*job, size=size, parts=parts), jobs)
+        for _ in progress(done, len(jobs)):
+            pass
 
 
 @contextmanager
@@ -219,13 +244,13 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 
 
 def _lay_out(
-    folder: Path, split: str, count: int, moving: bool, seed: int
+    folder: Path, split: str, poses: Sequence[npt.NDArray[np.float64]], moving: bool
 ) -> list[tuple[Path, npt.NDArray[np.float64], float]]:
     """Write the JSON file of a split, and return the file, pose and time of each view."""
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames, jobs = [], []
-    for index, pose in enumerate(camera_poses(split, count, seed)):
-        time = index / max(count - 1, 1) if moving else 0.0
+    for index, pose in enumerate(poses):
+        time = index / max(len(poses) - 1, 1) if moving else 0.0
         frame: dict[str, Any] = {"file_path": f"./{split}/r_{index:03d}", "transform_matrix": pose.tolist()}
         frames.append({**frame, "time": time} if moving else frame)
         jobs.append((folder / split / f"r_{index:03d}.png", pose, time))
@@ -234,8 +259,9 @@ def _lay_out(
     return jobs
 
 
-def _write_view(path: Path, pose: npt.NDArray[np.float64], time: float, *, size: int) -> None:
-    rgba, depth, normals = render_view(pose, CAMERA_ANGLE, size, size, time, geometry=path.parent.name != "train")
+def _write_view(path: Path, pose: npt.NDArray[np.float64], time: float, *, size: int, parts: Parts) -> None:
+    exact = path.parent.name != "train"
+    rgba, depth, normals = render_view(pose, CAMERA_ANGLE, size, size, time, geometry=exact, parts=parts)
     iio.imwrite(path, rgba)
     if depth is not None and normals is not None:
         np.savez_compressed(path.with_name(f"{path.stem}_geometry.npz"), depth=depth, normals=normals)

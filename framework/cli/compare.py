@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import check_weights, run_command
 from nerfloom.cli.flags import read_flags
+from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.training.run_path import check_data, check_writable
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CompareFlags:
+class CompareFlags(GeometryFlags):
     """Compare methods on one data set: each is trained and evaluated under the same conditions, in its own process.
 
     Writes report.html, report.md, results.json and results.csv. If run again, it continues where it was stopped."""
@@ -100,6 +101,7 @@ def plan_of(flags: CompareFlags) -> Plan:
     if flags.data is not None and not os.path.isdir(flags.data):
         flags = replace(flags, data=find_data(flags.data)[0])
     check_weights(flags.lpips_weights)
+    flags.check_geometry()
     conditions = Conditions(
         data=None if flags.data is None else str(flags.data.resolve()),
         data_flags=split_words(flags.data_flags, "--data-flags"),
@@ -111,6 +113,7 @@ def plan_of(flags: CompareFlags) -> Plan:
         curve_images=flags.curve_images,
         max_eval_images=views_for(flags.max_seconds) if flags.max_eval_images is None else flags.max_eval_images,
         lpips_weights=None if flags.lpips_weights is None else str(flags.lpips_weights.resolve()),
+        geometry=() if flags.reference is None else flags.words(),
     )
     name = "procedural" if flags.data is None else flags.data.resolve().name
     folder = flags.output_dir or Path("outputs") / f"compare-{name}"

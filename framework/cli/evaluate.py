@@ -7,16 +7,19 @@ from pathlib import Path
 from typing import Literal
 
 from nerfloom.base.config import RaysPerPixel
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
 from nerfloom.cli.common import make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
+from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.cli.run_flags import OPENS, RunFlags
 from nerfloom.training.run_path import check_writable
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalFlags(RunFlags):
-    """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views."""
+class EvalFlags(GeometryFlags, RunFlags):
+    """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views.
+
+    With --reference-mesh or --reference-points, also compare its surface with the true one."""
 
     output_path: Path | None = None
     """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
@@ -39,6 +42,8 @@ class EvalFlags(RunFlags):
     """End rays where the rest cannot change a colour by more than this, such as 1/255. Default: 1e-4."""
     round_to_uint8: bool = False
     """Round colours to 8 bits before computing metrics."""
+    mesh: Path | None = None
+    """Existing mesh (.ply, .obj, .glb) to compare with the reference instead of one made by --surface."""
 
 
 def main() -> None:
@@ -47,24 +52,30 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    words, named = with_format("ns-eval", with_run(arguments))
+    words, named = with_format("ns-eval", with_run(arguments, ("--f-score-at",)))
     flags = read_flags(EvalFlags, "ns-eval", words, takes=OPENS)
     if flags.max_images is not None and flags.max_images < 1:
         raise FlagError(f"--max-images is {flags.max_images}; it must be at least 1")
     if flags.max_pictures is not None and flags.max_pictures < 0:
         raise FlagError(f"--max-pictures is {flags.max_pictures}; it must be at least 0")
+    flags.check_geometry()
+    if flags.mesh is not None and flags.reference is None:
+        raise FlagError("--mesh is compared with a reference: give --reference-mesh or --reference-points")
     found = flags.check()
     output = flags.output_path or _beside(found)
     make_room(output)
     if flags.render_output_path is not None:
         check_writable(flags.render_output_path, "pictures to")
     from contextlib import nullcontext
+    from typing import Any
 
     from nerfloom.base.console import say
+    from nerfloom.cli.evaluate_geometry import evaluate_geometry, read_reference
     from nerfloom.evaluation.error_bound import limited_error, measured_error, parse_error
     from nerfloom.evaluation.evaluator import evaluate
     from nerfloom.training.report import write_evaluation
 
+    reference = read_reference(flags)
     loaded = flags.load(
         found, rays_per_pixel=flags.rays_per_pixel, eval_appearance=flags.eval_appearance, data_format=named
     )
@@ -91,9 +102,17 @@ def _command(arguments: list[str]) -> None:
     say(f"LPIPS: {evaluation.lpips_note}")
     if evaluation.masks_note is not None:
         say(f"masks: {evaluation.masks_note}")
-    write_evaluation(output, loaded.run, loaded.checkpoint, evaluation, model.device)
+    geometry: dict[str, Any] | None = None
+    wrong = evaluation.pictures_note or evaluation.warning
+    if reference is not None:
+        try:
+            geometry, warning = evaluate_geometry(flags, flags.mesh, loaded, reference)
+        except NerfloomError as error:  # what images show is written even so
+            warning = str(error)
+        wrong = wrong or warning
+    write_evaluation(output, loaded.run, loaded.checkpoint, evaluation, model.device, geometry)
     say(f"written to {output}")
-    if (wrong := evaluation.pictures_note or evaluation.warning) is not None:
+    if wrong is not None:
         raise ConfigError(wrong)
 
 

@@ -39,6 +39,7 @@ class Measured:
         folder: folder of the run.
         lpips_note: how LPIPS was computed, or the reason for its absence.
         masks_note: description of the metrics of masked images; None if all pixels count.
+        geometry: metrics of the surface as in eval.json; None without a reference.
     """
 
     label: str
@@ -77,6 +78,28 @@ class Measured:
     folder: str
     lpips_note: str
     masks_note: str | None
+    geometry: dict[str, Any] | None = None
+
+    @property
+    def chamfer(self) -> float | None:
+        """Chamfer distance in per cent of the reference's longest side; None without a reference."""
+        return None if self.geometry is None else self.geometry["chamfer_percent"]
+
+    @property
+    def f_score(self) -> float | None:
+        """F-score at the smallest distance, per cent; None without a reference."""
+        return None if self.geometry is None else 100 * self.geometry["f_scores"][0]["f_score"]
+
+    @property
+    def normal_error(self) -> float | None:
+        """Mean angle between normals, degrees; None without a reference or its normals."""
+        normals = None if self.geometry is None else self.geometry["normals"]
+        return None if normals is None else normals["degrees"]
+
+    @property
+    def faces(self) -> float | None:
+        """Number of faces of the mesh that was judged; None without a reference."""
+        return None if self.geometry is None else self.geometry["faces"]
 
     def as_plain(self) -> dict[str, Any]:
         """Return the measurements as a dictionary for JSON."""
@@ -130,6 +153,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         folder=str(job.folder),
         lpips_note=evaluation["lpips"],
         masks_note=evaluation.get("masks"),
+        geometry=evaluation.get("geometry"),
     )
 
 

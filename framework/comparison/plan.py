@@ -117,6 +117,8 @@ class Conditions:
     """Maximum number of views of the final evaluation; None for all."""
     lpips_weights: str | None = None
     """Absolute path of LPIPS's weights file; None to use the lpips package."""
+    geometry: tuple[str, ...] = ()
+    """Flags of ns-eval that compare surfaces with a reference; empty for no such comparison."""
 
     def __post_init__(self) -> None:
         if self.max_seconds is None and self.max_num_iterations is None and self.target_psnr is None:
@@ -209,7 +211,7 @@ class Job:
             command += ["--max-images", str(conditions.max_eval_images)]
         if conditions.lpips_weights is not None:
             command += ["--lpips-weights", conditions.lpips_weights]
-        return command
+        return [*command, *conditions.geometry]
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,10 @@ COLUMNS = (
     Column("MS-SSIM", "ms_ssim", "{:.4f}".format, max),
     Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
+    Column("Chamfer, % of side", "chamfer", "{:.3f}".format, min),
+    Column("F-score, %", "f_score", "{:.1f}".format, max),
+    Column("normals, °", "normal_error", "{:.2f}".format, min),
+    Column("faces", "faces", "{:,.0f}".format, None),
     Column("training, s", "seconds", "{:.1f}".format, min, TIME_TOLERANCE),
     Column("steps", "steps", "{:,.0f}".format, None),
     Column("training, rays/s", "rays_per_second", "{:,.0f}".format, None),  # pixels for methods that render images
@@ -159,7 +163,17 @@ def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measure
     if used := sorted({str(run.machine.get("kernels")) for run in runs}):
         lines.append(f"Kernels: {' and '.join(used)}.")
     lines += [f"LPIPS: {note}." for note in sorted({run.lpips_note for run in runs})]
-    return lines + [f"Masks: {note}." for note in sorted({run.masks_note for run in runs if run.masks_note})]
+    lines += [f"Masks: {note}." for note in sorted({run.masks_note for run in runs if run.masks_note})]
+    return lines + sorted({_surfaces(run.geometry) for run in runs if run.geometry is not None})
+
+
+def _surfaces(geometry: dict[str, Any]) -> str:
+    """Return how surfaces were compared with a reference, as a sentence."""
+    near = geometry["f_scores"][0]["distance"]
+    return (
+        f"Surfaces are compared with {Path(geometry['reference']).name}, whose longest side is {geometry['side']:.4g}; "
+        f"F-score at {near:.4g}, both in the input's unit."
+    )
 
 
 def _of_all(conditions: Conditions) -> str:
@@ -300,8 +314,8 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters")
-"""Measures of the rendered views."""
+QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "chamfer", "f_score", "normal_error", "faces")
+"""Measures of the rendered views and of the surface."""
 CSV_FIGURES = ("label", "method", "seed", *QUALITY, "views", "steps", "seconds", "rays_per_second")
 """First columns of results.csv."""
 CSV_MORE = ("render_seconds", "peak_memory_bytes", "parameters", "skipped_steps", "command")

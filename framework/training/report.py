@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,8 +20,15 @@ SUMMARY = "summary.json"
 """Name of the summary in a run's folder."""
 
 
-def write_evaluation(path: Path, run: Run, checkpoint: Path | None, found: Evaluation, device: torch.device) -> None:
-    """Write the metrics of an evaluation as JSON: nerfstudio's keys, and the metrics of each image.
+def write_evaluation(
+    path: Path,
+    run: Run,
+    checkpoint: Path | None,
+    found: Evaluation,
+    device: torch.device,
+    geometry: dict[str, Any] | None = None,
+) -> None:
+    """Write the metrics of an evaluation as JSON: nerfstudio's keys, the metrics of each image, and of the surface.
 
     Non-finite metrics and their means are null.
 
@@ -30,6 +38,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path | None, found: Evalu
         checkpoint: the evaluated checkpoint, for its name; None without a file.
         found: the metrics.
         device: device of the evaluation.
+        geometry: metrics of the surface; None if it was not compared with a reference.
 
     Raises:
         ConfigError: if the file cannot be written.
@@ -44,6 +53,7 @@ def write_evaluation(path: Path, run: Run, checkpoint: Path | None, found: Evalu
         "results": finite_or_null(found.results),
         "lpips": found.lpips_note,
         "masks": found.masks_note,
+        "geometry": finite_or_null(geometry),
         "per_image": finite_or_null(found.per_image),
     }
     try:

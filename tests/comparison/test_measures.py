@@ -36,6 +36,26 @@ def test_figures_come_from_the_runs_files(tmp_path: Path) -> None:
     assert measure(job, CONDITIONS) is None
 
 
+def test_surfaces_have_figures_where_there_was_a_reference(tmp_path: Path) -> None:
+    judged, other = plan(tmp_path, "kplanes", "tensorf").jobs()
+    finish(judged, 30.0)
+    finish(other, 30.0)
+    evaluation = json.loads(judged.evaluation.read_text())
+    scores = [{"distance": 0.1, "f_score": 0.4}, {"distance": 1.0, "f_score": 0.9}]
+    geometry = {"chamfer_percent": 0.25, "f_scores": scores, "normals": {"degrees": 6.0, "cosine": 0.99}, "faces": 1234}
+    judged.evaluation.write_text(json.dumps({**evaluation, "geometry": geometry}))
+    found = measure(judged, CONDITIONS)
+    assert found is not None
+    assert (found.chamfer, found.f_score, found.normal_error, found.faces) == (0.25, 40.0, 6.0, 1234)
+    without = measure(other, CONDITIONS)
+    assert without is not None
+    assert (without.chamfer, without.f_score, without.normal_error, without.faces) == (None,) * 4
+    judged.evaluation.write_text(json.dumps({**evaluation, "geometry": {**geometry, "normals": None}}))
+    bare = measure(judged, CONDITIONS)
+    assert bare is not None
+    assert bare.normal_error is None
+
+
 def test_a_run_is_done_once_it_was_judged_and_is_finite(tmp_path: Path) -> None:
     whole, stopped, blown_up = plan(tmp_path, "tensorf", "kplanes", "nerfacto").jobs()
     assert not is_done(whole)

@@ -142,3 +142,17 @@ def test_without_curve_images_nothing_is_evaluated_during_training(tmp_path: Pat
 def test_only_the_pictures_that_a_report_shows_are_written(tmp_path: Path) -> None:
     command = Job(Contender.of("kplanes"), 42, tmp_path).eval_command(CONDITIONS)
     assert command[command.index("--max-pictures") + 1] == str(MAX_VIEWS)
+
+
+def test_surfaces_are_judged_by_the_same_reference(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh")
+    file = tmp_path / "true.ply"
+    file.write_text("ply")
+    flags = CompareFlags(methods=("instant-ngp",), max_seconds=60, f_score_at=(0.1, 0.2), reference_mesh=file, crop=0.1)
+    plan = plan_of(flags)
+    words = ["--reference-mesh", str(file), "--f-score-at", "0.1", "0.2", "--crop", "0.1"]
+    assert list(plan.conditions.geometry) == words
+    assert plan.jobs()[0].eval_command(plan.conditions)[-len(words) :] == words
+    assert plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=60, crop=0.1)).conditions.geometry == ()
+    with pytest.raises(ConfigError, match=r"gone.ply is no file"):
+        plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=60, reference_points=tmp_path / "gone.ply"))

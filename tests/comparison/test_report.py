@@ -85,6 +85,30 @@ def test_what_nobody_has_measured_has_no_column(compared: Plan) -> None:
     assert "floaters" not in head  # no run has sparse points
 
 
+def test_surfaces_have_columns_and_say_how_they_were_compared(tmp_path: Path) -> None:
+    comparison = plan(tmp_path / "out", "kplanes", "tensorf")
+    for job, chamfer in zip(comparison.jobs(), (0.25, 0.5), strict=True):
+        finish(job, 30.0)
+        evaluation = json.loads(job.evaluation.read_text())
+        evaluation["geometry"] = {
+            "reference": "/data/solids/reference.ply", "side": 2.0, "chamfer_percent": chamfer, "faces": 1234,
+            "f_scores": [{"distance": 0.005, "f_score": 0.4}], "normals": {"degrees": 6.0, "cosine": 0.99},
+        }  # fmt: skip
+        job.evaluation.write_text(json.dumps(evaluation))
+    runs = [run for run in (measure(job, CONDITIONS) for job in comparison.jobs()) if run is not None]
+    write_report(comparison, rows_of(["kplanes", "tensorf"], runs, {}))
+    text = (comparison.folder / "report.md").read_text()
+    head = next(line for line in text.splitlines() if line.startswith("| method")).split(" | ")
+    row = next(line for line in text.splitlines() if line.startswith("| kplanes")).split(" | ")
+    assert row[head.index("Chamfer, % of side")] == "**0.250**"
+    assert row[head.index("F-score, %")] == "40.0"
+    assert row[head.index("normals, °")] == "6.00"
+    assert row[head.index("faces")] == "1,234"
+    assert "Surfaces are compared with reference.ply, whose longest side is 2; F-score at 0.005, both in" in text
+    (csv_row, _) = csv.DictReader(io.StringIO((comparison.folder / "results.csv").read_text()))
+    assert csv_row["chamfer"] == "0.25"
+
+
 def test_all_may_have_failed(tmp_path: Path) -> None:
     comparison = plan(tmp_path, "tensorf")
     page = write_report(comparison, rows_of(["tensorf"], [], {"tensorf": ["no luck"]})).read_text()

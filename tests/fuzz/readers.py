@@ -37,6 +37,11 @@ from nerfloom.dataparsers.record3d import Record3D
 from nerfloom.dataparsers.sdfstudio import SdfStudio
 from nerfloom.downloads import unpack as downloads
 from nerfloom.evaluation.lpips import SHAPES, read_weights
+from nerfloom.evaluation.surface_files import read_mesh
+from nerfloom.evaluation.surface_files import read_points as read_surface_points
+from nerfloom.evaluation.surfaces import drawn
+from nerfloom.export.mesh import Mesh
+from nerfloom.export.mesh_files import write_mesh
 from nerfloom.processing import polycam, record3d
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
@@ -158,6 +163,23 @@ def read_ply(folder: Path, scratch: Path) -> None:
     for file in sorted(folder.glob("*.ply")):
         points = read_points(file)
         require(points.shape[1:] == (3,) and bool(points.isfinite().all()), "points that are nowhere")
+
+
+def write_surfaces(folder: Path) -> None:
+    positions = torch.eye(4, dtype=torch.float64)[:, :3]
+    faces, normals = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.nn.functional.normalize(positions + 0.1, dim=-1)
+    for suffix in ("ply", "obj", "glb"):
+        write_mesh(folder / f"mesh.{suffix}", Mesh(positions, faces, normals))
+
+
+def read_surfaces(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("mesh.*")):
+        found = [read_mesh(file)] + ([read_surface_points(file)] if file.suffix == ".ply" else [])
+        for surface in found:
+            require(0 < surface.side < math.inf, "a surface without extent")
+            places = drawn(surface, 100)
+            require(bool(places.positions.isfinite().all()), "points that are nowhere")
+            require(places.normals is None or bool(places.normals.isfinite().all()), "normals that point nowhere")
 
 
 def write_splats(folder: Path) -> None:
@@ -404,6 +426,7 @@ READERS: dict[str, Reader] = {
     "sdfstudio": Reader(write_sdfstudio, partial(parse, SdfStudio()), ("meta_data.json",), SDFSTUDIO),
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
+    "surfaces": Reader(write_surfaces, read_surfaces, ("mesh.*",)),
     "splats": Reader(write_splats, read_splats, ("splat.*",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
     "images": Reader(write_blender, partial(load, Blender(), MEMORY), ("train/*.png",)),

@@ -14,13 +14,14 @@ from tests.fuzz.report import summary
 
 pytest.importorskip("resource")
 pytest.importorskip("pycolmap")
+pytest.importorskip("trimesh")
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory are those of Linux")
 FEW, MANY = 6, 200
 """Inputs for each reader, in the fast set and in the slow one."""
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
-    "phototourism", "ply", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths", "photographs",
-    "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
+    "phototourism", "ply", "surfaces", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths",
+    "photographs", "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
     "lpips-weights", "depths-exr", "dtu", "sdfstudio",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""

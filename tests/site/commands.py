@@ -20,6 +20,8 @@ UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
 """Commands of others, and those that no parser here knows."""
 TAKE_RUNS = ("run_flags",)
 """What looks whether a trained run is there."""
+SURFACES = "scan.ply", "scan_points.ply", "made_elsewhere.glb", "solids/reference.ply"
+"""Files of surfaces that commands of the documents name."""
 FORMATS = {"lego": "blender", "balls": "dnerf", "ring": "blender"}
 """Name of a folder in the documents -> its format; of any other, nerfstudio."""
 
@@ -49,6 +51,9 @@ class Checker:
         monkeypatch.chdir(folder)
         shutil.copytree(ROOT / "configs", folder / "configs")
         (folder / "path" / "to" / "masks").mkdir(parents=True)
+        (folder / "solids").mkdir()
+        for name in SURFACES:
+            (folder / name).touch()
         exchanged: dict[str, Callable[..., Any]] = {
             "nerfloom.training.data_folder.find_data": found,
             "nerfloom.cli.train_paths.check_paths": lambda *_: None,

@@ -36,6 +36,8 @@ ELSEWHERE = {
     r"python -m nerfloom.cli.bench gpu": "tests/benchmarks/test_gpu.py",
     r"ns-download-data": "tests/downloads/test_install.py",
     r"ns-stress": "tests/stress_command/test_runs.py",
+    r"python -m nerfloom.dataparsers.procedural.solids": "tests/dataparsers/test_solids.py",
+    r"ns-(eval|compare) .*--reference-": "tests/cli/test_eval_geometry.py",
     r"torchrun": "tests/training/test_processes.py",
     r"python examples/": "tests/plug_and_play/test_examples.py",
     r"python docs/building/failures": "tests/site/test_failures.py",

@@ -96,6 +96,13 @@ def test_it_can_be_compiled(page: Path) -> None:
 
 def test_pages_with_programs_are_executed() -> None:
     """Python that calls `nerfloom` or makes a METHOD is run by some test, not only compiled."""
-    run_elsewhere = {"plug-and-play", "guides/add-a-format", "guides/add-a-method", "interfaces", "plugins"}
+    run_elsewhere = {
+        "plug-and-play",
+        "guides/add-a-format",
+        "guides/add-a-method",
+        "guides/judge-geometry",
+        "interfaces",
+        "plugins",
+    }
     pages = {block.page for page in PAGES for block in blocks(page) if block.language == "python"}
     assert pages == {f"docs/{name}.md" for name in {*EXECUTED, *run_elsewhere}}

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
-from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
@@ -26,6 +28,8 @@ from nerfloom.samplers.background import BackgroundConfig, decide_background, fo
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import decide_samples
 
+APPEARANCE_SIZE = 16
+"""Default length of appearance vectors if the appearance varies."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
 
@@ -34,6 +38,7 @@ SAMPLES = 2**15
 class SurfaceConfig(
     HashGridConfig,
     BackgroundConfig,
+    AppearanceConfig,
     max_num_iterations=20_000,
     learning_rate=1e-2,
     lr_schedule="hold-exponential",
@@ -47,6 +52,7 @@ class SurfaceConfig(
     """Settings of a method that learns a signed distance."""
 
     RANGES: ClassVar[dict[str, Range]] = {
+        "appearance_embedding_dim": (0, 2**10),
         "hidden_width": (1, 2**14),
         "eikonal_loss_mult": AT_LEAST_0,
         "silhouette_loss_mult": AT_LEAST_0,
@@ -56,6 +62,8 @@ class SurfaceConfig(
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
+    appearance_embedding_dim: Auto[int] = AUTO
+    """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
     eikonal_loss_mult: float = 0.01
@@ -83,15 +91,42 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     if config.sampler != "occupancy":
         raise ConfigError(f"--sampler {config.sampler}: surfaces are sampled with --sampler occupancy")
     config, samples = decide_samples(config, SAMPLES)
-    return config, made + samples
+    varies = scene.appearance_varies
+    size = APPEARANCE_SIZE if varies else 0
+    config, light = fill(config, Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features"))
+    return config, made + samples + light
 
 
-def field_parts(config: SurfaceConfig, scene: Scene) -> tuple[Tensor, HashGrid, Sharpness, float, int]:
-    """Return the arguments of a field's constructor."""
-    box = foreground(config, scene).box
+class FieldParts(TypedDict):
+    """Arguments of a field's constructor."""
+
+    box: Tensor
+    encoding: HashGrid
+    sharpness: Sharpness
+    radius: float
+    width: int
+    appearance: Appearance | None
+
+
+def field_parts(config: SurfaceConfig, scene: Scene) -> FieldParts:
+    """Return the arguments of a field's constructor.
+
+    Args:
+        config: the method's settings, decided.
+        scene: properties of the whole scene.
+    """
+    box, size, appearance = foreground(config, scene).box, config.appearance_embedding_dim, None
+    if size:
+        appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
     half = float((box[1] - box[0]).min()) / 2
-    sharpness = Sharpness(config.start_sharpness / half, config.sharpness_learning_rate)
-    return box, HashGrid.of(config, config.open_levels_until), sharpness, config.start_radius, config.hidden_width
+    return {
+        "box": box,
+        "encoding": HashGrid.of(config, config.open_levels_until),
+        "sharpness": Sharpness(config.start_sharpness / half, config.sharpness_learning_rate),
+        "radius": config.start_radius,
+        "width": config.hidden_width,
+        "appearance": appearance,
+    }
 
 
 class SurfaceRenderer(VolumeRenderer):
@@ -142,6 +177,11 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
         """The field."""
         assert isinstance(self.field, SurfaceField)
         return self.field
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """Appearance vectors of the training images; None if there are none."""
+        return self.surface.appearance
 
     @torch.no_grad()
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ class NeuS(SurfaceModel[NeuSConfig], plain=True):
 
 def make_field(config: NeuSConfig, scene: Scene) -> NeuSField:
     """Return a field that starts as a ball."""
-    return NeuSField(*field_parts(config, scene))
+    return NeuSField(**field_parts(config, scene))
 
 
 METHOD = Method(

@@ -31,7 +31,7 @@ class VolSDF(SurfaceModel[VolSDFConfig], plain=True):
 
 def make_field(config: VolSDFConfig, scene: Scene) -> VolSDFField:
     """Return a field that starts as a ball."""
-    return VolSDFField(*field_parts(config, scene))
+    return VolSDFField(**field_parts(config, scene))
 
 
 METHOD = Method(

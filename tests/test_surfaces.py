@@ -125,6 +125,13 @@ def test_captures_get_a_background_on_a_sphere(name: str, shared_tiny: Path, tmp
     assert trainer.state.skipped == 0
 
 
+def test_images_that_are_lit_differently_have_appearances(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = said_otherwise("neus", shared_tiny, tmp_path, {"appearance_varies": True}, max_num_iterations=3)
+    assert chosen(trainer)["appearance features"] == "16"
+    trainer.train()
+    assert bool((trainer.model.appearance.vectors != 0).any())
+
+
 @pytest.mark.parametrize(
     ("settings", "said"),
     [({"background_model": "contraction"}, "is not contracted"), ({"sampler": "proposal"}, "--sampler occupancy")],

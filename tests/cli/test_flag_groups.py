@@ -25,7 +25,7 @@ METHODS = (
 )  # fmt: skip
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""
-WITH_BACKGROUND = ("instant-ngp", "nerf-plus-plus", "vanilla-nerf")
+WITH_BACKGROUND = ("instant-ngp", "nerf-plus-plus", "neus", "vanilla-nerf", "volsdf")
 """Methods with settings of a background."""
 FORMATS = (
     "blender", "colmap", "dnerf", "dtu", "llff", "nerfstudio", "phototourism", "polycam", "record3d", "sdfstudio",
@@ -78,7 +78,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert list(found) == [
         "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
         *["background options"] * (method in WITH_BACKGROUND), "ray options",
-        *["appearance options"] * (method in ("nerfacto", "zip-nerf")),
+        *["appearance options"] * (method in ("nerfacto", "neus", "volsdf", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
         "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",

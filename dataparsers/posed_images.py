@@ -91,8 +91,7 @@ class PosedImages:
     tracks: Tracks | None = None
     """Which images see which sparse points, in the input's frame; None if that is not known."""
     region: StatedRegion | None = None
-    """Region of interest, by which the scene is then placed, and which holds the object that masks show; None if the
-    input states none."""
+    """Region of interest; None if the input states none. It places the scene, and holds the object that masks show."""
 
     def __getitem__(self, index: Tensor) -> PosedImages:
         """Return the images selected by an index tensor."""

@@ -21,7 +21,7 @@ between two neighbours in `FACTORS`, so at most one of them is plausible."""
 MOST_SKEW = 0.5
 """Maximum displacement of a pixel by a skew that is left out, pixels."""
 REPORTED_SKEW = 0.01
-"""Displacement from which it is reported, pixels."""
+"""Minimum displacement of a skew that is reported, pixels."""
 
 
 @dataclass(frozen=True)

@@ -136,6 +136,8 @@ class SurfaceRenderer(VolumeRenderer):
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().shade(rays, samples, field, background)
+        if self.training:  # no term of the objective asks for them
+            return rendered
         assert samples.features is not None
         assert rendered.weights is not None
         normals = safe_normalize(samples.features[:, :3].detach())

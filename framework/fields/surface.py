@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -145,6 +146,19 @@ class SurfaceField(BoxField):
         """
         network = self.network(positions)
         return Shape(*ball_distance(network, positions, self.ball), network[:, 1:-3])
+
+    def reach(self, safety: float) -> Callable[[Tensor], Tensor]:
+        """Return the function from positions (N, 3) to how far rays may step from them (N,), negative inside.
+
+        Args:
+            safety: factor by which the distance may be steeper on the way than at the position.
+        """
+
+        def bound(positions: Tensor) -> Tensor:
+            shape = self.shape(positions)
+            return shape.distances / (safety * shape.gradients.norm(dim=-1).clamp(min=1))
+
+        return bound
 
     def signed_distance(self, points: Points) -> Tensor:
         """Return the distances (N,) from `points` to the nearest surface, scene units, negative inside."""

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.kernels.surfaces.opacity import laplace_density, surface_opacity
+from nerfloom.kernels.triton_backend import later
 
 PLACED = 6
 """Number of features before the network's: gradient of the distance, and position in units of the ball."""
@@ -122,6 +123,8 @@ _samples = native.Function("surface_samples", "pqippppfppfffppi")
 _samples_backward = native.Function("surface_samples_backward", "pqippppfppfffppppi")
 _unit = native.Function("unit_normals", "pqifpi")
 _unit_backward = native.Function("unit_normals_backward", "pqifppi")
+SURFACE_SAMPLES.implementation(TRITON, differentiable=2)(later("surfaces.samples_triton", "surface_samples"))
+UNIT_NORMALS.implementation(TRITON)(later("surfaces.samples_triton", "unit_normals"))
 
 
 @SURFACE_SAMPLES.implementation(CPP, differentiable=2)

@@ -1,8 +1,12 @@
-"""Sphere tracing (Hart 1996) of a signed distance: one sample a ray, where it first enters the surface.
+"""Sphere tracing (Hart 1996) of a signed distance: one sample for each surface that a ray meets, up to the first that
+covers it.
 
 A ray advances by the distance at its position, so it takes few steps far from a surface. It stays in occupied cells;
 the space between them counts as outside. A learnt distance is no exact one: steps are shortened by its slope at the
 position and by `SAFETY`, and a ray that has passed the surface is led back to it between its last two positions.
+
+A pixel is a cone. With m the least distance of the ray on its way past a surface, and r the cone's radius there, the
+surface covers (r - m) / (2 r) of the cone if its edge is straight. So edges are smooth with one ray a pixel.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ from nerfloom.samplers.occupancy import OccupancySampler
 SAFETY = 1.25
 """Factor by which a learnt distance may be steeper on the way than at the position where it was evaluated."""
 SHORTEST = 1 / 8
-"""Shortest advance, in steps of the sampler; parts of a surface that are thicker along a ray are not passed over."""
+"""Shortest advance, in steps of the sampler."""
 REFINEMENTS = 3
 """Number of evaluations of a ray's distance to find the surface between two positions."""
 DistanceFunction = Callable[[Tensor], Tensor]
@@ -45,89 +49,138 @@ class Pieces(NamedTuple):
     """(R + 1,) int64 index of each ray's first piece; the last entry is P."""
 
 
-class _Places(NamedTuple):
-    """The state of rays that are still advancing."""
+class Crossings(NamedTuple):
+    """M places where rays meet a surface, sorted by ray and distance."""
+
+    owners: Tensor
+    """(M,) int64 index of the ray."""
+    t: Tensor
+    """(M,) distance where it enters, or where it is nearest to a surface that it passes."""
+    coverage: Tensor
+    """(M,) share of the ray's cone that the surface covers."""
+    evaluations: int
+    """Number of evaluations of the distance."""
+
+
+class _Paths(NamedTuple):
+    """The state of rays that are still advancing, a column each."""
 
     rays: Tensor
-    """Index of each."""
+    """Index."""
     t: Tensor
-    """Distance along it."""
+    """Distance along the ray."""
     before: Tensor
-    """Distance along it at the position before."""
+    """Distance along the ray at the position before."""
     was: Tensor
     """Signed distance there; positive in space that is not searched, negative before the first position."""
+    least: Tensor
+    """Least distance since the ray was last clear of a surface; infinite if there was none."""
+    nearest: Tensor
+    """Distance along the ray at that place."""
+    outside: Tensor
+    """Distance along the ray of the last position before it entered; negative if it has not."""
+    inside: Tensor
+    """Distance along the ray of the first position after it entered."""
+    value_outside: Tensor
+    """Signed distance at `outside`."""
+    value_inside: Tensor
+    """Signed distance at `inside`."""
+
+    def of(self, chosen: Tensor) -> _Paths:
+        """Return the rays that a mask selects."""
+        index = chosen.nonzero().squeeze(-1)
+        return _Paths(*(column.index_select(0, index) for column in self))
 
 
-def first_crossings(
-    distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: float
-) -> tuple[Tensor, Tensor, int]:
-    """Return where rays first pass from outside to inside.
+def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: float) -> Crossings:
+    """Return where rays meet surfaces, up to the first that covers them.
 
     A ray that starts inside has to leave first. Parts of a surface are passed over only if they are thinner along the
-    ray than `shortest`, and if the distances are no longer than those to the nearest surface.
+    ray than `shortest` and half of its cone's radius, and if the distances are no longer than those to the nearest
+    surface.
 
     Args:
         distance: computes distances.
-        rays: R rays.
+        rays: R rays; without `pixel_radii` a surface covers all of a ray or nothing.
         pieces: where to search; elsewhere all space is outside.
         shortest: shortest advance, scene units.
-
-    Returns:
-        index (M,) of the rays that meet a surface, in ascending order; distances (M,) along them; and the number of
-        evaluations.
     """
-    counts = pieces.offsets[1:] - pieces.offsets[:-1]
-    active = counts.nonzero().squeeze(-1)
-    if not len(active):
-        return active, rays.nears[:0], 0
-    reach = float(pieces.ends.max()) + shortest  # one number orders ray and distance
-    ends = pieces.owners * (2 * reach) + pieces.ends.double()
+    active = (pieces.offsets[1:] > pieces.offsets[:-1]).nonzero().squeeze(-1)
+    radii = torch.zeros_like(rays.nears) if rays.pixel_radii is None else rays.pixel_radii
     first = pieces.starts[pieces.offsets[:-1][active]]
     # The first piece may begin at the face of the box, behind which is the outside, or at the ray's own start.
     was = torch.where(first > rays.nears[active] + shortest, 1.0, -1.0).to(first)
-    here, found, evaluations = _Places(active, first, first, was), list[tuple[Tensor, ...]](), 0
-    while len(here.rays):
-        value = distance(rays.points(here.rays, here.t))
+    none = torch.full_like(first, torch.inf)
+    paths = _Paths(active, first, first, was, none, first, -none, first, first, first)
+    span = 2 * (float(pieces.ends.max()) + shortest) if len(active) else 1.0  # one number orders ray and distance
+    ends = pieces.owners * span + pieces.ends.double()
+    met, evaluations = [(paths.of(active < 0), first[:0])], 0
+    while len(paths.rays):
+        value = distance(rays.points(paths.rays, paths.t))
         evaluations += len(value)
-        entered = (here.was > 0) & (value <= 0) | value.isnan()  # a broken field shows
-        found.append(tuple(column[entered] for column in (here.rays, here.before, here.t, here.was, value)))
-        going, t, value = (column[~entered] for column in (here.rays, here.t, value))
-        to = t + value.abs().clamp(min=shortest)
-        piece = torch.searchsorted(ends, going * (2 * reach) + to.double(), right=True)
-        inside = piece < pieces.offsets[going + 1]
-        going, t, value, to, piece = (column[inside] for column in (going, t, value, to, piece))
-        gap = pieces.starts[piece] > to + shortest
-        to = torch.maximum(to, pieces.starts[piece])
-        here = _Places(going, to, torch.where(gap, to, t), torch.where(gap, torch.ones_like(value), value))
-    owners, low, high, outside, inner = (torch.cat(columns) for columns in zip(*found, strict=True))
-    at = _refined(distance, rays, owners, (low, high, outside, inner))
-    order = owners.argsort()
-    return owners[order], at[order], evaluations + REFINEMENTS * len(owners)
+        radius = radii[paths.rays] * paths.t
+        paths = _noted(paths, value)
+        covered = (paths.outside > -torch.inf) & (paths.least <= -radius) | value.isnan()  # a broken field shows
+        step = value.abs().clamp(min=shortest).maximum(radius / 2)
+        to = paths.t + step
+        piece = torch.searchsorted(ends, paths.rays * span + to.double(), right=True)
+        over = piece >= pieces.offsets[paths.rays + 1]
+        start = pieces.starts[piece.clamp(max=len(ends) - 1)]
+        gap = ~over & (start > to + shortest)
+        clear = (value > radius) | over | gap
+        meets = covered | clear & (paths.least < radius)
+        share = torch.where(covered, 1.0, (0.5 - 0.5 * paths.least / radius).clamp(max=1))
+        met.append((paths.of(meets), share[meets]))
+        to, going = torch.maximum(to, start), ~covered & ~over
+        least, outside = (
+            x.masked_fill(clear, fill) for x, fill in ((paths.least, torch.inf), (paths.outside, -torch.inf))
+        )
+        before, was = torch.where(gap, to, paths.t), value.masked_fill(gap, 1.0)
+        paths = paths._replace(t=to, before=before, was=was, least=least, outside=outside).of(going)
+    found = _Paths(*(torch.cat(columns) for columns in zip(*(each for each, _ in met), strict=True)))
+    entered = found.outside > -torch.inf
+    at = found.nearest
+    at[entered] = _refined(distance, rays, found.of(entered))
+    order = found.rays.argsort(stable=True)  # those of a ray are in order
+    evaluations += REFINEMENTS * int(entered.sum())
+    return Crossings(found.rays[order], at[order], torch.cat([share for _, share in met])[order], evaluations)
 
 
-def _refined(distance: DistanceFunction, rays: Rays, owners: Tensor, bracket: tuple[Tensor, ...]) -> Tensor:
+def _noted(paths: _Paths, value: Tensor) -> _Paths:
+    """Return the state after a look at the distance `value` at the rays' positions."""
+    was_in = paths.outside > -torch.inf
+    enters = ~was_in & (paths.was > 0) & (value <= 0)
+    nearer = (value < paths.least) & (was_in | enters | (value > 0))  # not inside before the ray has left
+    return paths._replace(
+        least=torch.where(nearer, value, paths.least),
+        nearest=torch.where(nearer, paths.t, paths.nearest),
+        outside=torch.where(enters, paths.before, paths.outside),
+        inside=torch.where(enters, paths.t, paths.inside),
+        value_outside=torch.where(enters, paths.was, paths.value_outside),
+        value_inside=torch.where(enters, value, paths.value_inside),
+    )
+
+
+def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths) -> Tensor:
     """Return where distances are 0 (M,), by regula falsi (Illinois) between positions outside and inside.
 
     Args:
-        distance, rays: as in `first_crossings`.
-        owners: (M,) index of the rays.
-        bracket: distances (M,) along the rays, outside and inside, and signed distances (M,) there.
+        distance, rays: as in `crossings`.
+        entered: rays with such positions.
     """
-    low, high, outside, inside = bracket
-    at = high
+    low, high, outside, inside = entered.outside, entered.inside, entered.value_outside, entered.value_inside
     for _ in range(REFINEMENTS):
         at = low + (high - low) * (outside / (outside - inside))
-        value = distance(rays.points(owners, at))
+        value = distance(rays.points(entered.rays, at))
         is_outside = value > 0
         # The end that stays counts half, so that both ends approach.
-        outside = torch.where(is_outside, value, outside / 2)
-        inside = torch.where(is_outside, inside / 2, value)
+        outside, inside = torch.where(is_outside, value, outside / 2), torch.where(is_outside, inside / 2, value)
         low, high = torch.where(is_outside, at, low), torch.where(is_outside, high, at)
     return low + (high - low) * (outside / (outside - inside))
 
 
 class FirstCrossing(Sampler):
-    """Samples of another sampler, or in evaluation one opaque sample where a ray first enters the surface.
+    """Samples of another sampler, or in evaluation those where a ray meets a surface, up to the first that covers it.
 
     Args:
         sampler: knows which cells are occupied.
@@ -137,6 +190,8 @@ class FirstCrossing(Sampler):
     def __init__(self, sampler: OccupancySampler, traces: bool) -> None:
         super().__init__()
         self.sampler, self.traces, self.samples_per_step = sampler, traces, sampler.samples_per_step
+        self.evaluations = 0
+        """Number of evaluations for the last traced rays."""
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         if self.training or not self.traces:
@@ -144,11 +199,12 @@ class FirstCrossing(Sampler):
         assert isinstance(field, SurfaceField)
         with torch.no_grad():
             shortest = SHORTEST * self.sampler.step_size
-            owners, t, _ = first_crossings(field.reach(SAFETY), rays, self.pieces(rays), shortest)
-            counts = torch.bincount(owners, minlength=len(rays))
+            met = crossings(field.reach(SAFETY), rays, self.pieces(rays), shortest)
+            self.evaluations = met.evaluations + len(met.t)
+            counts = torch.bincount(met.owners, minlength=len(rays))
             offsets = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-            _, features = field.density(Points(rays.points(owners, t)))
-        return Samples(t, t, offsets, owners=owners, longest=1).with_alpha(torch.ones_like(t), features)
+            _, features = field.density(Points(rays.points(met.owners, met.t)))
+        return Samples(met.t, met.t, offsets, owners=met.owners).with_alpha(met.coverage, features)
 
     def pieces(self, rays: Rays) -> Pieces:
         """Return the steps of `rays` in occupied cells."""

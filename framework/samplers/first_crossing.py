@@ -30,8 +30,9 @@ SAFETY = 1.25
 """Factor by which a learnt distance may be steeper on the way than at the position where it was evaluated."""
 SHORTEST = 1 / 8
 """Shortest advance, in steps of the sampler."""
-REFINEMENTS = 3
-"""Number of evaluations of a ray's distance to find the surface between two positions."""
+REFINEMENTS, EXACT = 8, 1e-3
+"""Maximum number of evaluations to find the surface between two positions, and the distance from it that suffices, in
+shortest advances."""
 DistanceFunction = Callable[[Tensor], Tensor]
 """Function from positions (N, 3) to signed distances (N,), none longer than that to the nearest surface."""
 
@@ -140,10 +141,10 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     found = _Paths(*(torch.cat(columns) for columns in zip(*(each for each, _ in met), strict=True)))
     entered = found.outside > -torch.inf
     at = found.nearest
-    at[entered] = _refined(distance, rays, found.of(entered))
+    at[entered], more = _refined(distance, rays, found.of(entered), EXACT * shortest)
     order = found.rays.argsort(stable=True)  # those of a ray are in order
-    evaluations += REFINEMENTS * int(entered.sum())
-    return Crossings(found.rays[order], at[order], torch.cat([share for _, share in met])[order], evaluations)
+    shares = torch.cat([share for _, share in met])
+    return Crossings(found.rays[order], at[order], shares[order], evaluations + more)
 
 
 def _noted(paths: _Paths, value: Tensor) -> _Paths:
@@ -161,22 +162,28 @@ def _noted(paths: _Paths, value: Tensor) -> _Paths:
     )
 
 
-def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths) -> Tensor:
-    """Return where distances are 0 (M,), by regula falsi (Illinois) between positions outside and inside.
+def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths, exact: float) -> tuple[Tensor, int]:
+    """Return where distances are 0 (M,), and the number of evaluations.
+
+    It is found by regula falsi (Illinois) between positions outside and inside.
 
     Args:
         distance, rays: as in `crossings`.
         entered: rays with such positions.
+        exact: distance from the surface that suffices.
     """
-    low, high, outside, inside = entered.outside, entered.inside, entered.value_outside, entered.value_inside
+    owners, (low, high, outside, inside) = entered.rays, entered[6:]
+    at, left, evaluations = high.clone(), torch.arange(len(owners), device=owners.device), 0
     for _ in range(REFINEMENTS):
-        at = low + (high - low) * (outside / (outside - inside))
-        value = distance(rays.points(entered.rays, at))
-        is_outside = value > 0
+        here = low + (high - low) * (outside / (outside - inside))
+        value = distance(rays.points(owners, here))
+        at[left], evaluations, is_outside = here, evaluations + len(here), value > 0
         # The end that stays counts half, so that both ends approach.
         outside, inside = torch.where(is_outside, value, outside / 2), torch.where(is_outside, inside / 2, value)
-        low, high = torch.where(is_outside, at, low), torch.where(is_outside, high, at)
-    return low + (high - low) * (outside / (outside - inside))
+        low, high = torch.where(is_outside, here, low), torch.where(is_outside, high, here)
+        some = (value.abs() > exact).nonzero().squeeze(-1)
+        left, owners, low, high, outside, inside = (x[some] for x in (left, owners, low, high, outside, inside))
+    return at, evaluations
 
 
 class FirstCrossing(Sampler):

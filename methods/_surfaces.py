@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypedDict, TypeVar
+from typing import ClassVar, Generic, Literal, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,9 +24,13 @@ from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
-from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
+from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground, foreground_sphere
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import decide_samples
+from nerfloom.samplers.choice import make_sampler as occupancy_sampler
+from nerfloom.samplers.first_crossing import FirstCrossing
+from nerfloom.samplers.inside import InsideSphere
+from nerfloom.samplers.occupancy import OccupancySampler
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
@@ -76,6 +80,8 @@ class SurfaceConfig(
     """First inverse width of the surface, in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
+    eval_rendering: Literal["volume", "surface"] = "volume"
+    """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
     open_levels_until: float = 0.3
     """Fraction of the budget during which levels of the hash grid open, from coarse to fine."""
 
@@ -136,11 +142,21 @@ class SurfaceRenderer(VolumeRenderer):
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().shade(rays, samples, field, background)
+        if self.training:  # no term of the objective asks for them
+            return rendered
         assert samples.features is not None
         assert rendered.weights is not None
         normals = safe_normalize(samples.features[:, :3].detach())
         facing = ray_sum(rendered.weights.detach()[:, None] * normals, samples)
         return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
+
+
+def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
+    """Return the sampler, whose pictures are traced if the settings say so."""
+    sampler = occupancy_sampler(config, foreground(config, scene))
+    assert isinstance(sampler, OccupancySampler)
+    traced = FirstCrossing(sampler, config.eval_rendering == "surface")
+    return InsideSphere(traced, foreground_sphere(scene)) if config.background_model == "sphere" else traced
 
 
 def make_background(config: SurfaceConfig, scene: Scene) -> InvertedField:

@@ -18,9 +18,9 @@ from nerfloom.methods._surfaces import (
     SurfaceModel,
     decide_surface,
     field_parts,
+    make_sampler,
     renderer,
 )
-from nerfloom.samplers.inside import make_foreground_sampler
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ METHOD = Method(
     NeuSConfig(),
     paper="arXiv:2106.10689",
     field=make_field,
-    sampler=make_foreground_sampler,
+    sampler=make_sampler,
     renderer=renderer,
     model=NeuS,
     decide=decide_surface,

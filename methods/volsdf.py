@@ -15,9 +15,9 @@ from nerfloom.methods._surfaces import (
     SurfaceModel,
     decide_surface,
     field_parts,
+    make_sampler,
     renderer,
 )
-from nerfloom.samplers.inside import make_foreground_sampler
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ METHOD = Method(
     VolSDFConfig(),
     paper="arXiv:2106.12052",
     field=make_field,
-    sampler=make_foreground_sampler,
+    sampler=make_sampler,
     renderer=renderer,
     model=VolSDF,
     decide=decide_surface,

@@ -30,6 +30,9 @@ class RunFlags:
     """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
+    eval_rendering: Literal["volume", "surface"] | None = None
+    """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
+    the surface. Default: the run's setting."""
 
     def check(self) -> Path:
         """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
@@ -51,4 +54,5 @@ class RunFlags:
         """
         from nerfloom.training.load import load
 
-        return load(found, self.load_checkpoint, self.device_type, self.data, up=self.up, **others)
+        given = self.load_checkpoint, self.device_type, self.data
+        return load(found, *given, eval_rendering=self.eval_rendering, up=self.up, **others)

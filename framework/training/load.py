@@ -21,6 +21,7 @@ def load(
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
     eval_appearance: Literal["mean", "half"] | None = None,
+    eval_rendering: Literal["volume", "surface"] | None = None,
     data_format: DataFormat | None = None,
     up: Axis | None = None,
 ) -> Loaded:
@@ -34,6 +35,7 @@ def load(
         data: folder of the data, if a run's has moved; optional data for a file of Gaussians.
         rays_per_pixel: rays per rendered pixel; None for the run's setting.
         eval_appearance: appearance of held-out images; None for the run's setting.
+        eval_rendering: rendering of a signed distance; None for the run's setting.
         data_format: data format for a file of Gaussians, with its flags; None to detect it.
         up: up axis of a file of Gaussians without data; None for z.
 
@@ -47,8 +49,13 @@ def load(
             raise ConfigError(f"'{data_format[0]}': the run knows its data format; leave it out, with its flags")
         if up is not None:
             raise ConfigError("--up is for files of Gaussians: the run knows which way is up; leave it out")
-        return load_trained(path, checkpoint, device_type, data, rays_per_pixel, eval_appearance)
-    useless = {"load-checkpoint": checkpoint, "rays-per-pixel": rays_per_pixel, "eval-appearance": eval_appearance}
+        return load_trained(path, checkpoint, device_type, data, rays_per_pixel, eval_appearance, eval_rendering)
+    useless = {
+        "load-checkpoint": checkpoint,
+        "rays-per-pixel": rays_per_pixel,
+        "eval-appearance": eval_appearance,
+        "eval-rendering": eval_rendering,
+    }
     for flag, value in useless.items():
         if value is not None:
             raise ConfigError(f"--{flag} has no effect with a file of Gaussians: leave it out")

@@ -32,6 +32,7 @@ def load_trained(
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
     eval_appearance: Literal["mean", "half"] | None = None,
+    eval_rendering: Literal["volume", "surface"] | None = None,
 ) -> Loaded:
     """Load a run with its trained model.
 
@@ -42,6 +43,7 @@ def load_trained(
         data: folder of the data, if it has moved; None for the run's.
         rays_per_pixel: rays per rendered pixel; None for the run's setting.
         eval_appearance: appearance of held-out images; None for the run's setting.
+        eval_rendering: rendering of a signed distance; None for the run's setting.
 
     Raises:
         ConfigError: if the run's settings are missing or do not fit.
@@ -54,7 +56,13 @@ def load_trained(
         machine=machine,
         data=run.config.data if data is None else find_data(data, run.dataparser)[0],
     )
-    config = _changed(config, run.method, rays_per_pixel=rays_per_pixel, eval_appearance=eval_appearance)
+    config = _changed(
+        config,
+        run.method,
+        rays_per_pixel=rays_per_pixel,
+        eval_appearance=eval_appearance,
+        eval_rendering=eval_rendering,
+    )
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
     if checkpoint is None:

@@ -48,6 +48,7 @@ from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
 from nerfloom.kernels.splats.project import PROJECT, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TILES, tile_lists
 from nerfloom.kernels.surfaces.distance import DISTANCE_NETWORK
+from nerfloom.kernels.surfaces.samples import SURFACE_SAMPLES, UNIT_NORMALS, Ball, Intervals
 from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
 from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
 from nerfloom.kernels.traced.trace import TRACE, GridDensity
@@ -150,6 +151,14 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
     HASH_GRID_TANGENT: lambda: (torch.rand(50, 6), rand(GRID.num_entries, 2), GRID),
     DISTANCE_NETWORK: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), rand(8, 6) - 0.6, rand(3, 8), GRID, None),
+    SURFACE_SAMPLES: lambda: (
+        rand(50, 8),
+        rand(1)[0] + 3,
+        torch.rand(50, 3),
+        Ball(rand(3), rand(3), 0.5, 0.3, 1e-3),
+        Intervals(torch.nn.functional.normalize(torch.randn(50, 3), dim=-1), rand(50), 0.4),
+    ),
+    UNIT_NORMALS: lambda: (rand(50, 7),),
     MULTISAMPLED_GRID: lambda: (rand(50, 1, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     FRUSTUM_BALLS: lambda: (frustums(), BOX, True),

@@ -47,6 +47,14 @@ from nerfloom.kernels.splats.blend import blend, blend_reference
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference
+from nerfloom.kernels.surfaces.samples import (
+    Ball,
+    Intervals,
+    surface_samples,
+    surface_samples_reference,
+    unit_normals,
+    unit_normals_reference,
+)
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.distortion_by_pairs import distortion_by_pairs
@@ -148,6 +156,16 @@ def density_network(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
     return run
 
 
+def around_a_ball(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
+    ball = Ball(torch.tensor([0.5, 0.4, 0.6]), torch.tensor([1.0, 0.8, 0.9]), 0.5, 0.3, 1e-3)
+
+    def run(network: Tensor, sharpness: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor) -> Tensor:
+        stopping, features = form(network, sharpness, positions, ball, Intervals(directions, lengths))
+        return torch.cat([stopping[:, None], features], -1)
+
+    return run
+
+
 def gaussians() -> dict[str, Tensor]:
     return {
         "means": torch.rand(20, 3) + torch.tensor([-0.5, -0.5, 3.0]), "log_scales": rand(20, 3) - 2,
@@ -201,6 +219,24 @@ OPERATIONS = {
             "second": rand(3, 8) - 0.6,
         },
         ("distance_network_forward", "distance_network_backward", "hash_grid_tangent_backward_table"),
+    ),
+    "surface samples": Operation(
+        around_a_ball(surface_samples),
+        around_a_ball(surface_samples_reference),
+        lambda: {
+            "network": rand(20, 8),
+            "sharpness": rand(1)[0] + 3,
+            "positions": torch.rand(20, 3),
+            "directions": torch.nn.functional.normalize(torch.randn(20, 3), dim=-1),
+            "lengths": torch.rand(20),
+        },
+        ("surface_samples", "surface_samples_backward"),
+    ),
+    "unit normals": Operation(
+        unit_normals,
+        unit_normals_reference,
+        lambda: {"features": rand(20, 7)},
+        ("unit_normals", "unit_normals_backward"),
     ),
     "multisampled grid": Operation(
         lambda points, table: multisampled_grid(points, table, GRID),

@@ -18,18 +18,21 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.losses.surfaces import Eikonal, Silhouette
-from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
+from nerfloom.losses.functions import charbonnier
+from nerfloom.losses.surfaces import Curvature, DistanceBounds, Eikonal, Silhouette, SurfacePoints
+from nerfloom.losses.terms import KNOWN_DISTANCES, ColorError, SamplerLoss
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
-from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
+from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground, foreground_sphere
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import decide_samples
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
+SHARPER = 50.0
+"""Multiple of the first inverse width that its bound has reached when it ends."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
 
@@ -48,17 +51,24 @@ class SurfaceConfig(
     log2_table_size=17,
     eval_num_rays_per_chunk=8_192,
     thin_gradients=0.5,
+    sphere_around="object",
 ):
     """Settings of a method that learns a signed distance."""
 
+    samplers: ClassVar[tuple[str, ...]] = ("occupancy",)
+    """Samplers that suit the method."""
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
         "hidden_width": (1, 2**14),
         "eikonal_loss_mult": AT_LEAST_0,
         "silhouette_loss_mult": AT_LEAST_0,
+        "points_loss_mult": AT_LEAST_0,
+        "bounds_loss_mult": AT_LEAST_0,
+        "curvature_loss_mult": AT_LEAST_0,
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
         "sharpness_learning_rate": AT_LEAST_0,
+        "sharpen_until": (0, 1),
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
@@ -70,12 +80,22 @@ class SurfaceConfig(
     """Weight of the term that keeps the distance's gradient at length 1."""
     silhouette_loss_mult: float = 0.01
     """Weight of the difference between opacity and the images' alpha."""
+    points_loss_mult: float = 0.1
+    """Weight of the distance at points of a reconstruction, where it should be 0."""
+    bounds_loss_mult: float = 0.1
+    """Weight of distances before such points that are negative, or larger than the distance to the point."""
+    curvature_loss_mult: float = 0.0
+    """Weight of the change of normals along the surface."""
+    l1: bool = False
     start_radius: float = 0.5
     """Radius of the ball that training starts from, in halves of the box's shortest edge."""
     start_sharpness: float = 20.0
     """First inverse width of the surface, in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
+    sharpen_until: float = 0.8
+    """Fraction of the budget over which the upper bound of the inverse width rises, exponentially, to 50 times the
+    first value."""
     open_levels_until: float = 0.3
     """Fraction of the budget during which levels of the hash grid open, from coarse to fine."""
 
@@ -88,8 +108,8 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     if config.background_model == "contraction":
         raise ConfigError("--background-model contraction: a signed distance is not contracted; take sphere or none")
     config, made = decide_background(config, scene, "sphere")
-    if config.sampler != "occupancy":
-        raise ConfigError(f"--sampler {config.sampler}: surfaces are sampled with --sampler occupancy")
+    if config.sampler not in config.samplers:
+        raise ConfigError(f"--sampler {config.sampler}: take --sampler {' or '.join(config.samplers)}")
     config, samples = decide_samples(config, SAMPLES)
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
@@ -108,12 +128,13 @@ class FieldParts(TypedDict):
     appearance: Appearance | None
 
 
-def field_parts(config: SurfaceConfig, scene: Scene) -> FieldParts:
+def field_parts(config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] = Sharpness) -> FieldParts:
     """Return the arguments of a field's constructor.
 
     Args:
         config: the method's settings, decided.
         scene: properties of the whole scene.
+        sharpness: class of the learnt inverse width.
     """
     box, size, appearance = foreground(config, scene).box, config.appearance_embedding_dim, None
     if size:
@@ -122,7 +143,7 @@ def field_parts(config: SurfaceConfig, scene: Scene) -> FieldParts:
     return {
         "box": box,
         "encoding": HashGrid.of(config, config.open_levels_until),
-        "sharpness": Sharpness(config.start_sharpness / half, config.sharpness_learning_rate),
+        "sharpness": sharpness(config.start_sharpness / half, config.sharpness_learning_rate),
         "radius": config.start_radius,
         "width": config.hidden_width,
         "appearance": appearance,
@@ -160,17 +181,40 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     )
 
 
+class AbsoluteColorError(ColorError):
+    def error(self, rgb, shown):
+        if shown.model.config.l1:
+            return charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
+        return super().error(rgb, shown)
+
+
 class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
     """A model that learns the distance to a surface, and its colour."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), Silhouette(), Eikonal(), *KNOWN_DISTANCES)
+    losses = (
+        AbsoluteColorError(),
+        SamplerLoss(),
+        Silhouette(),
+        Eikonal(),
+        SurfacePoints(),
+        DistanceBounds(),
+        Curvature(),
+        *KNOWN_DISTANCES,
+    )
 
     def __init__(
         self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
-        super().__init__(config, scene, field, sampler, renderer)
+        # Meshes and crops cover what the field covers.
+        super().__init__(config, replace(scene, box=foreground(config, scene).box), field, sampler, renderer)
+        self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
         edges = self.surface.box[1] - self.surface.box[0]
         self.surface.cell = float((edges / config.grid_resolution).norm())
+
+    def before_step(self, step: int, progress: float) -> None:
+        super().before_step(step, progress)
+        if progress < self.config.sharpen_until:
+            self.surface.sharpness.limit(SHARPER ** (progress / self.config.sharpen_until))
 
     @property
     def surface(self) -> SurfaceField:
@@ -185,9 +229,17 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
 
     @torch.no_grad()
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3)."""
+        """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3).
+
+        The distance is NaN outside the sphere, where the background shows the scene.
+        """
         shape = self.surface.shape(points.positions)
-        return shape.distances, shape.gradients
+        if self.sphere is None:
+            return shape.distances, shape.gradients
+        sphere = self.sphere.to(points.positions)
+        outside = (points.positions - sphere[:3]).norm(dim=-1) > sphere[3]
+        distances = torch.where(outside, torch.nan, shape.distances)
+        return distances, shape.gradients
 
     @property
     def grid_density(self) -> DensityFunction:

@@ -56,12 +56,50 @@ class Sharpness(nn.Module):
 
     def __init__(self, first: float, rate: float) -> None:
         super().__init__()
+        self.first = first
         self.exponent = nn.Parameter(torch.tensor(math.log(first) / self.SPEED))
         self.optimised = Optimised("sharpness", rate)
 
     def forward(self) -> Tensor:
         """Return the inverse width (), 1/length."""
         return torch.exp(self.SPEED * self.exponent)
+
+    @torch.no_grad()
+    def limit(self, factor: float) -> None:
+        """Lower the inverse width if it is more than a multiple of the first value.
+
+        Args:
+            factor: the multiple.
+        """
+        self.exponent.clamp_(max=(math.log(self.first) + math.log(factor)) / self.SPEED)
+
+
+class AnnealedSharpness(Sharpness):
+    """The inverse width of a surface, and how far the annealing of its slope has come (`surface_opacity`).
+
+    Args:
+        first, rate: as in `Sharpness`.
+    """
+
+    annealing: Tensor
+
+    def __init__(self, first: float, rate: float) -> None:
+        super().__init__(first, rate)
+        self.register_buffer("annealing", torch.tensor(0.0))
+        self._share = HostValue()
+
+    @property
+    def share(self) -> float:
+        """Fraction of the annealing that is done, from 0 to 1."""
+        return self._share.of(self.annealing)
+
+    def anneal(self, share: float) -> None:
+        """Set the fraction of the annealing that is done.
+
+        Args:
+            share: fraction from 0 to 1 that float32 represents exactly.
+        """
+        self._share.change(self.annealing, share)
 
 
 class SurfaceField(BoxField):
@@ -180,35 +218,9 @@ class SurfaceField(BoxField):
 
 
 class NeuSField(SurfaceField):
-    """A field whose intervals have the opacity of NeuS, equation 13.
+    """A field whose intervals have the opacity of NeuS, equation 13; its sharpness is an `AnnealedSharpness`."""
 
-    Args:
-        box, encoding, sharpness, radius, width, num_features, appearance: as in `SurfaceField`.
-    """
-
-    annealing: Tensor
-
-    def __init__(
-        self,
-        box: Tensor,
-        encoding: HashGrid,
-        sharpness: Sharpness,
-        radius: float = 0.5,
-        width: int = 64,
-        num_features: int = 15,
-        appearance: Appearance | None = None,
-    ) -> None:
-        super().__init__(box, encoding, sharpness, radius, width, num_features, appearance)
-        self.register_buffer("annealing", torch.tensor(0.0))
-        self._annealing = HostValue()
-
-    def anneal(self, share: float) -> None:
-        """Set how far the slope's annealing has come (`surface_opacity`).
-
-        Args:
-            share: fraction from 0 to 1 that float32 represents exactly.
-        """
-        self._annealing.change(self.annealing, share)
+    sharpness: AnnealedSharpness
 
     def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
         """Return the opacity of intervals around points, and features.
@@ -220,8 +232,7 @@ class NeuSField(SurfaceField):
         """
         shape = self.shape(points.positions)
         cosines = (shape.gradients * directions).sum(-1)
-        share = self._annealing.of(self.annealing)
-        opacity = surface_opacity(shape.distances, cosines, deltas, self.sharpness(), share)
+        opacity = surface_opacity(shape.distances, cosines, deltas, self.sharpness(), self.sharpness.share)
         return opacity, self._features(points.positions, shape)
 
     def density_at(self, distances: Tensor) -> Tensor:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypedDict, TypeVar
+from typing import ClassVar, Generic, Literal, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,9 +19,15 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.losses.functions import charbonnier
-from nerfloom.losses.surfaces import Curvature, DistanceBounds, Eikonal, Silhouette, SurfacePoints
-from nerfloom.losses.terms import KNOWN_DISTANCES, ColorError, SamplerLoss
+from nerfloom.losses.surfaces import (
+    Curvature,
+    DistanceBounds,
+    Eikonal,
+    Silhouette,
+    SurfaceColorError,
+    SurfacePoints,
+)
+from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.renderer import Renderer
@@ -76,6 +83,9 @@ class SurfaceConfig(
     """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
+    color_loss: Auto[Literal["squared", "absolute"]] = AUTO
+    """Error of colours. absolute: as in NeuS and VolSDF; edges and highlights that are still wrong count less, so that
+    surfaces form where there is little texture. auto: absolute if there is a background, otherwise squared."""
     eikonal_loss_mult: float = 0.01
     """Weight of the term that keeps the distance's gradient at length 1."""
     silhouette_loss_mult: float = 0.01
@@ -86,7 +96,6 @@ class SurfaceConfig(
     """Weight of distances before such points that are negative, or larger than the distance to the point."""
     curvature_loss_mult: float = 0.0
     """Weight of the change of normals along the surface."""
-    l1: bool = False
     start_radius: float = 0.5
     """Radius of the ball that training starts from, in halves of the box's shortest edge."""
     start_sharpness: float = 20.0
@@ -111,10 +120,14 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     if config.sampler not in config.samplers:
         raise ConfigError(f"--sampler {config.sampler}: take --sampler {' or '.join(config.samplers)}")
     config, samples = decide_samples(config, SAMPLES)
+    color = Choice("color_loss", "squared", "nothing is behind the surfaces")
+    if config.background_model == "sphere":
+        color = Choice("color_loss", "absolute", "a background could explain what has no texture", "error of colours")
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
-    config, light = fill(config, Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features"))
-    return config, made + samples + light
+    light = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
+    config, own = fill(config, color, light)
+    return config, made + samples + own
 
 
 class FieldParts(TypedDict):
@@ -181,18 +194,11 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     )
 
 
-class AbsoluteColorError(ColorError):
-    def error(self, rgb, shown):
-        if shown.model.config.l1:
-            return charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
-        return super().error(rgb, shown)
-
-
 class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
     """A model that learns the distance to a surface, and its colour."""
 
     losses = (
-        AbsoluteColorError(),
+        SurfaceColorError(),
         SamplerLoss(),
         Silhouette(),
         Eikonal(),
@@ -213,8 +219,8 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
 
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
-        if progress < self.config.sharpen_until:
-            self.surface.sharpness.limit(SHARPER ** (progress / self.config.sharpen_until))
+        until = self.config.sharpen_until
+        self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
 
     @property
     def surface(self) -> SurfaceField:

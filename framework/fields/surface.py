@@ -66,12 +66,13 @@ class Sharpness(nn.Module):
 
     @torch.no_grad()
     def limit(self, factor: float) -> None:
-        """Lower the inverse width if it is more than a multiple of the first value.
+        """Keep the inverse width between the first value and a multiple of it.
 
         Args:
-            factor: the multiple.
+            factor: the multiple; infinity for no upper bound.
         """
-        self.exponent.clamp_(max=(math.log(self.first) + math.log(factor)) / self.SPEED)
+        least = math.log(self.first)
+        self.exponent.clamp_(least / self.SPEED, (least + math.log(factor)) / self.SPEED)
 
 
 class AnnealedSharpness(Sharpness):

@@ -12,8 +12,9 @@ from nerfloom.fields.surface import SurfaceField
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.losses.functions import mean_squared_error
+from nerfloom.losses.functions import charbonnier, mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import ColorError
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
@@ -24,6 +25,19 @@ skipped; and for one in this many samples at a random place in the box."""
 
 BEHIND = 0.03
 """Thickness of what is taken for solid behind points of a reconstruction, in halves of the box's shortest edge."""
+
+ABSOLUTE = 0.1
+"""Factor of the absolute error of colours, which is some ten times the squared error, so that the weights of the other
+terms suit both."""
+
+
+class SurfaceColorError(ColorError):
+    """Squared or absolute error of colours: the setting `color_loss`."""
+
+    def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
+        if shown.model.config.color_loss == "squared":
+            return super().error(rgb, shown)
+        return ABSOLUTE * charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
 
 
 class Eikonal(LossTerm):

@@ -79,8 +79,9 @@ def bounded_opacity(t: Tensor, distances: Tensor, beta: Tensor) -> Bounded:
     nearest = nearest_in_intervals(distances, lengths)
     error = (lengths.square() * torch.exp(-nearest / beta)).cumsum(-1) / (4 * beta.square())
     before = torch.nn.functional.pad(depth, (1, 0))
-    bound = torch.exp(-before[:, :-1]) * torch.expm1(error.clamp(max=MAX_EXPONENT))
-    return Bounded(-torch.expm1(-before), bound)
+    left = torch.exp(-before[:, :-1])
+    large = torch.exp((error - before[:, :-1]).clamp(max=MAX_EXPONENT)) - left  # expm1 would overflow
+    return Bounded(-torch.expm1(-before), torch.where(error < 1, left * torch.expm1(error), large))
 
 
 def bounding_beta(t: Tensor, distances: Tensor, beta: Tensor, first: Tensor, epsilon: float) -> Tensor:

@@ -1,6 +1,7 @@
 """Methods with a signed distance: how they start, what they learn of a ball, and its mesh."""
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from nerfloom.losses.term import RenderedBatch
 from nerfloom.method import Method
 from nerfloom.registry import load_method
 from nerfloom.rendering.background import SphereRenderer
+from nerfloom.samplers.background import foreground_sphere
 from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.trainer import Trainer
@@ -133,8 +135,39 @@ def test_captures_get_a_background_on_a_sphere(name: str, shared_tiny: Path, tmp
     trainer = captured(tmp_path, {"unbounded": True, "has_alpha": False}, max_num_iterations=3)
     assert chosen(trainer)["background model"] == "sphere"
     assert isinstance(trainer.model.renderer, SphereRenderer)
+    assert chosen(trainer)["error of colours"] == "absolute"
     trainer.train()
     assert trainer.state.skipped == 0
+
+
+def test_distances_of_captures_are_known_inside_the_sphere(shared_tiny: Path, tmp_path: Path) -> None:
+    """Outside, the background shows the scene; meshes cover the sphere's cube, and the first ball is inside."""
+    trainer = said_otherwise(
+        "neus", shared_tiny, tmp_path, {"unbounded": True, "has_alpha": False}, max_num_iterations=3
+    )
+    model = trainer.model
+    sphere = foreground_sphere(model.config, trainer.train_set.scene)
+    directions = torch.nn.functional.normalize(torch.randn(100, 3), dim=-1)
+    for share, known in ((0.99, True), (1.01, False)):
+        distances, gradients = model.signed_distance(Points(sphere[:3] + share * sphere[3] * directions))
+        assert bool((distances.isfinite() == known).all())
+        assert bool(gradients.isfinite().all())
+    assert float(model.signed_distance(Points(sphere[None, :3]))[0]) < 0
+    low, high = model.scene.box
+    torch.testing.assert_close((low + high) / 2, sphere[:3])
+    torch.testing.assert_close((high - low) / 2, sphere[3].expand(3))
+
+
+def test_the_inverse_width_stays_between_bounds() -> None:
+    """At first it cannot leave its first value; halfway to the end of the bound it may be some 7 times as large."""
+    trainer = trainer_of("neus", sharpen_until=0.8)
+    sharpness = trainer.model.field.sharpness
+    for progress, upper in ((0.0, 20.0), (0.4, 20 * 50**0.5), (0.9, 1e4)):
+        for value in (1e4, 1.0):
+            with torch.no_grad():
+                sharpness.exponent.fill_(math.log(value) / 10)
+            trainer.model.before_step(1, progress)
+            assert float(sharpness()) == pytest.approx(min(max(value, 20.0), upper), rel=1e-3)
 
 
 def test_images_that_are_lit_differently_have_appearances(shared_tiny: Path, tmp_path: Path) -> None:

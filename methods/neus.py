@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from nerfloom import Method, Scene
 from nerfloom.base.config import Range
-from nerfloom.fields.surface import NeuSField
+from nerfloom.fields.surface import AnnealedSharpness, NeuSField
 from nerfloom.methods._surfaces import (
     SurfaceConfig,
     SurfaceModel,
@@ -40,12 +40,12 @@ class NeuS(SurfaceModel[NeuSConfig], plain=True):
         super().before_step(step, progress)
         until = self.config.anneal_slope_until
         assert isinstance(self.field, NeuSField)
-        self.field.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
+        self.field.sharpness.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
 
 
 def make_field(config: NeuSConfig, scene: Scene) -> NeuSField:
     """Return a field that starts as a ball."""
-    return NeuSField(**field_parts(config, scene))
+    return NeuSField(**field_parts(config, scene, AnnealedSharpness))
 
 
 METHOD = Method(

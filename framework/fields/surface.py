@@ -55,12 +55,51 @@ class Sharpness(nn.Module):
 
     def __init__(self, first: float, rate: float) -> None:
         super().__init__()
+        self.first = first
         self.exponent = nn.Parameter(torch.tensor(math.log(first) / self.SPEED))
         self.optimised = Optimised("sharpness", rate)
 
     def forward(self) -> Tensor:
         """Return the inverse width (), 1/length."""
         return torch.exp(self.SPEED * self.exponent)
+
+    @torch.no_grad()
+    def limit(self, factor: float) -> None:
+        """Keep the inverse width between the first value and a multiple of it.
+
+        Args:
+            factor: the multiple; infinity for no upper bound.
+        """
+        least = math.log(self.first)
+        self.exponent.clamp_(least / self.SPEED, (least + math.log(factor)) / self.SPEED)
+
+
+class AnnealedSharpness(Sharpness):
+    """The inverse width of a surface, and how far the annealing of its slope has come (`surface_opacity`).
+
+    Args:
+        first, rate: as in `Sharpness`.
+    """
+
+    annealing: Tensor
+
+    def __init__(self, first: float, rate: float) -> None:
+        super().__init__(first, rate)
+        self.register_buffer("annealing", torch.tensor(0.0))
+        self._share = HostValue()
+
+    @property
+    def share(self) -> float:
+        """Fraction of the annealing that is done, from 0 to 1."""
+        return self._share.of(self.annealing)
+
+    def anneal(self, share: float) -> None:
+        """Set the fraction of the annealing that is done.
+
+        Args:
+            share: fraction from 0 to 1 that float32 represents exactly.
+        """
+        self._share.change(self.annealing, share)
 
 
 class SurfaceField(BoxField):
@@ -196,35 +235,9 @@ class SurfaceField(BoxField):
 
 
 class NeuSField(SurfaceField):
-    """A field whose intervals have the opacity of NeuS, equation 13.
+    """A field whose intervals have the opacity of NeuS, equation 13; its sharpness is an `AnnealedSharpness`."""
 
-    Args:
-        box, encoding, sharpness, radius, width, num_features, appearance: as in `SurfaceField`.
-    """
-
-    annealing: Tensor
-
-    def __init__(
-        self,
-        box: Tensor,
-        encoding: HashGrid,
-        sharpness: Sharpness,
-        radius: float = 0.5,
-        width: int = 64,
-        num_features: int = 15,
-        appearance: Appearance | None = None,
-    ) -> None:
-        super().__init__(box, encoding, sharpness, radius, width, num_features, appearance)
-        self.register_buffer("annealing", torch.tensor(0.0))
-        self._annealing = HostValue()
-
-    def anneal(self, share: float) -> None:
-        """Set how far the slope's annealing has come (`surface_opacity`).
-
-        Args:
-            share: fraction from 0 to 1 that float32 represents exactly.
-        """
-        self._annealing.change(self.annealing, share)
+    sharpness: AnnealedSharpness
 
     def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
         """Return the opacity of intervals around points, and features.
@@ -234,7 +247,7 @@ class NeuSField(SurfaceField):
             directions: (N, 3) unit directions of their rays.
             deltas: (N,) lengths of the intervals, scene units.
         """
-        positions, intervals = points.positions, Intervals(directions, deltas, self._annealing.of(self.annealing))
+        positions, intervals = points.positions, Intervals(directions, deltas, self.sharpness.share)
         return surface_samples(self.network(positions), self.sharpness(), positions, self.ball, intervals)
 
     def density_at(self, distances: Tensor) -> Tensor:

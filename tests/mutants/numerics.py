@@ -357,6 +357,15 @@ MUTANTS = {
             "the sky of captures is a hole through which the background shows",
             "truth/test_training.py::test_a_ray_of_a_capture_ends_in_matter_unless_photographs_tell_what_is_empty"),
     ],
+    "nerfloom.samplers.error_bounded": [
+        Mutant("nearest-of-the-farther-end", "nearest_in_intervals", "torch.minimum(A, B)", "torch.maximum(A, B)",
+            "the bound of the opacity's error forgets the surface beside an interval's nearer end",
+            "samplers/test_error_bounded.py::test_nearest_is_that_of_a_place_outside_both_balls"),
+        Mutant("error-of-one-interval", "bounded_opacity", "(A * torch.exp(-nearest / beta)).cumsum(-1)",
+            "(A * torch.exp(-nearest / beta))",
+            "the opacity's error is bounded in each interval by itself, although errors add up",
+            "samplers/test_error_bounded.py::test_opacity_is_within_its_bound"),
+    ],
     "nerfloom.samplers.hierarchical": [
         Mutant("drawn-in-front", "HierarchicalSampler._of_points", "A[:, 1:-1]", "A[:, :-2]",
             "fine samples are drawn a bin behind what the coarse network found",

@@ -65,8 +65,8 @@ def _with_scale(flags: MeasureFlags, loaded: Loaded, given: tuple[str, str, floa
     """Return the run in the scale of two points and their distance."""
     if loaded.scale.is_known:
         raise ConfigError(
-            f"{loaded.origin} has a scale already: {loaded.scale.words()}; remove it first (--forget-scale True), since "
-            "the coordinates of points change with it"
+            f"{loaded.origin} has a scale already: {loaded.scale.words()}; remove it first (--forget-scale True), "
+            "since the coordinates of points change with it"
         )
     start, end = _points(flags, loaded, given[:2])
     say(f"{loaded.measure(start, end)} in the unit of the input are {given[2]:g} {flags.unit}")

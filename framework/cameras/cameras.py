@@ -80,6 +80,10 @@ class Cameras:
         """Return the cameras on `device`."""
         return self._map(lambda values: values.to(device))
 
+    def in_float64(self) -> Cameras:
+        """Return the cameras with all floating-point numbers in float64."""
+        return self._map(lambda values: values.double() if values.is_floating_point() else values)
+
     def _map(self, change: Callable[[Tensor], Tensor]) -> Cameras:
         """Apply a function to every tensor."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -57,7 +57,7 @@ def evaluate_geometry(
     found = judge_surface(surface, reference, views, flags.f_score_at, flags.crop)
     console.print(_distances(found))
     console.print(_f_scores(found))
-    for line in _notes(flags, found, surface, reference, source):
+    for line in _notes(flags, found, surface, reference, source, loaded.scale.unit or "the input's unit"):
         say(line)
     content = {
         "reference": str(flags.reference),
@@ -124,13 +124,15 @@ def _f_scores(found: Geometry) -> Table:
     return table
 
 
-def _notes(flags: GeometryFlags, found: Geometry, surface: Surface, reference: Surface, source: str) -> list[str]:
+def _notes(
+    flags: GeometryFlags, found: Geometry, surface: Surface, reference: Surface, source: str, unit: str
+) -> list[str]:
     """Return lines that say what was compared, in which unit, and what was left out."""
     seen = "every point counts" if flags.min_views == 0 else f"what {flags.min_views} or more training cameras see"
     left_out, reference_left_out = found.left_out.describe(), found.reference_left_out.describe()
     lines = [
         f"surface: {source}, {surface.describe()}; reference: {flags.reference}, {reference.describe()}",
-        f"lengths are in the input's unit; the reference's longest side is {found.side:.6g}",
+        f"lengths are in {unit}; the reference's longest side is {found.side:.6g}",
         "accuracy: distance of the surface from the reference; completeness: of the reference from the surface; "
         "Chamfer: the mean of both",
         f"judged: {seen}; surface: {left_out}; reference: {reference_left_out}",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.base.extras import install_command
 from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
@@ -36,7 +37,8 @@ Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): gaussian-splat 
 
   ns-export web splat.ply --output-dir exports
 
-ns-export WHAT --help shows its flags. All files use the frame and units of the input.
+ns-export WHAT --help shows its flags. All files use the frame and units of the input, or the unit that ns-measure
+has set.
 """
 
 
@@ -113,6 +115,8 @@ def _command(arguments: list[str]) -> None:
     loaded = flags.load(found, data_format=named)
     if loaded.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
+    if loaded.scale.is_known:
+        say(loaded.scale.words())
     run(flags, loaded, path)
 
 
@@ -121,7 +125,7 @@ def _points(flags: PointFlags, loaded: Loaded, path: Path) -> None:
         raise FlagError("--num-points must be at least 1, --reach and --std-ratio at least 0")
     if flags.remove_outliers or flags.estimate_normals:
         _need_packages("--remove-outliers and --estimate-normals need", "; or set both to False")
-    from nerfloom.base.console import say, track
+    from nerfloom.base.console import track
     from nerfloom.base.device import seed_step
     from nerfloom.data.ply import write_points
     from nerfloom.export.neighbors import inliers, plane_normals
@@ -159,7 +163,6 @@ def _need_packages(what: str, otherwise: str = "") -> None:
 
 
 def _cameras(flags: CameraFlags, loaded: Loaded, path: Path) -> None:
-    from nerfloom.base.console import say
     from nerfloom.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
     from nerfloom.export.colmap_text import images_folder, write_model
     from nerfloom.export.transforms import write_transforms
@@ -191,7 +194,6 @@ def _cameras(flags: CameraFlags, loaded: Loaded, path: Path) -> None:
 
 
 def _occupancy(flags: OccupancyFlags, loaded: Loaded, path: Path) -> None:
-    from nerfloom.base.console import say
     from nerfloom.export.occupancy import write_cells, write_grid
     from nerfloom.renderable import parts
     from nerfloom.samplers.base import SkipsCells
@@ -215,7 +217,7 @@ def _occupancy(flags: OccupancyFlags, loaded: Loaded, path: Path) -> None:
 def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
-    from nerfloom.base.console import say
+    from nerfloom.cameras.scale import write_scale
     from nerfloom.data.offsets import write_offset
     from nerfloom.export.run_page import moment_of
     from nerfloom.geometry.local_origin import local_origin
@@ -241,6 +243,7 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         say(cost)
     if sentence := write_offset(path, origin):
         say(sentence)
+    write_scale(path, loaded.scale)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 
 

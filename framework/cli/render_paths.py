@@ -78,7 +78,7 @@ def camera_path_views(flags: CameraPathFlags, loaded: Loaded) -> Views:
     path = read_camera_path(flags.camera_path_filename)
     if flags.dataparser_transforms is not None:
         path = replace(path, placement=read_transforms(flags.dataparser_transforms))
-    path = path.placed(loaded.placement)
+    path = path.placed(loaded.input_placement)
     if path.has_crop:
         say(f"{flags.camera_path_filename}: its crop box is not applied")
     times = None

@@ -113,6 +113,10 @@ def export_page(
         look=look,
         focus=focus_of(cameras, turn),
         cameras=camera_rows(cameras[torch.tensor(order)], [printable(names[i]) for i in order], turn),
+        unit_length=loaded.unit,
+        unit=loaded.scale.unit,
+        relative_error=loaded.scale.relative_error,
+        photographed=dataset is not None,
     )
     text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, max_megabytes)
     for cost in costs:

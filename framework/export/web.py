@@ -36,7 +36,7 @@ BITS = (8, 8)
 """Bits of harmonics where there is room: the page looks like the Gaussians to 55 dB, with SPZ's usual 5 and 4 to 41."""
 MAX_CAMERAS = 300
 """Maximum number of the capture's cameras in a page, evenly spaced."""
-SCRIPTS = ("spz.js", "splats.js", "viewer.js")
+SCRIPTS = ("spz.js", "splats.js", "measure.js", "viewer.js")
 """Files of the page's program, in their order."""
 LEVEL = 0.5
 """The scene is turned if the cosine between z and the cameras' mean up direction is below this."""
@@ -63,6 +63,14 @@ class PageFacts:
     cameras: list[list[Any]]
     """Of each camera its name, its 12 numbers of camera-to-scene pose (OpenGL axes, row by row), and fx, fy, cx, cy,
     width and height in pixels."""
+    unit_length: float = 1.0
+    """Length of a scene unit, in `unit`."""
+    unit: str = ""
+    """Name of the unit of lengths; empty for that of the input."""
+    relative_error: float = 0.0
+    """Standard deviation of `unit_length`, as a fraction of it."""
+    photographed: bool = True
+    """Whether `cameras` are those of photographs, which say how precise a length is."""
 
 
 def upright(cameras: Cameras) -> Tensor:
@@ -184,6 +192,7 @@ def page(payload: bytes, facts: PageFacts) -> str:
     parts = {
         "title": html.escape(facts.title),
         "about": html.escape(facts.about),
+        "lengths": html.escape(f"lengths are in {facts.unit or 'the unit of the input'}"),
         "version": html.escape(nerfloom.__version__),
         "style": (folder / "viewer.css").read_text(encoding="utf-8"),
         "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS),

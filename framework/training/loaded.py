@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from nerfloom.base.errors import ConfigError
+import torch
+from torch import Tensor
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.scale import Scale, write_scale
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.evaluation.measuring import Length, measured, scale_of, surface_point
 from nerfloom.renderable import Renderable
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.datasets import load_split
@@ -26,7 +33,7 @@ class Loaded:
     model: Renderable
     """The renderable, on its device: a `nerfloom.Model` in evaluation mode, or Gaussians."""
     placement: Placement
-    """Placement of the input in the scene of `model`."""
+    """Placement of the input, in the unit of `scale`, in the scene of `model`. All that is exported has this frame."""
     method: str
     """Name of the method that made it."""
     origin: Path
@@ -37,7 +44,10 @@ class Loaded:
     """Number of training steps done; 0 if unknown."""
     source: Run | None = None
     """Method, settings, data and folder; None for Gaussians without data."""
+    scale: Scale = field(default_factory=Scale)
+    """The unit of lengths (docs/guides/measure.md)."""
     _datasets: dict[Split, Dataset] = field(default_factory=dict)
+    _cameras: dict[Split, Cameras | None] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Loaded({self.method!r}, {str(self.origin)!r})"
@@ -54,8 +64,13 @@ class Loaded:
 
     @property
     def unit(self) -> float:
-        """Units of the input per scene unit."""
+        """Length of a scene unit, in the unit of `scale`."""
         return 1 / self.placement.scale
+
+    @property
+    def input_placement(self) -> Placement:
+        """Placement of the input in its own unit, whatever `scale` is."""
+        return self.scale.unplaced(self.placement)
 
     @property
     def run(self) -> Run:
@@ -117,3 +132,98 @@ class Loaded:
         """
         weights = self.run.config.lpips_weights if lpips_weights is None else Path(lpips_weights)
         return evaluate(self.model, self.dataset(split), max_images=max_images, lpips_weights=weights).results
+
+    # -- measuring --------------------------------------------------------------------------------------------
+
+    def pick(self, camera: View | Cameras, column: float, row: float) -> Tensor:
+        """Return the position (3,) float64 of the surface at a pixel, in the frame of exports and the unit of `scale`.
+
+        Args:
+            camera: a view, or one camera.
+            column, row: the pixel; (0, 0) is the centre of the top left one, and fractions are allowed.
+
+        Raises:
+            ConfigError: if the pixel shows no surface.
+        """
+        view = camera if isinstance(camera, View) else View(camera.to(self.model.device))
+        return self.placement.original_points(surface_point(self.model, view, column, row)[None])[0]
+
+    def measure(
+        self, start: Tensor | Sequence[float], end: Tensor | Sequence[float], time: float | None = None
+    ) -> Length:
+        """Return the distance between two points, with its error (docs/guides/measure.md).
+
+        Args:
+            start, end: the points x, y, z, in the frame of exports and the unit of `scale`, as `pick` returns them.
+            time: time in [0, 1] of a moving scene; None for 0.
+
+        Raises:
+            ConfigError: if the points are the same, or the scene has no scale (normalised device coordinates).
+        """
+        return self._measured(start, end, self.scale, time)
+
+    def with_scale(
+        self,
+        start: Tensor | Sequence[float],
+        end: Tensor | Sequence[float],
+        distance: float,
+        unit: str = "m",
+        time: float | None = None,
+    ) -> Loaded:
+        """Return this with the scale in which two points have a given distance; `keep_scale` keeps it.
+
+        Args:
+            start, end: the points, as in `measure`.
+            distance: their true distance.
+            unit: name of the distance's unit.
+            time: time in [0, 1] of a moving scene; None for 0.
+
+        Raises:
+            ConfigError: if the points are the same, or the distance or the name cannot be used.
+        """
+        found = self._measured(start, end, replace(self.scale, relative_error=0.0), time)
+        return self.scaled(scale_of(found, self.scale, distance, unit))
+
+    def scaled(self, scale: Scale) -> Loaded:
+        """Return this in another scale.
+
+        Args:
+            scale: the scale.
+        """
+        return replace(self, placement=scale.placed(self.input_placement), scale=scale)
+
+    def keep_scale(self) -> None:
+        """Write the scale to the run's folder, where whatever loads the run finds it.
+
+        Raises:
+            ConfigError: for a file of Gaussians, whose coordinates are in a unit already.
+            OSError: if it cannot be written.
+        """
+        if not self.is_run:
+            raise ConfigError(
+                f"{self.origin} is a file of Gaussians, and keeps its coordinates: set the scale of the run that it is "
+                "from, and export it again"
+            )
+        write_scale(self.folder, self.scale)
+
+    def _measured(
+        self,
+        start: Tensor | Sequence[float],
+        end: Tensor | Sequence[float],
+        scale: Scale,
+        time: float | None,
+    ) -> Length:
+        if self.model.scene.warped:
+            raise ConfigError("this run is in normalised device coordinates (--ndc), which have no lengths to measure")
+        ends = self.placement.points(torch.stack([torch.as_tensor(p, dtype=torch.float64) for p in (start, end)]))
+        return measured(self.model, self._photographs(), (ends[0], ends[1]), self.unit, scale, time)
+
+    def _photographs(self) -> Cameras | None:
+        """Return the cameras of the training images, which are not decoded; None if they are not known."""
+        if "train" not in self._cameras:
+            try:
+                self._cameras["train"] = None if self.source is None else self.source.parse("train").cameras
+            except DataError as error:
+                say(f"the errors of lengths are not known: {error}")
+                self._cameras["train"] = None
+        return self._cameras["train"]

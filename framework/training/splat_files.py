@@ -13,6 +13,7 @@ from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
+from nerfloom.cameras.scale import read_scale
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.parsed_scene import DataParser, ParsedScene
@@ -43,7 +44,8 @@ def load_splats(
     """Load a file of Gaussians, in the scene of its data, or without data in a scene made from the Gaussians.
 
     Args:
-        file: the file, in the frame of the input, or about a local origin given by an offset file beside it.
+        file: the file, in the frame of the input, or about a local origin given by an offset file beside it, and in the
+            unit of the input, or that of a scale beside it.
         data: folder of the photographs; None without.
         data_format: format of the data, with its flags; None to detect it.
         device_type: auto, cpu, cuda or mps.
@@ -55,7 +57,7 @@ def load_splats(
     """
     gaussians, look = read_gaussians(file)
     say(f"{file}: {look.words()}")
-    machine, offset = MachineConfig(device_type=device_type), read_offset(file)
+    machine, offset, scale = MachineConfig(device_type=device_type), read_offset(file), read_scale(file)
     if data is None and data_format is None:
         source, (about, scene) = None, placed_gaussians(gaussians, up or "z")
         if up is None:
@@ -67,7 +69,7 @@ def load_splats(
     else:
         source = _source(file, data, data_format, machine)
         parsed = source.parse("train")
-        scene, placement = _scene(parsed, source.config), parsed.placement
+        scene, placement = _scene(parsed, source.config), scale.placed(parsed.placement)
         if scene.warped:
             raise ConfigError(
                 f"{file}: normalised device coordinates (--ndc) have no place for Gaussians; leave out --ndc"
@@ -76,7 +78,7 @@ def load_splats(
         _check_place(file, gaussians, placed, parsed)
     device = choose_device(machine)
     model = DrawnGaussians(placed.map(lambda values: values.to(device)), look, scene.to(device))
-    return Loaded(model, placement, METHOD, file, file, source=source)
+    return Loaded(model, placement, METHOD, file, file, source=source, scale=scale)
 
 
 def _source(file: Path, data: Path | None, data_format: DataFormat | None, machine: MachineConfig) -> Run:

@@ -13,6 +13,7 @@ from nerfloom.base.config import RaysPerPixel, TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
 from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.scale import read_scale
 from nerfloom.data.scene import Scene
 from nerfloom.method import Method
 from nerfloom.model import Model
@@ -48,6 +49,7 @@ def load_trained(
     Raises:
         ConfigError: if the run's settings are missing or do not fit.
         CheckpointError: if there is no readable checkpoint, or it does not fit the settings.
+        DataError: if the run's scale cannot be read.
     """
     run = read_run(config_path)
     machine = dataclasses.replace(run.config.machine, device_type=device_type)
@@ -77,7 +79,8 @@ def load_trained(
         model.show_images(load_split(run, "train").to(device))
     placement, state = Placement.of(content["transform"], content["scale"]), content.get("state")
     step = state.get("step") if isinstance(state, dict) else None
-    return Loaded(model, placement, run.method, run.folder, path, step if isinstance(step, int) else 0, run)
+    loaded = Loaded(model, placement, run.method, run.folder, path, step if isinstance(step, int) else 0, run)
+    return loaded.scaled(read_scale(run.folder))
 
 
 def _changed(config: TrainConfig, method: str, **values: Any) -> TrainConfig:

@@ -13,6 +13,7 @@ from nerfloom.base.console import say
 from nerfloom.cameras.poses import looked_at
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
+from nerfloom.viewer.measure_panel import MeasurePanel
 from nerfloom.viewer.panel import Panel
 from nerfloom.viewer.path_panel import PathPanel
 from nerfloom.viewer.photographs import Photographs
@@ -67,6 +68,8 @@ class Page:
                     parts.append(CameraPanel(client, self._photographs))
             with tabs.add_tab("Path"):
                 parts.append(PathPanel(client, lambda: queue.loaded, panel.request, self._renders))
+            with tabs.add_tab("Measure"):
+                MeasurePanel(client, queue, panel.request)
         if number not in self._server.get_clients():  # the browser left before it was set up
             self._farewell(client)
 

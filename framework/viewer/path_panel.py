@@ -124,7 +124,7 @@ class PathPanel:
 
     def _path(self) -> CameraPath | None:
         width, height = (round(number_in(one.value, 16, 8192, 720)) for one in (self._width, self._height))
-        return self._editor.path(width, height, self._loaded().placement)
+        return self._editor.path(width, height, self._loaded().input_placement)
 
     def _show(self, path: CameraPath | None) -> None:
         """Draw the path as a line in the scene."""

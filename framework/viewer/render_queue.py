@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import cast
 
@@ -24,6 +25,9 @@ NO_LIMIT = 1e6
 """Time limit for a piece of a method that casts no rays, seconds, so large that a piece is the whole picture. Gaussians
 near an image's border depend on the image's size, so strips of it would differ from the whole: on fox they had 28
 dB."""
+
+PROBLEMS = NerfloomError, MemoryError, RuntimeError, ValueError
+"""Errors of a picture or a task that the viewer reports, and goes on."""
 
 
 class RenderQueue:
@@ -54,6 +58,7 @@ class RenderQueue:
         self._ndc, self._truth = ndc, truth
         self._speed = Speed()
         self._browsers: dict[int, Browser] = {}
+        self._tasks: deque[Callable[[], None]] = deque()
         self._lock = threading.Lock()
         self._asked = threading.Event()
 
@@ -83,6 +88,11 @@ class RenderQueue:
                 return
         self._asked.set()
 
+    def do(self, task: Callable[[], None]) -> None:
+        """Have a `task` done between two pictures, by the thread that draws."""
+        self._tasks.append(task)
+        self._asked.set()
+
     @property
     def is_empty(self) -> bool:
         """True if there are no browsers."""
@@ -96,9 +106,11 @@ class RenderQueue:
         self._asked.clear()
 
     def draw_next(self) -> float | None:
-        """Draw the next piece for one of the browsers, and return the seconds it took; None if there is none."""
+        """Do a task or draw the next piece for a browser, and return the seconds it took; None if there is none."""
         with self._lock:
             browsers = list(self._browsers.values())
+        if self._tasks:
+            return self._done(self._tasks.popleft())
         now = time.monotonic()
         index = next_browser([one.waiting(self.loaded.step, now) for one in browsers], now, REFINE_AFTER)
         if index is None:
@@ -107,11 +119,19 @@ class RenderQueue:
         start = time.perf_counter()
         try:
             self._serve(browser)
-        except (NerfloomError, MemoryError, RuntimeError, ValueError) as error:
-            reason = " ".join(str(error).split())[:300] or type(error).__name__
-            say(f"viewer: a picture could not be drawn: {reason}")
+        except PROBLEMS as error:
+            say(f"viewer: a picture could not be drawn: {_reason(error)}")
             browser.drawn, browser.pieces, browser.step = browser.wanted, [], self.loaded.step
         browser.served_at = time.monotonic()
+        return time.perf_counter() - start
+
+    def _done(self, task: Callable[[], None]) -> float:
+        """Do a task, and return the seconds it took."""
+        start = time.perf_counter()
+        try:
+            task()
+        except PROBLEMS as error:
+            say(f"viewer: {_reason(error)}")
         return time.perf_counter() - start
 
     def _serve(self, browser: Browser) -> None:
@@ -147,3 +167,7 @@ class RenderQueue:
         pixels = smaller(request.width, request.height, piece.stride)[0] * (piece.bottom - piece.top)
         self._speed = self._speed.with_one(pixels * piece.rays, time.perf_counter() - start)
         return kept
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__

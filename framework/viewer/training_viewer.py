@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from nerfloom.cameras.ndc import NdcCameras
+from nerfloom.cameras.scale import read_scale
 from nerfloom.training.checkpoint import FOLDER
 from nerfloom.training.curve import in_order
 from nerfloom.training.loaded import Loaded
@@ -123,7 +124,8 @@ def in_training(run: Run, trainer: Trainer) -> Loaded:
         trainer: its trainer.
     """
     placement, checkpoints = trainer.train_set.placement, run.folder / FOLDER
-    return Loaded(trainer.model, placement, run.method, run.folder, checkpoints, trainer.state.step, run)
+    loaded = Loaded(trainer.model, placement, run.method, run.folder, checkpoints, trainer.state.step, run)
+    return loaded.scaled(read_scale(run.folder))
 
 
 @contextmanager

@@ -17,6 +17,7 @@ COMMANDS = {
     "ns-download-data": ["blender"],
     "ns-eval": [],
     "ns-export": ["pointcloud"],
+    "ns-measure": [],
     "ns-new-method": ["my-method"],
     "ns-process-data": ["images"],
     "ns-render": ["orbit"],

@@ -19,6 +19,7 @@ from nerfloom import DataParser, Dataset
 from nerfloom.base.config import from_plain, read_yaml
 from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.scale import Scale, read_scale, write_scale
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
@@ -412,6 +413,11 @@ def read_lpips(folder: Path, scratch: Path) -> None:
         require(all(bool(values.isfinite().all()) for values in vars(layer).values()), "weights that are not finite")
 
 
+def read_run_scale(folder: Path, scratch: Path) -> None:
+    scale = read_scale(folder)
+    require(0 < scale.factor < math.inf and 0 <= scale.relative_error < math.inf, "a scale that is no number")
+
+
 READERS: dict[str, Reader] = {
     "blender": Reader(write_blender, partial(parse, Blender()), ("transforms_train.json",), ("camera_angle_x", "time")),
     "dnerf": Reader(write_dnerf, partial(parse, DNeRF()), ("transforms_train.json",), ("camera_angle_x", "time")),
@@ -429,6 +435,9 @@ READERS: dict[str, Reader] = {
     "surfaces": Reader(write_surfaces, read_surfaces, ("mesh.*",)),
     "splats": Reader(write_splats, read_splats, ("splat.*",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
+    "scale": Reader(
+        lambda folder: write_scale(folder, Scale(0.25, "m", 0.01)), read_run_scale, ("scale.json",), ("factor", "unit")
+    ),
     "images": Reader(write_blender, partial(load, Blender(), MEMORY), ("train/*.png",)),
     "images-to-a-file": Reader(write_blender, partial(load, Blender(), 0.0), ("train/*.png",)),
     "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),

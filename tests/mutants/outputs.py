@@ -25,6 +25,16 @@ MUTANTS = {
             "ns-render time shows the first moment all along",
             "cli/test_render_command.py::test_one_camera_while_time_runs"),
     ],
+    "nerfloom.cameras.scale": [
+        Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
+            "exports stay in the unit of the input after a true length was given",
+            "test_scale.py::test_a_scaled_placement_puts_the_scene_in_the_same_place"),
+    ],
+    "nerfloom.cameras.triangulation": [
+        Mutant("pixel-error-not-squared", "point_covariance", "A / pixel_error ** 2", "A / pixel_error",
+            "errors of lengths are too large by the root of two",
+            "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
+    ],
     "nerfloom.evaluation.appearance": [
         Mutant("appearance-of-judged-half", "_left_pixels", "A.view(-1, B)[:, :C]", "A.view(-1, B)[:, C:]",
             "appearance is fitted on the half that is judged",

@@ -35,6 +35,7 @@ ELSEWHERE = {
     ),
     r"python -m nerfloom.cli.bench gpu": "tests/benchmarks/test_gpu.py",
     r"ns-download-data": "tests/downloads/test_install.py",
+    r"ns-measure": "tests/test_scale.py",
     r"ns-stress": "tests/stress_command/test_runs.py",
     r"python -m nerfloom.dataparsers.procedural.solids": "tests/dataparsers/test_solids.py",
     r"ns-(eval|compare) .*--reference-": "tests/cli/test_eval_geometry.py",

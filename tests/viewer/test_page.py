@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from nerfloom.cameras.camera_path import read_camera_path
 from nerfloom.cameras.view import View
+from nerfloom.runs import load
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import TINY_NGP, command, train
@@ -228,6 +229,51 @@ def test_crop(browser: Chromium, run: Path) -> None:
     assert matter[outside].mean() > 0.1
     assert left[outside].mean() == 0
     assert left[inside].mean() > 0.1
+
+
+def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
+    """Two clicks on the ball, its scale, and the length in it."""
+    places = (230, 330), (330, 380)
+    with started(command("ns-viewer"), run, "--websocket-port", 17507) as (_, address):
+        tab = browser.open(address)
+        shown(tab)
+        width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+        tab.press("Measure")
+        tick(tab, "Pick points")
+        until(lambda: "first point" in tab.evaluate("document.body.innerText"))
+        tab.click(*places[0])
+        until(lambda: "second point" in tab.evaluate("document.body.innerText"))
+        tab.click(*places[1])
+        length = r"(\d+\.\d+)(?: m)? ± (\d+\.\d+)"
+        found = until(lambda: re.search(length, tab.evaluate("document.body.innerText")))
+        time.sleep(1)
+        picture = tab.screenshot(tmp_path / "measure.png")
+        tab.press("Set the scale")
+        time.sleep(1)
+        tab.press("Set scale")
+        file = run / "scale.json"
+        until(file.is_file)
+        scale = json.loads(file.read_text())
+        file.unlink()
+        scaled = until(lambda: re.search(r"1\.0+ m ± (\d+\.\d+) m", tab.evaluate("document.body.innerText")))
+        tab.screenshot(tmp_path / "scaled.png")
+        tab.close()
+    loaded = load(run, device="cpu")
+    position, target, up = (torch.tensor(look_of(run)[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
+    back = torch.nn.functional.normalize(position - target, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
+    pose = Pose(tuple(torch.stack([right, torch.linalg.cross(back, right), back, position], 1).flatten().tolist()),
+                np.radians(50))  # fmt: skip
+    view = View(Request(pose, width, height).camera())
+    ends = [loaded.pick(view, x - 0.5, y - 0.5) for x, y in places]
+    expected = loaded.measure(*ends)
+    print(f"on the page: {found[0]}; in Python: {expected}; with the scale: {scaled[0]}")
+    assert float(found[1]) == pytest.approx(expected.value, rel=0.02)  # the page's pixels are not the window's
+    assert expected.error is not None
+    assert float(found[2]) == pytest.approx(expected.error, rel=0.1)
+    assert scale["unit"] == "m"
+    assert scale["factor"] == pytest.approx(1 / expected.value, rel=0.02)
+    assert int((np.abs(picture[PICTURE].astype(int) - [255, 190, 0]).max(-1) < 60).sum()) > 100  # the line is drawn
 
 
 @pytest.fixture

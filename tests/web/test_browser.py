@@ -1,17 +1,24 @@
 """The web page in a browser: headless Chromium, from disk, its WebGL in software."""
 
+import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 
+from nerfloom.cameras.triangulation import point_covariance, projection_jacobians, reading_error
+from nerfloom.evaluation.measuring import Length
 from nerfloom.evaluation.metrics import psnr
-from nerfloom.export.web import gaussians_of, make_page
+from nerfloom.evaluation.paths import look_at
+from nerfloom.export.web import camera_rows, gaussians_of, make_page
 from nerfloom.splats.drawing import draw_colors, splat_camera
+from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from tests.patience import PATIENCE
 from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
@@ -141,3 +148,72 @@ def test_no_webgl_is_named(browser: str, scene: Path, tmp_path: Path) -> None:
     dom = opened(browser, tmp_path, scene.as_uri(), "--dump-dom", "--disable-3d-apis")
     assert 'data-state="refused"' in dom
     assert "WebGL 2" in dom
+
+
+MEASURE = """<script>
+const wait = setInterval(() => {
+  const state = document.documentElement.dataset, canvas = document.getElementById("canvas");
+  if (state.state !== "ready") return;
+  clearInterval(wait);
+  const [w, h] = [SIZE], scale = Math.min(canvas.clientWidth / w, canvas.clientHeight / h);
+  const click = ([u, v]) => {
+    const x = u * scale + (canvas.clientWidth - w * scale) / 2, y = v * scale + (canvas.clientHeight - h * scale) / 2;
+    for (const type of ["pointerdown", "pointerup"]) canvas.dispatchEvent(new PointerEvent(
+      type, { pointerId: 1, clientX: x, clientY: y, buttons: 1, bubbles: true, cancelable: true }));
+  };
+  document.getElementById("measure").click();
+  PLACES.forEach(click);
+}, 50);
+</script>"""
+
+
+@pytest.mark.medium
+def test_the_page_measures_as_we_do(browser: str, tmp_path: Path) -> None:
+    """Two points, one before another Gaussian; the length and its error are those of Python."""
+    ends = torch.tensor([[0.3, -0.2, 0.1], [-0.2, 0.1, 0.35]])
+    places = [[2.5 * math.cos(a), 2.5 * math.sin(a), 0.8] for a in (0.3 * k for k in range(12))]
+    poses = torch.stack(
+        [look_at(torch.tensor(place), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])) for place in places]
+    )
+    cameras, view = replace(some_cameras(12), camera_to_worlds=poses), 2
+    eye = cameras.camera_to_worlds[view, :, 3]
+    means = torch.cat([ends, eye + 1.2 * (ends[:1] - eye)])  # the last is behind the first
+    turns = torch.nn.functional.normalize(torch.tensor([[1.0, 0.3, -0.2, 0.5]]), dim=-1).repeat(3, 1)
+    sizes = torch.tensor([[0.03, 0.05, 0.02]]).log().repeat(3, 1)
+    opaque = Gaussians(means, sizes, turns, torch.full((3,), 8.0), torch.zeros(3, 3), torch.zeros(3, 3, 0))
+    rows = camera_rows(cameras, [str(number) for number in range(12)], torch.eye(3, dtype=torch.float64))
+    facts = replace(some_facts(), cameras=rows, unit_length=0.5, unit="m", relative_error=0.01)
+    text = make_page(opaque, facts, 30)[0]
+    found = gaussians_of(text).means  # rounded by the file
+    order = [int((found - end).norm(dim=-1).argmin()) for end in ends]
+    first, second = found[order[0]], found[order[1]]
+    columns, lines, _ = cameras.project(torch.stack([first, second]), view)
+    clicks = (torch.stack([columns, lines], -1) + 0.5).tolist()
+    script = MEASURE.replace("SIZE", "{}, {}".format(*SIZE)).replace("PLACES", str(clicks))
+    file = tmp_path / "measure.html"
+    file.write_text(text.replace("</body>", script + "</body>"), encoding="utf-8")
+    shot = tmp_path / "shot.png"
+    dom = opened(browser, tmp_path, f"{file.as_uri()}#camera={view}&sort=here", "--dump-dom")
+    points = re.search(r'data-points="([^"]*)"', dom)
+    assert points is not None, dom[:300]
+    picked = torch.tensor([[float(x) for x in each.split()] for each in points[1].split("|")])
+    torch.testing.assert_close(picked, torch.stack([first, second]), atol=2e-4, rtol=0)
+
+    square, apart = 0.0, (second - first).double()
+    away = torch.nn.functional.normalize(cameras.camera_to_worlds[:, None, :, 3] - torch.stack([first, second]), dim=-1)
+    for number, point in enumerate((first, second)):
+        columns, lines, ahead = cameras.project(point.expand(len(cameras), 3), torch.arange(len(cameras)))
+        inside = (columns > -0.5) & (lines > -0.5) & (columns < SIZE[0] - 0.5) & (lines < SIZE[1] - 0.5)
+        seen = ahead & inside & (away[:, number] @ away[view, number] >= 0.5)
+        assert int(seen.sum()) >= 2
+        jacobians = projection_jacobians(cameras[seen], point)
+        along = apart / apart.norm()
+        square += float(along @ point_covariance(jacobians, 0.5) @ along) + reading_error(jacobians, 0.5) ** 2
+    length = 0.5 * float(apart.norm())
+    expected = Length(length, math.hypot(0.5 * square**0.5, 0.01 * length), "m")
+    measured = re.search(r'data-measured="([^"]*)"', dom)
+    assert measured is not None
+    assert measured[1] == str(expected)
+    opened(browser, tmp_path, f"{file.as_uri()}#camera={view}&sort=here", f"--screenshot={shot}")
+    label = iio.imread(shot)[..., :3].astype(int)
+    assert int((np.abs(label - [255, 190, 0]).max(-1) < 30).sum()) > 100  # the line is drawn

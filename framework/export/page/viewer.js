@@ -98,7 +98,8 @@ async function main() {
 }
 
 function show(gl, gaussians, facts) {
-  let drawn = drawer(gl, gaussians, facts), lost = false, needsOrder = true;
+  let drawn = drawer(gl, gaussians, facts), lost = false, needsOrder = true, measuring = false;
+  const measure = ruler(gaussians, facts);
   const sort = sortingElsewhere(gaussians.centers, plain || options.get("sort") === "here");
   const cameras = facts.cameras, start = Math.max(chosen(options.get("camera")), 0);
   let camera = start, view = viewOf(cameras[start], facts.focus), background = facts.background;
@@ -155,6 +156,7 @@ function show(gl, gaussians, facts) {
       if (needsOrder) drawn.setOrder(order);
       needsOrder = false;
       drawn.draw(cameraOf(view, canvas.width, canvas.height), background);
+      measure.follow(view, canvas.clientWidth, canvas.clientHeight);
       frames += 1;
       drew = true;
       if (state.state !== "ready") first();
@@ -235,7 +237,8 @@ function show(gl, gaussians, facts) {
     canvas.classList.add("held");
     if (spinning) spin(false);
     const { timeStamp: time, clientX: x, clientY: y } = event;
-    if (pointers.size === 1 && time - tapped.time < 350 && Math.hypot(x - tapped.x, y - tapped.y) < 24) centre(x, y);
+    const again = time - tapped.time < 350 && Math.hypot(x - tapped.x, y - tapped.y) < 24;
+    if (pointers.size === 1 && again && !measuring) centre(x, y);
     tapped = { time, x, y };
   });
   canvas.addEventListener("pointermove", (event) => {
@@ -261,6 +264,12 @@ function show(gl, gaussians, facts) {
       if (!pointers.size) canvas.classList.remove("held");
     });
   }
+  canvas.addEventListener("pointerup", ({ clientX: x, clientY: y, button }) => {
+    if (!measuring || button !== 0 || Math.hypot(x - tapped.x, y - tapped.y) > 4) return;
+    const box = canvas.getBoundingClientRect();
+    measure.pick(view, box.width, box.height, x - box.left, y - box.top);
+    dirty = true;
+  });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
@@ -291,6 +300,13 @@ function show(gl, gaussians, facts) {
     element("spin").setAttribute("aria-pressed", on);
     dirty = true;
   }
+  function setMeasuring(on) {
+    measuring = on;
+    element("measure").setAttribute("aria-pressed", on);
+    canvas.classList.toggle("measuring", on);
+    measure.clear();
+    dirty = true;
+  }
   const reset = () => { spin(false); jump(start); };
   const behind = () => {
     const at = BACKGROUNDS.findIndex((color) => color.every((x, k) => x === background[k]));
@@ -309,7 +325,7 @@ function show(gl, gaussians, facts) {
   };
   const bare = () => document.body.classList.toggle("bare");
   const ACTIONS = {
-    KeyR: reset, KeyT: () => spin(!spinning), KeyB: behind, KeyF: full, KeyH: bare, Escape: () => help(false),
+    KeyR: reset, KeyT: () => spin(!spinning), KeyM: () => setMeasuring(!measuring), KeyB: behind, KeyF: full, KeyH: bare, Escape: () => help(false),
     BracketLeft: () => jump(camera - 1), BracketRight: () => jump(camera + 1),
   };
   window.addEventListener("keydown", (event) => {
@@ -333,7 +349,8 @@ function show(gl, gaussians, facts) {
   slider.max = cameras.length - 1;
   slider.addEventListener("input", () => { spin(false); jump(Number(slider.value)); });
   for (const [id, action] of Object.entries({
-    previous: () => jump(camera - 1), next: () => jump(camera + 1), reset, spin: () => spin(!spinning), behind, full,
+    previous: () => jump(camera - 1), next: () => jump(camera + 1), reset, spin: () => spin(!spinning),
+    measure: () => setMeasuring(!measuring), behind, full,
     ask: () => help(), close: () => help(false),
   })) element(id).addEventListener("click", action);
   if (!document.documentElement.requestFullscreen) element("full").hidden = true;

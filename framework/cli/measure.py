@@ -1,0 +1,125 @@
+"""The command `ns-measure`: lengths in a run's scene, and the true length that sets its scale."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError, FlagError, nearest, shown
+from nerfloom.cli.common import run_command, with_format, with_run
+from nerfloom.cli.flags import read_flags
+from nerfloom.cli.run_flags import OPENS, RunFlags
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerfloom.cameras.view import View
+    from nerfloom.training.loaded import Loaded
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasureFlags(RunFlags):
+    """Measure lengths in a run's scene, and set its scale by a true length. Without flags it prints the scale."""
+
+    between: tuple[str, str] | None = None
+    """Points A B to measure between: x,y,z in the frame and unit of exports, or column,row in --image."""
+    scale_points: tuple[str, str, float] | None = None
+    """Points A B and their true DISTANCE, which sets the scale of the run and all its exports."""
+    unit: str = "m"
+    """Name of the unit of DISTANCE."""
+    image: str | None = None
+    """Photograph for points column,row: its file name. (0, 0) is the centre of its top left pixel."""
+    forget_scale: bool = False
+    """Remove the scale, so that lengths are in the unit of the input again."""
+
+
+def main() -> None:
+    """Run ns-measure on the arguments of the process."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    words, named = with_format("ns-measure", with_run(arguments))
+    flags = read_flags(MeasureFlags, "ns-measure", words, takes=OPENS)
+    given = [flags.between, flags.scale_points, flags.forget_scale or None]
+    if sum(each is not None for each in given) > 1:
+        raise FlagError("--between, --scale-points and --forget-scale exclude each other: give one at a time")
+    loaded = flags.load(flags.check(), data_format=named)
+    if flags.between is not None:
+        start, end = _points(flags, loaded, flags.between)
+        say(str(loaded.measure(start, end)))
+    elif flags.scale_points is not None:
+        loaded = _with_scale(flags, loaded, flags.scale_points)
+        loaded.keep_scale()
+    elif flags.forget_scale:
+        from nerfloom.cameras.scale import Scale
+
+        loaded = loaded.scaled(Scale())
+        loaded.keep_scale()
+    say(loaded.scale.words())
+
+
+def _with_scale(flags: MeasureFlags, loaded: Loaded, given: tuple[str, str, float]) -> Loaded:
+    """Return the run in the scale of two points and their distance."""
+    if loaded.scale.is_known:
+        raise ConfigError(
+            f"{loaded.origin} has a scale already: {loaded.scale.words()}; remove it first (--forget-scale True), "
+            "since the coordinates of points change with it"
+        )
+    start, end = _points(flags, loaded, given[:2])
+    say(f"{loaded.measure(start, end)} in the unit of the input are {given[2]:g} {flags.unit}")
+    return loaded.with_scale(start, end, given[2], flags.unit)
+
+
+def _points(flags: MeasureFlags, loaded: Loaded, words: tuple[str, str]) -> list[Tensor]:
+    """Return two points (3,) that words describe."""
+    import torch
+
+    numbers = [_numbers(word, 3 if flags.image is None else 2) for word in words]
+    if flags.image is None:
+        return [torch.tensor(each, dtype=torch.float64) for each in numbers]
+    view = _photograph(loaded, flags.image)
+    found = [loaded.pick(view, column, row) for column, row in numbers]
+    for word, point in zip(words, found, strict=True):
+        say(f"{word} of {flags.image}: {','.join(f'{value:.6g}' for value in point.tolist())}")
+    return found
+
+
+def _numbers(word: str, count: int) -> list[float]:
+    """Return the numbers in a word, which commas separate."""
+    try:
+        found = [float(part) for part in word.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        what = (
+            "three numbers x,y,z (or column,row, with --image)" if count == 3 else "two numbers column,row of --image"
+        )
+        raise FlagError(f"a point is {shown(word)}; it must be {what}")
+    return found
+
+
+def _photograph(loaded: Loaded, name: str) -> View:
+    """Return the view of the photograph with a file name."""
+    from nerfloom.cameras.view import View
+    from nerfloom.export.cameras import SPLITS
+
+    known: list[str] = []
+    for split in SPLITS:
+        try:
+            parsed = loaded.run.parse(split)
+        except DataError:
+            if split == "train":
+                raise
+            continue
+        names = [path.name for path in parsed.image_paths]
+        if name in names:
+            return View.of(parsed.cameras.to(loaded.model.device), names.index(name), parsed.times)
+        known += names
+    raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Points at pixels, the cameras that see them, and lengths, in scenes that are known exactly."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.scale import Scale
+from nerfloom.cameras.triangulation import point_covariance, projection_jacobians, reading_error
+from nerfloom.cameras.view import View
+from nerfloom.data.scene import Scene
+from nerfloom.evaluation.measuring import (
+    PIXEL_ERROR,
+    Length,
+    located,
+    measured,
+    scale_of,
+    seeing_cameras,
+    surface_point,
+)
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.renderable import RendersRays
+from nerfloom.rendering.rendered import Picture, Rendered
+from nerfloom.splats.drawn import DrawnGaussians
+from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.look import OURS
+from nerfloom.testing.ball import RADIUS, cameras_at
+
+SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 10.0, 4, True, False, 32, image_pixels=32 * 32)
+
+
+class Ball(RendersRays):
+    """A ball around the origin, whose depth is off by a fraction."""
+
+    scene = SCENE
+    device = torch.device("cpu")
+    rays_at_once = 10_000
+
+    def __init__(self, off: float = 0.0) -> None:
+        self.off = off
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        middle = -(rays.origins * rays.directions).sum(-1)
+        square = RADIUS**2 - (rays.origins + middle[:, None] * rays.directions).square().sum(-1)
+        hit = square > 0
+        depth = torch.where(hit, (middle - square.clamp(min=0).sqrt()) * (1 + self.off), rays.fars)
+        return Rendered(torch.zeros(len(depth), 3), depth, depth, hit.float(), len(depth))
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        raise NotImplementedError
+
+
+class Surface(Ball):
+    """The same with a signed distance, of a slope that is not 1."""
+
+    def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
+        length = points.positions.norm(dim=-1)
+        return 1.5 * (length**2 - RADIUS**2), 3 * points.positions
+
+
+def around(count: int = 40) -> Cameras:
+    """Cameras at random places 3 from the origin."""
+    generator = torch.Generator().manual_seed(0)
+    places = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    return cameras_at(3 * places, 40, 100)
+
+
+@pytest.mark.parametrize(("model", "tolerance"), [(Ball(), 1e-6), (Ball(0.002), 8e-3), (Surface(0.002), 1e-6)])
+def test_the_point_at_a_pixel(model: Ball, tolerance: float) -> None:
+    """On the ball, and seen at that pixel; a signed distance mends a depth that is a little off."""
+    cameras = around()
+    for column, row in ((49.5, 49.5), (30.2, 61.7)):
+        point = surface_point(model, View.of(cameras, 3), column, row)
+        assert float(point.norm()) == pytest.approx(RADIUS, abs=tolerance)
+        there = cameras.project(point.float()[None], 3)
+        assert [float(value) for value in there[:2]] == pytest.approx([column, row], abs=1e-3)
+
+
+def test_a_depth_far_from_the_level_set_is_kept() -> None:
+    """What stands before the surface, such as a floater, is what the pixel shows."""
+    point = surface_point(Surface(-0.1), View.of(around(), 3), 49.5, 49.5)
+    assert float(point.norm()) == pytest.approx(3 - 0.9 * (3 - RADIUS), abs=1e-5)
+
+
+def test_a_pixel_beside_the_ball_has_no_point() -> None:
+    with pytest.raises(ConfigError, match="no surface at column 1"):
+        surface_point(Ball(), View.of(around(), 3), 1, 1)
+
+
+def test_the_cameras_that_see_a_point() -> None:
+    """Those above the plane that touches the ball there, whose image has the point."""
+    cameras = around()
+    point = RADIUS * torch.nn.functional.normalize(torch.tensor([1.0, 0.4, -0.2], dtype=torch.float64), dim=0)
+    height = cameras.camera_to_worlds[:, :, 3].double() @ point / RADIUS
+    sure = (height - RADIUS).abs() > 0.3  # others look along the surface
+    found = torch.zeros(len(cameras), dtype=torch.bool)
+    found[seeing_cameras(Ball(), cameras, point)] = True
+    assert torch.equal(found[sure], (height > RADIUS)[sure])
+    assert 5 < int(found.sum()) < len(cameras) / 2
+    far = torch.tensor([0.0, 0.0, 50.0], dtype=torch.float64)
+    assert len(seeing_cameras(Ball(), cameras, far)) == 0
+
+
+def test_a_length_and_its_error() -> None:
+    cameras, model = around(), Surface()
+    ends = [RADIUS * torch.nn.functional.normalize(torch.tensor(each).double(), dim=0)
+            for each in ([1.0, 0.4, -0.2], [0.8, -0.3, 0.4])]  # fmt: skip
+    scale, unit = Scale(0.5, "m", 0.02), 0.25
+    found = measured(model, cameras, (ends[0], ends[1]), unit, scale)
+    length = float((ends[1] - ends[0]).norm())
+    assert found.value == pytest.approx(unit * length)
+    along = (ends[1] - ends[0]) / length
+    square = 0.0
+    for end in ends:
+        jacobians = projection_jacobians(cameras[seeing_cameras(model, cameras, end)], end)
+        square += float(along @ point_covariance(jacobians, PIXEL_ERROR) @ along)
+        square += reading_error(jacobians, PIXEL_ERROR) ** 2
+    assert found.error == pytest.approx(unit * math.hypot(square**0.5, 0.02 * length))
+    exact = measured(model, cameras, (ends[0], ends[1]), unit, Scale(0.5, "m"))
+    assert exact.error is not None
+    true = scale_of(exact, Scale(0.5, "m"), 30.0, "cm")
+    assert true.factor == pytest.approx(0.5 * 30 / (unit * length))
+    assert true.relative_error == pytest.approx(exact.error / exact.value)
+
+
+def test_errors_that_are_not_known() -> None:
+    cameras, ends = around(), (torch.tensor([RADIUS, 0, 0]), torch.tensor([0, RADIUS, 0]))
+    for given in (None, cameras[:1], cameras[:0]):
+        assert measured(Ball(), given, ends, 1.0, Scale()).error is None
+    assert bool(located(Ball(), cameras[:0], ends[0]).isinf().any())
+    with pytest.raises(ConfigError, match="same"):
+        measured(Ball(), cameras, (ends[0], ends[0]), 1.0, Scale())
+
+
+def test_a_gaussian_is_picked_at_its_centre() -> None:
+    """A method that casts no rays."""
+    centre = torch.tensor([[0.2, -0.1, 0.3]])
+    one = Gaussians(centre, torch.full((1, 3), -3.0), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 8.0),
+                    torch.zeros(1, 3), torch.zeros(1, 3, 0))  # fmt: skip
+    model, cameras = DrawnGaussians(one, OURS, SCENE), around()
+    column, row, _ = cameras.project(centre, 5)
+    point = surface_point(model, View.of(cameras, 5), float(column), float(row))
+    torch.testing.assert_close(point.float(), centre[0], atol=1e-4, rtol=0)
+    assert len(seeing_cameras(model, cameras, point)) == len(cameras)  # nothing hides it
+
+
+@pytest.mark.parametrize(
+    ("length", "text"),
+    [
+        (Length(0.21341, 0.00114, "m"), "0.2134 m ± 0.0011 m"),
+        (Length(21.341, 0.3, "cm"), "21.34 cm ± 0.30 cm"),
+        (Length(1234.6, 17.3, "mm"), "1235 mm ± 17 mm"),
+        (Length(0.79, 0.004, ""), "0.7900 ± 0.0040"),
+        (Length(0.79, 0.0, ""), "0.790000 ± 0.000000"),
+    ],
+)
+def test_lengths_as_text(length: Length, text: str) -> None:
+    assert str(length) == text
+    assert "unknown" in str(Length(1.0, None, "m"))

@@ -21,6 +21,7 @@ from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError
+from nerfloom.losses.robust import RobustColors
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model
@@ -57,6 +58,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
+        self.robust = None if config.robust == "off" else RobustColors(config)
         self.poses: PoseRefinement | None = None
         """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
@@ -96,7 +98,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:
         """Return the mean squared error of a batch's colours if a native call can compute it; else None."""
-        if not self.plain or self.poses is not None:
+        if not self.plain or self.poses is not None or self.robust is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
         return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, self.config.thin_gradients)
@@ -168,6 +170,8 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         for term in self.losses:
             if (reason := term.varies(self.config)) is not None:
                 return StepKind(varies=reason)
+        if self.robust is not None and self.robust.varies(step):
+            return StepKind(varies="the share of pixels that count in any case still falls")
         if not all(opening.complete for opening in parts(self, OpenLevels)):
             return StepKind(varies="levels are still opening")
         return self.sampler.step_kind(step)

@@ -257,15 +257,20 @@ class SourceViewsConfig(RayConfig):
     """Number of images that a training step draws pixels from; each is rendered from other images of its scene."""
 
 
+HeldOutAppearance = Literal["mean", "half", "nearest"]
+"""What held-out images are evaluated with."""
+
+
 @dataclass(frozen=True)
 class AppearanceConfig(TrainConfig):
     """Settings of a method that learns an appearance for each image."""
 
     RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
     """Allowed ranges."""
-    eval_appearance: Literal["mean", "half"] = "mean"
+    eval_appearance: HeldOutAppearance = "mean"
     """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
-    image, with metrics of the right half (NeRF-W's protocol)."""
+    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
+    nearest."""
     mean_appearance_share: float = 0.25
     """Probability of training an image with the mean appearance, so that the model learns to render it."""
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RaysPerPixel, TrainConfig
+from nerfloom.base.config import HeldOutAppearance, RaysPerPixel, TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
 from nerfloom.cameras.poses import Placement
@@ -31,7 +31,7 @@ def load_trained(
     device_type: Any = "auto",
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
-    eval_appearance: Literal["mean", "half"] | None = None,
+    eval_appearance: HeldOutAppearance | None = None,
 ) -> Loaded:
     """Load a run with its trained model.
 

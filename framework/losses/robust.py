@@ -7,9 +7,11 @@ covers a connected region. RobustNeRF (Sabour et al. 2023) counts a pixel as an 
 - if most of the 3 x 3 pixels around it are below, so that single pixels of fine texture count, or
 - if enough of the 16 x 16 pixels around its tile of 8 x 8 are below, so that edges in an agreeing region count.
 
-The errors of all other pixels have no effect. SpotLessSplats (Sabour et al. 2024) applies the first two rules to whole
-images, takes the quantile from a running histogram, and counts all pixels at first: a pixel is counted anyway with a
-probability that falls exponentially with the steps.
+The errors of all other pixels have no effect. In small images, where somebody covers fewer pixels, the third rule has
+windows of 8 x 8 or 4 x 4 pixels and tiles of half their side.
+
+SpotLessSplats (Sabour et al. 2024) takes the quantile from a running histogram and counts all pixels at first: a pixel
+is counted anyway with a probability that falls exponentially with the steps.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ from nerfloom.data.pixels.patches import PATCH
 
 NEIGHBOURS, MOST = 3, 0.5
 """Side of a pixel's neighbourhood, and the share of it that must be exceeded."""
-TILE, ENOUGH = 8, 0.6
-"""Side of the tiles at the centres of patches, pixels, and the share of a patch that must be exceeded."""
+ENOUGH, WINDOWS_ALONG = 0.6, 25
+"""Share of a window around a tile that must be exceeded, and the number of windows along an image's longer side; a
+window's side is the nearest power of two, from 4 to PATCH pixels."""
 BINS_PER_DECADE, DECADES = 128, 8
 """Bins of the histogram of squared errors for a factor of 10, and the number of such factors below 1."""
 RECENT_PIXELS, KEPT_BY_IMAGE = 16_384, 0.95
@@ -67,14 +70,24 @@ def error_quantile(counts: Tensor, share: float) -> Tensor:
     return 10 ** ((place + within.clamp(0, 1)) / BINS_PER_DECADE - DECADES)
 
 
-def inliers(errors: Tensor, threshold: Tensor, counted: Tensor | None = None) -> Tensor:
-    """Return the pixels of patches that other images do not contradict: RobustNeRF (Sabour et al. 2023), section 4.2.
-
-    The third rule applies to tiles of 8 x 8 pixels that lie 4 pixels or more inside; a patch of 16 x 16 has one.
+def window_side(image_side: int) -> int:
+    """Return the side of the windows of the third rule, pixels: 4, 8 or 16.
 
     Args:
-        errors: (N, H, W) errors of N patches; sides are multiples of TILE, and at least PATCH.
+        image_side: longer side of the image, pixels.
+    """
+    return min(max(2 ** round(math.log2(max(image_side / WINDOWS_ALONG, 1))), 4), PATCH)
+
+
+def inliers(errors: Tensor, threshold: Tensor, window: int = PATCH, counted: Tensor | None = None) -> Tensor:
+    """Return the pixels of patches that other images do not contradict: RobustNeRF (Sabour et al. 2023), section 4.2.
+
+    Tiles lie a quarter of a window or more inside, so that their windows do; a patch of one window has one tile.
+
+    Args:
+        errors: (N, H, W) errors of N patches; sides are at least `window`, and multiples of half of it.
         threshold: () error below which a pixel agrees.
+        window: side of the windows of the third rule; their tiles have half of it.
         counted: (N, H, W) bool, pixels with an error; None for all. Others neither agree nor disagree.
 
     Returns:
@@ -91,16 +104,15 @@ def inliers(errors: Tensor, threshold: Tensor, counted: Tensor | None = None) ->
         )
         return found > share * of
 
-    near = most(NEIGHBOURS, 1, NEIGHBOURS // 2, MOST)
-    tiles = most(PATCH, TILE, 0, ENOUGH).repeat_interleave(TILE, 1).repeat_interleave(TILE, 2)
-    border = (PATCH - TILE) // 2
+    near, tile, border = most(NEIGHBOURS, 1, NEIGHBOURS // 2, MOST), window // 2, window // 4
+    tiles = most(window, tile, 0, ENOUGH).repeat_interleave(tile, 1).repeat_interleave(tile, 2)
     return below | near | pad(tiles, (border, border, border, border))
 
 
 def image_inliers(errors: Tensor, threshold: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the pixels of a whole image that other images do not contradict.
 
-    All three rules of `inliers` apply at every pixel: the image is divided into tiles of 8 x 8 pixels.
+    The rules are those of `inliers`, with a tile around every pixel.
 
     Args:
         errors: (H, W) errors.
@@ -111,10 +123,11 @@ def image_inliers(errors: Tensor, threshold: Tensor, counted: Tensor | None = No
         (H, W) bool.
     """
     height, width = errors.shape
-    border = (PATCH - TILE) // 2
-    around = (border, border + -width % TILE, border, border + -height % TILE)
+    window = window_side(max(height, width))
+    tile, border = window // 2, window // 4
+    around = (border, border + -width % tile, border, border + -height % tile)
     known = torch.ones_like(errors, dtype=torch.bool) if counted is None else counted
-    found = inliers(pad(errors, around)[None], threshold, pad(known, around)[None])[0]
+    found = inliers(pad(errors, around)[None], threshold, window, pad(known, around)[None])[0]
     return found[border : border + height, border : border + width]
 
 
@@ -123,13 +136,15 @@ class RobustColors(nn.Module):
 
     Args:
         config: settings of the rule.
+        image_side: longer side of the largest training image, pixels.
     """
 
     counts: Tensor
     """Histogram of recent squared errors."""
 
-    def __init__(self, config: RobustConfig) -> None:
+    def __init__(self, config: RobustConfig, image_side: int) -> None:
         super().__init__()
+        self.window = window_side(image_side)
         self.quantile, self.steps = config.robust_quantile, config.robust_steps
         self.register_buffer("counts", torch.zeros(DECADES * BINS_PER_DECADE))
 
@@ -159,7 +174,9 @@ class RobustColors(nn.Module):
         self._learn(errors, known, max(1 - len(errors) / RECENT_PIXELS, 0))
         first, threshold = batch.patches * PATCH**2, self.threshold
         of_patches, known_there = (each[:first].view(-1, PATCH, PATCH) for each in (errors, known))
-        found = torch.cat([inliers(of_patches, threshold, known_there).view(-1), errors[first:] < threshold])
+        found = torch.cat(
+            [inliers(of_patches, threshold, self.window, known_there).view(-1), errors[first:] < threshold]
+        )
         weights = self._drawn(found, step).to(errors)
         return weights if batch.weights is None else weights * batch.weights
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
@@ -85,7 +86,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         """
         factors = {term: term.factor(self.config, step) for term in self.losses}
         terms = [term for term, factor in factors.items() if factor and term.applies(batch, self)]
-        known = self._traced(batch) if terms == [COLOR_ERROR] else None
+        known = self._traced(batch, step) if terms == [COLOR_ERROR] else None
         if known is not None:
             return Loss({COLOR_ERROR.name: known.error}, known.rgb, known.num_samples)
         rendered = self.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))
@@ -96,12 +97,14 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             values |= named if factor == 1 else {name: factor * value for name, value in named.items()}
         return Loss(values, shown.pixels.rgb.detach(), rendered.num_samples)
 
-    def _traced(self, batch: PixelBatch) -> TracedError | None:
+    def _traced(self, batch: PixelBatch, step: int) -> TracedError | None:
         """Return the mean squared error of a batch's colours if a native call can compute it; else None."""
-        if not self.plain or self.poses is not None or self.robust is not None:
+        if not self.plain or self.poses is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
-        return error_of_traced(batch.rays, pixels, self.sampler, self.field, self.renderer, self.config.thin_gradients)
+        weigh = None if self.robust is None else partial(self.robust.pixel_weights, batch=batch, step=step)
+        parts, thin = (self.sampler, self.field, self.renderer), self.config.thin_gradients
+        return error_of_traced(batch.rays, pixels, *parts, thin, weigh)
 
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_batch
 from nerfloom.data.pixels.patches import PATCH, patches_around
 from nerfloom.data.pixels.pixel_set import PixelSet
-from nerfloom.data.sources import make_source
+from nerfloom.data.sources import Request, make_source
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.losses.robust import (
     BINS_PER_DECADE,
@@ -165,6 +166,10 @@ def test_masked_pixels_of_a_patch_do_not_count_and_keypoints_follow() -> None:
     assert float(batch.weights.mean()) == pytest.approx(1, rel=1e-5)
     part = batch[torch.arange(10)]
     assert (part.patches, len(part)) == (0, 10)
+    robust = RobustColors(load_method("instant-ngp").config, 24)
+    weights = robust.pixel_weights(part.rgb + torch.linspace(0, 1, 10)[:, None], part, 10**9)  # single pixels
+    assert float(weights[9]) == 0
+    assert torch.equal(weights[:4], part.weights[:4])
 
 
 def test_an_error_without_the_pixels_left_out_has_their_gradient_zero() -> None:
@@ -192,6 +197,28 @@ def test_an_error_without_the_pixels_left_out_has_their_gradient_zero() -> None:
     expected = 2 * (wide - target) * counted[:, None] / target.numel()
     torch.testing.assert_close(rgb.grad.double(), expected, rtol=1e-5, atol=1e-9)
     assert float(value.detach()) == pytest.approx(float((errors * counted).mean()), rel=1e-5)
+
+
+def test_a_step_in_one_native_call_has_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its value is the weighted mean square of its own colours, with the weights that the rule gave."""
+    given, made = [], RobustColors.pixel_weights
+
+    def kept(*arguments: Any, **named: Any) -> torch.Tensor:
+        given.append(made(*arguments, **named))
+        return given[-1]
+
+    monkeypatch.setattr(RobustColors, "pixel_weights", kept)
+    method = load_method("instant-ngp")
+    config = from_plain(method.config, {**SMALL, "robust": "percentile", "robust_steps": 0.0, "vis": "none"}, "test")
+    trainer = Trainer(method, config, with_distractors(BALL.train, 0.2))
+    for _ in range(30):
+        trainer.train_step()
+    batch = trainer.source.draw(Request(30, 1024))
+    loss = trainer.model.loss(batch, 30)
+    assert len(given) == 31
+    squares = (loss.rgb - batch.rgb).square().mean(-1)
+    assert 0 < float((given[-1] == 0).float().mean()) < 0.5
+    assert float(loss.total.detach()) == pytest.approx(float((squares * given[-1]).mean()), rel=1e-4)
 
 
 def test_at_first_all_pixels_count_and_later_only_those_that_agree() -> None:

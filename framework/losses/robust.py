@@ -173,7 +173,7 @@ class RobustColors(nn.Module):
         known = torch.ones_like(errors, dtype=torch.bool) if batch.weights is None else batch.weights > 0
         self._learn(errors, known, max(1 - len(errors) / RECENT_PIXELS, 0))
         first, threshold = batch.patches * PATCH**2, self.threshold
-        of_patches, known_there = (each[:first].view(-1, PATCH, PATCH) for each in (errors, known))
+        of_patches, known_there = (each[:first].view(batch.patches, PATCH, PATCH) for each in (errors, known))
         found = torch.cat(
             [inliers(of_patches, threshold, self.window, known_there).view(-1), errors[first:] < threshold]
         )

@@ -147,6 +147,7 @@ class TrainConfig:
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
+    robust_quantile, robust_steps = 0.8, 500.0
 
     def __init_subclass__(cls, **defaults: Any) -> None:
         """Change defaults of inherited settings, as in `class MyConfig(RayConfig, learning_rate=1e-2)`.

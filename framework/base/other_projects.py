@@ -33,7 +33,7 @@ ELSEWHERE: dict[str, str] = {
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",
     "nerfacto-huge": f"{_LARGER} --max-resolution 8192 --log2-table-size 21 --hidden-width 256",
     "phototourism": "here it is 'nerfacto'; data of the format phototourism is recognised",
-    "semantic-nerfw": "here 'nerfacto' learns appearance if the light differs between images; none learns semantics",
+    "semantic-nerfw": "here it is called 'nerf-w', without semantics",
     "nerfplayer-nerfacto": "for moving scenes there are 'kplanes' and 'dnerf'",
     "nerfplayer-ngp": "for moving scenes there are 'kplanes' and 'dnerf'",
     "depth-nerfacto": "here 'nerfacto' does that if the images come with depth images",

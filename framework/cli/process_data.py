@@ -41,6 +41,8 @@ class ImagesFlags(ColmapFlags):
         super().check()
         if self.masks_dir is not None and self.undistort:
             raise ConfigError("--masks-dir with --undistort: masks are not undistorted; leave one of them out")
+        if self.masks_dir is not None and self.mask_moving:
+            raise ConfigError("--masks-dir with --mask-moving: an image has one mask; leave one of them out")
         if self.masks_dir is not None and not self.masks_dir.is_dir():
             raise ConfigError(f"--masks-dir {self.masks_dir}: there is no such folder")
 

@@ -77,6 +77,8 @@ class Dataset:
     """(M,) int64 on the CPU, index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
     """(M,) bool on the CPU, source images, for rendering others; they are not evaluated. None without."""
+    training: bool = False
+    """Whether these are training images, in the order of a model's vectors for them."""
     motion_bound: MotionBound | None = None
     """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 
@@ -144,7 +146,7 @@ class Dataset:
             index: index of the image.
             stride: distance between the rows and columns in use.
         """
-        view = View.of(self.cameras, index, self.times, stride)
+        view = replace(View.of(self.cameras, index, self.times, stride), image=index if self.training else None)
         return view if self.scene_indices is None else replace(view, scene=int(self.scene_indices[index]))
 
     def kept_of(self, index: int) -> Tensor | None:
@@ -312,6 +314,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         sparse_depth=sparse,
         scene_indices=parsed.scene_indices,
         source_images=parsed.source_images,
+        training=split == "train",
     )
 
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from nerfloom.base.config import HeldOutAppearance
 from nerfloom.base.console import say, track
 from nerfloom.base.device import runs_ahead, wait_for
 from nerfloom.base.errors import DataError
@@ -22,7 +22,7 @@ from nerfloom.base.meter import time_text
 from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.appearance import appearance_of, fitted_appearance, right_half
+from nerfloom.evaluation.appearance import appearance_of, held_out_appearance, right_half
 from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, NETWORK, Lpips, load_lpips
 from nerfloom.evaluation.metrics import MIN_SIDE_OF_SCALES, ms_ssim, psnr, quick_ssim
 from nerfloom.evaluation.statistics import statistics
@@ -147,7 +147,7 @@ class Evaluation:
     numbers of counted and of masked pixels; by_size, the statistics of images of each size."""
     lpips_note: str
     """Network of LPIPS and source of its weights, or the reason for its absence."""
-    eval_appearance: Literal["mean", "half"] | None = None
+    eval_appearance: HeldOutAppearance | None = None
     """Source of the held-out images' appearance; None if the method has none."""
     pictures_note: str | None = None
     """Reason why rendered images could not be written; None if there was no problem."""
@@ -309,7 +309,7 @@ def _judge(
 ) -> tuple[dict[str, Any], Judged]:
     """Return the report on a view, and its images."""
     target = composite(dataset.image(index).float() / 255, background)
-    with fitted_appearance(model, dataset, index, background) if half else nullcontext():
+    with held_out_appearance(model, dataset, index, background):
         picture, spent = timed_view(model, dataset.view(index), background)
     rgb = picture.rgb.clamp(0, 1)
     if round_to_uint8:

@@ -34,6 +34,12 @@ class RenderedBatch:
         """The P pixels as rendered."""
         return self.rendered.to_pixels(self.batch.rays_per_pixel, self.model.outputs)
 
+    @cached_property
+    def weights(self) -> Tensor | None:
+        """Factors (P,) of the pixels' colour errors: the batch's, and 0 for pixels that a robust loss leaves out."""
+        batch, robust = self.batch, self.model.robust
+        return batch.weights if robust is None else robust.pixel_weights(self.pixels.rgb, batch, self.step)
+
 
 class LossTerm(ABC):
     """One term of the objective of a method that casts rays.

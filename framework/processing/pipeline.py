@@ -80,6 +80,11 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     _keep(work, output / "colmap", final)
     (output / "colmap" / "summary.json").write_text(json.dumps(summary.as_json(), indent=2))
     transforms.write(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
+    if flags.mask_moving:
+        from nerfloom.processing.moving_masks import mask_moving  # imports all that trains
+
+        with job.timed("masks"):
+            mask_moving(output, flags.num_downscales, max_seconds=flags.mask_seconds)
     for line in lines(summary):
         say(line)
     say(ready(output))

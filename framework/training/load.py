@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from nerfloom.base.config import RaysPerPixel
+from nerfloom.base.config import HeldOutAppearance, RaysPerPixel
 from nerfloom.base.errors import ConfigError
 from nerfloom.splats.files import is_splat_file
 from nerfloom.splats.placement import Axis
@@ -20,7 +20,7 @@ def load(
     device_type: Any = "auto",
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
-    eval_appearance: Literal["mean", "half"] | None = None,
+    eval_appearance: HeldOutAppearance | None = None,
     eval_rendering: Literal["volume", "surface"] | None = None,
     data_format: DataFormat | None = None,
     up: Axis | None = None,

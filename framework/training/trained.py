@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RaysPerPixel, TrainConfig
+from nerfloom.base.config import HeldOutAppearance, RaysPerPixel, TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
 from nerfloom.cameras.poses import Placement
@@ -32,7 +32,7 @@ def load_trained(
     device_type: Any = "auto",
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
-    eval_appearance: Literal["mean", "half"] | None = None,
+    eval_appearance: HeldOutAppearance | None = None,
     eval_rendering: Literal["volume", "surface"] | None = None,
 ) -> Loaded:
     """Load a run with its trained model.

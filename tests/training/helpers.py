@@ -50,6 +50,21 @@ TINY: dict[str, dict[str, Any]] = {
         "num_rays_per_batch": 128,
         "learning_rate": 5e-3,
     },
+    "nerf-w": {
+        "num_levels": 4,
+        "max_resolution": 64,
+        "log2_table_size": 12,
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 4096,
+    },
+    "nerf-w+frequency": {
+        "encoding": "frequency",
+        "sampler": "occupancy",
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 2048,
+    },
     "mip-nerf-360": {
         "encoding": "hash-grid",
         "num_levels": 4,

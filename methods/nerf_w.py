@@ -46,8 +46,8 @@ PAPER_RATE = 0.05
 """Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
 FREQUENCIES = 6
 """Number of frequencies of positions for the transient head, whose features need not tell where they are."""
-START = 0.05
-"""Transient density before training, per half edge of the box: nearly transparent."""
+START = 0.2
+"""Transient density before training, per half edge of the box."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid over a box."""
 STATIC = Output("static", "color", of_training=True)
@@ -166,7 +166,8 @@ class WildRenderer(VolumeRenderer):
     In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
     constant densities. The paper's equation 8 adds the opacities of both instead, which is the same for thin intervals.
 
-    Depth, opacity and weights are those of the static part.
+    Depth, opacity and weights are those of the static part. The uncertainty is composited by the transient density
+    alone (equation 11), so that the static part does not change on its account.
 
     Args:
         head: the transient part.
@@ -197,9 +198,9 @@ class WildRenderer(VolumeRenderer):
         share = (density / (sigma + density).clamp(min=torch.finfo(torch.float32).tiny))[:, None]
         both = volume_render(rays, samples, sigma + density, torch.lerp(rgb, color, share), background)
         assert both.weights is not None
-        seen = both.weights[:, None] * share
-        extras[TRANSIENT.name] = ray_sum(seen.detach() * color.detach(), samples)
-        extras[UNCERTAINTY.name] = self.least + ray_sum(seen[:, 0] * doubt, samples)
+        extras[TRANSIENT.name] = ray_sum((both.weights[:, None] * share * color).detach(), samples)
+        nothing_behind, doubts = torch.zeros_like(background), doubt[:, None].expand(-1, 3)
+        extras[UNCERTAINTY.name] = self.least + volume_render(rays, samples, density, doubts, nothing_behind).rgb[:, 0]
         extras["transient_density"] = ray_sum(density, samples) / samples.counts.clamp(min=1)
         return replace(static, rgb=both.rgb, extras=extras)
 

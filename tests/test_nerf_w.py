@@ -90,27 +90,24 @@ def two_parts() -> tuple[Rays, Samples, Slabs, Given]:
 
 
 def test_two_parts_are_composited_as_many_thin_slices() -> None:
-    """Reference: 20,000 slices of each interval, whose light is that of equation 8."""
+    """Reference: 20,000 slices of each interval, whose light is that of equation 8; and equation 11."""
     rays, samples, field, head = two_parts()
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     found = WildRenderer(head, LEAST, None).render(rays, samples, field, background)
     density, color, doubt = (x.double() for x in head.given)
     count = 20_000
     for ray in range(2):
-        passed, rgb, transient, uncertain, static, alone = (
-            1.0,
-            *torch.zeros(2, 3).double(),
-            LEAST,
-            torch.zeros(3).double(),
-            1.0,
-        )
+        passed = alone = hazy = 1.0  # transmittance of both parts, of the static one, and of the transient one
+        rgb, transient, static = torch.zeros(3, 3).double()
+        uncertain = torch.tensor(LEAST).double()
         for i in range(5 * ray, 5 * ray + 5):
             thin = float(samples.deltas[i]) / count
             one, other = (-torch.expm1(-x * thin) for x in (field.sigma[i], density[i]))
             ahead = passed * torch.exp(-(field.sigma[i] + density[i]) * thin * torch.arange(count).double()).sum()
             rgb = rgb + ahead * (one * field.rgb[i] + other * color[i])
             transient = transient + ahead * other * color[i]
-            uncertain = uncertain + ahead * other * doubt[i]
+            uncertain = uncertain + hazy * -torch.expm1(-density[i] * samples.deltas[i]) * doubt[i]
+            hazy = hazy * torch.exp(-density[i] * samples.deltas[i])
             passed = passed * torch.exp(-(field.sigma[i] + density[i]) * samples.deltas[i])
             static = static + alone * -torch.expm1(-field.sigma[i] * samples.deltas[i]) * field.rgb[i]
             alone = alone * torch.exp(-field.sigma[i] * samples.deltas[i])

@@ -30,6 +30,7 @@ from nerfloom.fields.nerf import NeRFField
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.table_memory import require
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_capture
@@ -118,6 +119,7 @@ class TransientHead(nn.Module):
         self, num_features: int, size: int, resolution: int, width: int, box: Tensor, camera_to_worlds: Tensor
     ) -> None:
         super().__init__()
+        require(4.0 * len(camera_to_worlds) * resolution**2 * size, "the transient vectors of all images")
         self.resolution = resolution
         self.vectors = nn.Parameter(torch.zeros(len(camera_to_worlds) * resolution**2, size))
         self.network = MLP(num_features + size + 3 + 6 * FREQUENCIES, width, width, 5)

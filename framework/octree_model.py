@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerfloom.base.config import RayConfig
+from nerfloom.base.config import AT_LEAST_0, Range, RayConfig
 from nerfloom.base.optimised import Optimised
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.dispatch import CPP
-from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.layout import OctreeLayout, cells_of
 from nerfloom.kernels.octree.leaf_gradient import LeafGradient
-from nerfloom.kernels.octree.light import OctreeLight, error_bound
+from nerfloom.kernels.octree.light import MAX_DEGREE, OctreeLight, error_bound
 from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.model import Loss, Model
@@ -41,10 +41,12 @@ class OctreeConfig(
 ):
     """Settings of learning an octree's leaves."""
 
+    RANGES: ClassVar[dict[str, Range]] = {"density_rate": AT_LEAST_0, "degree": (0, MAX_DEGREE)}
+    """Allowed ranges."""
     density_rate: float = 5.0
     """Learning rate of densities, relative to that of colours."""
-    harmonics_rate: float = 0.5
-    """Learning rate of harmonics that depend on the direction, relative to that of the constant one."""
+    degree: int = 1
+    """Degree of the harmonics of colours, 0 to 3."""
 
 
 class LeafTable(nn.Module):
@@ -76,7 +78,7 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
     def __init__(self, config: OctreeConfig, scene: Scene) -> None:
         super().__init__(config, scene)
         self.densities = LeafTable("densities", config.density_rate * config.learning_rate, 1)
-        self.colors = LeafTable("colors", config.learning_rate, 3)
+        self.colors = LeafTable("colors", config.learning_rate, 3 * (config.degree + 1) ** 2)
         cells = torch.zeros(0, 3, dtype=torch.int64)
         self.layout = OctreeLayout.build(scene.box[0].cpu(), 1.0, (1, 1, 1), cells)[0]
 
@@ -102,6 +104,23 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
             deferred = density.deferred, color.deferred
         stop = STOP if self.training else stop
         return trace_octree(self.layout, density.table, color.table, rays, background, stop, deferred)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return where the leaves are, for a checkpoint."""
+        layout = self.layout
+        numbers = torch.tensor([*layout.origin.tolist(), layout.cell], dtype=torch.float64)
+        return {"grid": numbers, "size": list(layout.size), "places": layout.places(), "masks": layout.masks}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Place leaves as in a checkpoint, before their values are loaded.
+
+        Raises:
+            ValueError: if the state is of no octree.
+        """
+        numbers, cells = state["grid"].tolist(), cells_of(state["places"], state["masks"])
+        layout, _ = OctreeLayout.build(torch.tensor(numbers[:3]), numbers[3], state["size"], cells)
+        count, width = layout.num_leaves, self.colors.table.shape[1]
+        self.set_octree(layout, torch.zeros(count, 1), torch.zeros(count, width))
 
     @property
     def largest(self) -> float:

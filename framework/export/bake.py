@@ -17,13 +17,13 @@ from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.cameras import refined_cameras
-from nerfloom.export.octree_cells import Grid, MatterSearch
+from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, fitted_colors, seen_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.method import Method
 from nerfloom.octree_model import OctreeConfig, OctreeModel
 from nerfloom.octrees.octree import Octree
-from nerfloom.octrees.packing import packed
+from nerfloom.octrees.packing import packed, raw_of
 from nerfloom.ray_model import RayModel
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.trainer import Trainer
@@ -105,7 +105,7 @@ def _bakeable(loaded: Loaded) -> RayModel:
 def _visible(model: RayModel, dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
     """Return cells with matter, their raw densities (L, 1), and what training images see of them."""
     search = MatterSearch(model)
-    grid: Grid = search.tight(resolution)
+    grid = search.tight(resolution)
     cells, depths = search.cells(grid)
     layout, rows = OctreeLayout.build(grid.origin, grid.cell, grid.size, cells)
     if not layout.num_leaves:
@@ -116,12 +116,6 @@ def _visible(model: RayModel, dataset: Dataset, resolution: int) -> tuple[Octree
     edges = " x ".join(str(8 * count) for count in grid.size)
     say(f"{layout.num_leaves:,} of {edges} cells have matter, and training images see {visible:,} of these")
     return layout, raw, seen
-
-
-def raw_of(depths: Tensor) -> Tensor:
-    """Return the raw densities (L,) whose softplus is the optical depths (L,) of cells' edges."""
-    small = depths.clamp(1e-6, 20)
-    return torch.where(depths < 20, torch.log(torch.expm1(small)), depths)
 
 
 def _chosen(largest: Tensor, settings: Baking) -> tuple[int, Tensor]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,6 +12,7 @@ from nerfloom.base.console import track
 from nerfloom.export.density import LatticeDensity
 from nerfloom.export.lattice import lattice_of
 from nerfloom.kernels.octree.layout import BRICK, OCTANT
+from nerfloom.octrees.grid import Grid
 from nerfloom.renderable import Renderable
 
 MIN_DEPTH = 0.01
@@ -24,34 +23,6 @@ COARSE = 64
 """Octants along the longest edge for finding the box of the matter."""
 OCTANTS_AT_ONCE = 4096
 """Octants whose cells are evaluated together."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A grid of cubic cells, of whole bricks along each axis."""
-
-    origin: Tensor
-    """(3,) float64 corner of the first cell, scene units."""
-    cell: float
-    """Edge of a cell, scene units."""
-    size: tuple[int, int, int]
-    """Bricks along each axis."""
-
-    @classmethod
-    def of(cls, low: Tensor, high: Tensor, resolution: int) -> Grid:
-        """Construct the grid of a box.
-
-        Args:
-            low, high: (3,) float64 corners.
-            resolution: cells along the longest edge.
-        """
-        cell = float((high - low).max()) / resolution
-        x, y, z = (max(math.ceil(float(edge) / (cell * BRICK) - 1e-6), 1) for edge in high - low)
-        return cls(low, cell, (x, y, z))
-
-    def positions(self, cells: Tensor) -> Tensor:
-        """Return the positions (N, 3) float32 of coordinates (N, 3) in cells, whole or fractional."""
-        return (self.origin + self.cell * cells.double()).float()
 
 
 class MatterSearch:
@@ -93,7 +64,7 @@ class MatterSearch:
             ranges = [torch.arange(count) for count in counts[1:]]
             for x in track(range(counts[0]), "Looking for matter", total=counts[0]):
                 slab = torch.cartesian_prod(torch.tensor([x]), *ranges).view(-1, 1, 3)
-                positions = grid.positions(((slab + offsets) * OCTANT).view(-1, 3))
+                positions = grid.positions(((slab + offsets) * OCTANT).reshape(-1, 3))
                 sigma = self._evaluate.density(positions).view(-1, PROBES)
                 dense = (sigma.amax(-1) * grid.cell > MIN_DEPTH).view(counts[1:])
                 found[x] = dense
@@ -107,7 +78,7 @@ class MatterSearch:
         shape = [3, *(len(each) for each in ranges)]
         for x in range(counts[0]):
             half = torch.cartesian_prod(torch.arange(2 * x, 2 * x + 3), *ranges)
-            kept = self._evaluate._kept(grid.positions(half * (OCTANT / 2))).view(shape)
+            kept = self._evaluate.kept(grid.positions(half * (OCTANT / 2))).view(shape)
             found[x] = functional.max_pool3d(kept[None, None].float(), 3, 2)[0, 0, 0] > 0
         return found
 
@@ -119,7 +90,7 @@ class MatterSearch:
         octants, within = self.octants(grid), torch.cartesian_prod(*[torch.arange(OCTANT)] * 3)
         found = [(torch.zeros(0, 3, dtype=torch.int16), torch.zeros(0))]
         for part in _tracked(octants):
-            cells = (part[:, None] * OCTANT + within).view(-1, 3)
+            cells = (part[:, None] * OCTANT + within).reshape(-1, 3)
             depths = self._evaluate.density(grid.positions(cells + 0.5)) * grid.cell
             kept = depths > MIN_DEPTH
             found.append((cells[kept].to(torch.int16), depths[kept]))

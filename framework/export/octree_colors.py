@@ -85,13 +85,13 @@ def fitted_colors(model: RayModel, centers: Tensor, size: float, seen: Seen, deg
     """
     out = torch.zeros(len(centers), 3 * (degree + 1) ** 2)
     parts = torch.arange(len(centers)).split(LEAVES_AT_ONCE)
-    with model.rendering():
-        for part in track(parts, "Fitting colours", total=len(parts)):
-            weights, order = seen.by_view[part].float().topk(min(DIRECTIONS[degree], seen.by_view.shape[1]))
-            away = centers[part, None] - seen.positions[order]
-            directions = torch.nn.functional.normalize(away, dim=-1)
+    for part in track(parts, "Fitting colours", total=len(parts)):
+        weights, order = seen.by_view[part].float().topk(min(DIRECTIONS[degree], seen.by_view.shape[1]))
+        away = centers[part, None] - seen.positions[order]
+        directions = torch.nn.functional.normalize(away, dim=-1)
+        with model.rendering():
             colors = _colors(model.field, centers[part], directions, size)
-            out[part] = fitted(directions, colors, weights + 1e-3, degree)
+        out[part] = fitted(directions, colors, weights + 1e-3, degree)
     return out
 
 

@@ -18,7 +18,7 @@ MAX_DEPTH = 100.0
 """Maximum stored optical depth of a cell's edge; exp(-100) is 0 in every picture."""
 CLIPPED = 2e-4
 """Share of a coefficient's values that is clipped, at each end."""
-LOOKED_AT = 2**20
+LOOKED_AT = 2**17
 """Number of leaves for finding quantiles."""
 
 
@@ -58,6 +58,12 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
     opacity = (torch.exp(-depths) - torch.exp(-leaves.depths())).square().mean().sqrt()
     color = (leaves.coefficients() - coefficients).square().mean().sqrt()
     return leaves, Rounding(float(opacity), 0.2821 * float(color))
+
+
+def raw_of(depths: Tensor) -> Tensor:
+    """Return the raw densities (L,) whose softplus is the optical depths (L,) of cells' edges."""
+    small = depths.clamp(1e-6, 20)
+    return torch.where(depths < 20, torch.log(torch.expm1(small)), depths)
 
 
 def _range(coefficients: Tensor) -> tuple[Tensor, Tensor]:

@@ -133,5 +133,5 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
 
     @property
     def runs_on_kernels(self) -> bool:
-        """True: torch's own operations then use one CPU thread."""
+        """Return True, so that torch's own operations use one CPU thread."""
         return True

@@ -33,7 +33,7 @@ RAYS_AT_ONCE = 2**18
 
 @dataclass(frozen=True)
 class Seen:
-    """What training images see of L leaves."""
+    """The L leaves of an octree as training images see them."""
 
     largest: Tensor
     """(L,) largest weight on any ray."""

@@ -34,5 +34,5 @@ class Grid:
         return cls(low, cell, (x, y, z))
 
     def positions(self, cells: Tensor) -> Tensor:
-        """Return the positions (N, 3) float32 of coordinates (N, 3) in cells, whole or fractional."""
+        """Return the positions (N, 3) float32 of coordinates `cells` (N, 3), whole or fractional."""
         return (self.origin + self.cell * cells.double()).float()

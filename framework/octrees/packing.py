@@ -24,7 +24,7 @@ LOOKED_AT = 2**17
 
 @dataclass(frozen=True)
 class Rounding:
-    """What rounding to bytes has changed."""
+    """The errors of leaves that were rounded to bytes."""
 
     opacity: float
     """Root mean square of the error of a cell's opacity."""
@@ -61,7 +61,7 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
 
 
 def raw_of(depths: Tensor) -> Tensor:
-    """Return the raw densities (L,) whose softplus is the optical depths (L,) of cells' edges."""
+    """Return the raw densities whose softplus is `depths`, optical depths of cells' edges, of any shape."""
     small = depths.clamp(1e-6, 20)
     return torch.where(depths < 20, torch.log(torch.expm1(small)), depths)
 

@@ -80,9 +80,10 @@ def test_it_is_opened_like_a_run(file: Path) -> None:
 
 @pytest.mark.medium
 def test_commands_open_it(file: Path) -> None:
-    done = called("ns-render", "orbit", file, "--num-frames", 3, "--downscale-factor", 8, "--output-path", file.parent)
+    folder = file.parent / "orbit"
+    done = called("ns-render", "orbit", file, "--num-frames", 3, "--downscale-factor", 8, "--output-path", folder)
     assert done.returncode == 0, done.stderr
-    frames = np.stack([iio.imread(path) for path in sorted(file.parent.glob("*.png"))]).astype(float)
+    frames = np.stack([iio.imread(path) for path in sorted(folder.glob("*.png"))]).astype(float)
     assert (frames[:, 0, 0] == 255).all()
     assert frames.min() < 60
     done = called("ns-render", "orbit", file, "--up=z", "--output-path", file.parent)

@@ -1,4 +1,4 @@
-"""Where a sparse voxel octree has leaves.
+"""The places of the leaves of a sparse voxel octree.
 
 All leaves are cubes of one size, the cells of a grid over a box. Of the octree's levels, three are kept: bricks of 8^3
 cells, their octants of 4^3, and cells. A dense grid of bricks says where they are and, in empty space, how far away the

@@ -19,6 +19,7 @@ def leaf_samples(layout: OctreeLayout, rays: Rays) -> tuple[Samples, Tensor]:
     This is the walk of `walk.h`, with a step of all rays at once.
 
     Args:
+        layout: the places of the leaves.
         rays: R rays of any float type.
     """
     kind, device, count = rays.origins.dtype, rays.origins.device, len(rays)
@@ -51,7 +52,7 @@ def leaf_samples(layout: OctreeLayout, rays: Rays) -> tuple[Samples, Tensor]:
 
 
 def leaf_at(layout: OctreeLayout, positions: Tensor) -> Tensor:
-    """Return the leaf (N,) int64 at `positions` (N, 3) in scene units; -1 where there is none."""
+    """Return the leaf (N,) int64 at `positions` (N, 3) in scene units; -1 where `layout` has none."""
     top = BRICK * torch.tensor(layout.size, device=positions.device)
     cell = ((positions - layout.origin) / layout.cell).floor()
     inside = ((cell >= 0) & (cell < top)).all(-1)  # NaN is outside

@@ -1,4 +1,4 @@
-"""Flags of every command that opens a trained run or a file of Gaussians."""
+"""Flags of every command that opens a trained run, a file of Gaussians, or an octree."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ OPENS = "RUN_FOLDER or FILE"
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """The trained run, or the file of Gaussians."""
+    """The trained run, the file of Gaussians, or the octree."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat). The
-    flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
+    octree (.octree). The flag's name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None
-    """Folder of the data, if it has moved since training; optional data for a file of Gaussians."""
+    """Folder of the data, if it has moved since training; optional data for a file."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"

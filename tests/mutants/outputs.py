@@ -120,7 +120,7 @@ MUTANTS = {
         Mutant("mesh-blocks-beside-cells", "LatticeDensity._occupied_blocks", "(A + ROUNDING).floor() + 1", "A.ceil()",
             "meshes have cracks where an occupied cell begins at the face of a block",
             "export/test_density.py::test_cells_that_end_with_a_block_are_closed"),
-        Mutant("mesh-of-skipped-cells", "LatticeDensity._kept", "inside & A", "inside | A",
+        Mutant("mesh-of-skipped-cells", "LatticeDensity.kept", "inside & A", "inside | A",
             "meshes show density where the renderer never looks",
             "export/test_density.py::test_cells_that_the_renderer_skips_are_empty_and_not_evaluated"),
     ],

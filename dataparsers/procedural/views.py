@@ -213,7 +213,7 @@ def write_views(
         moving: whether each frame has a time; otherwise the scene is static, at time 0.
         progress: wrapper of the iteration over views, called with the iterable and the number of views.
     """
-    jobs = [job for split, of_split in poses.items() for job in _lay_out(folder, split, of_split, moving)]
+    jobs = [job for split, of_split in poses.items() for job in lay_out(folder, split, of_split, moving)]
     with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
         done = pool.map(lambda job: _write_view(*job, size=size, parts=parts), jobs)
         for _ in progress(done, len(jobs)):
@@ -243,10 +243,17 @@ def complete_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _lay_out(
+def lay_out(
     folder: Path, split: str, poses: Sequence[npt.NDArray[np.float64]], moving: bool
 ) -> list[tuple[Path, npt.NDArray[np.float64], float]]:
-    """Write the JSON file of a split, and return the file, pose and time of each view."""
+    """Write the JSON file of a split, and return the file, pose and time of each view.
+
+    Args:
+        folder: folder of the data set.
+        split: train, val or test.
+        poses: camera-to-world matrices (4, 4).
+        moving: whether each frame has a time.
+    """
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames, jobs = [], []
     for index, pose in enumerate(poses):

@@ -9,6 +9,7 @@ density's gradient (`nerfloom.fields.normals`).
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
@@ -25,11 +26,8 @@ from nerfloom.geometry.points import Footprint, Points
 from nerfloom.kernels.color import to_srgb
 from nerfloom.kernels.dispatch import derivatives
 from nerfloom.kernels.encodings.integrated_directional import directional_encoding, num_features
-from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
-from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP
-from nerfloom.kernels.math import safe_normalize, split_density
+from nerfloom.kernels.math import safe_normalize
 from nerfloom.kernels.networks.mlp import Activation
-from nerfloom.kernels.surfaces.distance import distance_network
 from nerfloom.kernels.traced.trace import GridDensity
 
 NORMALS, DIFFUSE, TINT, ROUGHNESS = slice(1, 4), slice(4, 7), slice(7, 10), 10
@@ -38,6 +36,8 @@ NUM_OUTPUTS = 11
 """Number of these columns. The bottleneck, which the directional network takes, follows."""
 DIFFUSE_BIAS, ROUGHNESS_BIAS = -math.log(3.0), -1.0
 """Added before the activation functions: dim diffuse colours and medium roughness at first (supplement)."""
+TAP_DISTANCE = 1 / 512
+"""Distance along each axis of the places between which a grid's density is compared, in shortest edges of the box."""
 
 
 class Light(NamedTuple):
@@ -94,15 +94,22 @@ class Reflection(nn.Module):
 
 
 class ReflectiveField(Field):
-    """Base class of fields with reflections. `density` returns the outputs of the spatial network as features.
-
-    In training, the gradient (N, 3) of the log-density, or of another number that rises with the density, follows them.
-    """
+    """Base class of fields with reflections. `density` returns the outputs of the spatial network as features."""
 
     reflection: Reflection
     """Computes the light of points."""
-    num_outputs: int
-    """Number of outputs of the spatial network: 11 with a meaning, and the bottleneck."""
+
+    @abstractmethod
+    def density_normals(self, points: Points) -> Tensor:
+        """Return the unit normals (N, 3) of the density, with a gradient; 0 where its gradient is 0.
+
+        Args:
+            points: N points.
+        """
+
+    def predicted_normals(self, features: Tensor) -> Tensor:
+        """Return the predicted unit normals (N, 3) of points from their `features` (N, F)."""
+        return safe_normalize(features[:, NORMALS].float())
 
     def light(self, features: Tensor, directions: Tensor) -> Light:
         """Return the light of points.
@@ -111,26 +118,17 @@ class ReflectiveField(Field):
             features: (N, F) features of the points, from `density`.
             directions: (N, 3) unit viewing directions.
         """
-        return self.reflection(features[:, : self.num_outputs].float(), directions)
+        return self.reflection(features.float(), directions)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return self.light(features, directions).rgb
 
-    def predicted_normals(self, features: Tensor) -> Tensor:
-        """Return the predicted unit normals (N, 3) of points from their `features` (N, F)."""
-        return safe_normalize(features[:, NORMALS].float())
-
-    def density_normals(self, features: Tensor) -> Tensor:
-        """Return the unit normals (N, 3) of the density, with a gradient; 0 where its gradient is 0.
-
-        Args:
-            features: (N, F) features of the points, from `density` in training.
-        """
-        return -safe_normalize(features[:, self.num_outputs :].float())
-
 
 class ReflectiveGrid(ReflectiveField, BoxField):
-    """A hash grid and a network with one hidden layer, whose gradient is learnt from in compiled kernels.
+    """A hash grid and a network with one hidden layer.
+
+    Its normals are differences of the log-density at four places around a point, as in Neuralangelo (Li et al. 2023,
+    section 3.2): they have a gradient by first derivatives alone, and the noise of single cells averages out.
 
     Args:
         box: (2, 3) corners of the box, scene units.
@@ -140,6 +138,8 @@ class ReflectiveGrid(ReflectiveField, BoxField):
         bottleneck: number of features for the directional network.
         unbounded: whether the grid covers all of space, contracted by `contract_to_unit`.
     """
+
+    taps: Tensor
 
     def __init__(
         self,
@@ -151,45 +151,22 @@ class ReflectiveGrid(ReflectiveField, BoxField):
         unbounded: bool = False,
     ) -> None:
         super().__init__(box, encoding, unbounded)
-        self.grid, self.reflection, self.num_outputs = encoding, reflection, NUM_OUTPUTS + bottleneck
-        self.head = MLP(encoding.num_features, width, self.num_outputs, bias=False)
-        if encoding.deferred is not None:  # gradients of this table are those of features and of their derivatives
-            encoding.deferred = TableGradient(LOOK_UP, encoding.layout)
+        self.reflection = reflection
+        self.head = MLP(encoding.num_features, width, NUM_OUTPUTS + bottleneck, bias=False)
+        corners = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])  # of a tetrahedron
+        self.register_buffer("taps", TAP_DISTANCE * (box[1] - box[0]).min() * corners.to(box), persistent=False)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        if not self.training:
-            return self.head.density(self.encode(points.positions, None))
-        out = self._network(self.unit(points.positions.detach()))
-        slopes = self._in_space(points.positions, out[:, self.num_outputs :])
-        return split_density(torch.cat([out[:, : self.num_outputs], slopes], dim=-1))
+        return self.head.density(self.encode(points.positions, None))
 
     def grid_density(self) -> GridDensity | None:
-        """Return the density for `trace`; None in training, where it would lack the gradient."""
-        return None if self.training else self._grid_density(self.head)
+        """Return the density for `trace`."""
+        return self._grid_density(self.head)
 
-    def _network(self, unit: Tensor) -> Tensor:
-        """Return outputs (N, D) and the gradient (N, 3) of the first at positions `unit` (N, 3) in the cube."""
-        grid = self.grid
-        hidden, last = (layer.weight for layer in self.head if isinstance(layer, nn.Linear))
-        table, layout, opening = grid.table, grid.layout, grid.opening
-        if opening is not None and not opening.complete:
-            layout = layout.first(opening.count)
-            open_features = layout.num_levels * table.shape[1]
-            factors = opening.completed(hidden.new_ones(1, open_features), grid.num_features)
-            table, hidden = table[: layout.num_entries], (hidden * factors)[:, :open_features]
-        if grid.deferred is not None:
-            grid.deferred.layout = layout
-        return distance_network(unit, table, hidden, last, layout, grid.deferred)
-
-    def _in_space(self, positions: Tensor, slopes: Tensor) -> Tensor:
-        """Return gradients (N, 3) by `positions` (N, 3), scene coordinates, from gradients by those in the cube."""
-        if not self.unbounded:
-            return slopes * self.scale
-        with torch.enable_grad():
-            positions = positions.detach().requires_grad_()
-            unit = self.unit(positions)
-            rows = [torch.autograd.grad(unit[:, a].sum(), positions, retain_graph=True)[0] for a in range(3)]
-        return (torch.stack(rows, 1) * slopes[:, :, None]).sum(1)
+    def density_normals(self, points: Points) -> Tensor:
+        around = (points.positions.detach()[:, None] + self.taps).view(-1, 3)
+        logs = self.head(self.encode(around, None))[:, 0].float().view(-1, len(self.taps), 1)
+        return -safe_normalize((logs * self.taps.sign()).sum(1))
 
 
 class SkippingNetwork(nn.Module):
@@ -233,16 +210,17 @@ class ReflectiveNetworks(ReflectiveField):
         self, encoding: IntegratedEncoding, reflection: Reflection, width: int, depth: int, bottleneck: int
     ) -> None:
         super().__init__()
-        self.encoding, self.reflection, self.num_outputs = encoding, reflection, NUM_OUTPUTS + bottleneck
-        self.network = SkippingNetwork(encoding.num_features, width, depth, depth // 2 + 1, self.num_outputs)
+        self.encoding, self.reflection = encoding, reflection
+        outputs = NUM_OUTPUTS + bottleneck
+        self.network = SkippingNetwork(encoding.num_features, width, depth, depth // 2 + 1, outputs)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        if not (self.training and torch.is_grad_enabled()):
-            outputs = self.network(self.encoding(points)).float()
-        else:
-            with derivatives(2):
-                points = replace(points, positions=points.positions.detach().requires_grad_())
-                outputs = self.network(self.encoding(points)).float()
-                (slopes,) = torch.autograd.grad(outputs[:, 0].sum(), points.positions, create_graph=True)
-            outputs = torch.cat([outputs, slopes], dim=-1)
+        outputs = self.network(self.encoding(points)).float()
         return softplus(outputs[:, 0] + DENSITY_BIAS), outputs
+
+    def density_normals(self, points: Points) -> Tensor:
+        with torch.enable_grad(), derivatives(2):
+            points = replace(points, positions=points.positions.detach().requires_grad_())
+            outputs = self.network(self.encoding(points)).float()
+            (slopes,) = torch.autograd.grad(outputs[:, 0].sum(), points.positions, create_graph=True)
+        return -safe_normalize(slopes)

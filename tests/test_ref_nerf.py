@@ -88,7 +88,7 @@ def test_normals_point_down_the_density(kind: str, unbounded: bool) -> None:
     more = {"sparse_updates": False, "open_levels_until": 0.0, "sampler": "proposal" if unbounded else "auto"}
     field = field_of(kind, scene, **more).double().train()
     if isinstance(field, ReflectiveGrid):
-        nn.init.normal_(field.grid.table)
+        nn.init.normal_(field.encoding.table)
     where, step = (3.0 if unbounded else 1.0) * places().double(), 1e-6
     columns = []
     for axis in torch.eye(3, dtype=torch.float64):
@@ -112,7 +112,7 @@ def test_penalties_of_normals_train_the_density(kind: str) -> None:
     rendered = model.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))
     rendered.extras["normals_penalty"].sum().backward()
     field = model.field
-    first = field.grid.table if isinstance(field, ReflectiveGrid) else field.network.before[0].weight
+    first = field.encoding.table if isinstance(field, ReflectiveGrid) else field.network.before[0].weight
     assert first.grad is not None
     assert float(first.grad.abs().sum()) > 0
 

@@ -204,8 +204,8 @@ def _write_view(
     iio.imwrite(path.with_name(f"{path.stem}_normal.png"), normals)
     if light is not None:
         known = {
-            name: getattr(light, name).T.float().reshape(size, size, -1).numpy()
-            for name in ("diffuse", "specular", "roughness")
+            name: rows.view(-1, size, size).movedim(0, -1).float().numpy()
+            for name, rows in (("diffuse", light.diffuse), ("specular", light.specular), ("roughness", light.roughness))
         }
         np.savez_compressed(path.with_name(f"{path.stem}_light.npz"), **known)  # type: ignore[arg-type]
 

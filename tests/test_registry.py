@@ -23,6 +23,7 @@ BUILT_IN = {
     "nerfacto",
     "neus",
     "pixel-nerf",
+    "ref-nerf",
     "tensorf",
     "vanilla-nerf",
     "volsdf",

@@ -31,6 +31,7 @@ class Measured:
         ms_ssim: mean SSIM at five scales; None for small images.
         lpips: mean LPIPS over all evaluated views; None if it was not computed.
         floaters: mean percentage of sparse points with matter in front of them; None without sparse points.
+        normal_mae: mean angle between rendered and true normals, degrees; None without either.
         steps: number of training steps.
         parameters: number of parameters.
         skipped_steps: number of steps dropped because of non-finite values.
@@ -52,6 +53,7 @@ class Measured:
     ms_ssim: float | None
     lpips: float | None
     floaters: float | None
+    normal_mae: float | None
     views: int
     """Number of evaluated views."""
     steps: int
@@ -136,6 +138,7 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         ms_ssim=results.get("ms_ssim"),
         lpips=results["lpips"],
         floaters=results.get("floaters"),
+        normal_mae=results.get("normal_mae"),
         views=results["num_images"],
         steps=summary["steps"],
         seconds=summary["seconds"],

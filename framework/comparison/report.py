@@ -49,6 +49,7 @@ COLUMNS = (
     Column("MS-SSIM", "ms_ssim", "{:.4f}".format, max),
     Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
+    Column("normals of views, °", "normal_mae", "{:.2f}".format, min),
     Column("Chamfer, % of side", "chamfer", "{:.3f}".format, min),
     Column("F-score, %", "f_score", "{:.1f}".format, max),
     Column("normals, °", "normal_error", "{:.2f}".format, min),
@@ -314,7 +315,7 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "chamfer", "f_score", "normal_error", "faces")
+QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "normal_mae", "chamfer", "f_score", "normal_error", "faces")
 """Measures of the rendered views and of the surface."""
 CSV_FIGURES = ("label", "method", "seed", *QUALITY, "views", "steps", "seconds", "rays_per_second")
 """First columns of results.csv."""

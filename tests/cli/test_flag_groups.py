@@ -21,7 +21,7 @@ from tests.cli.helpers import called
 
 METHODS = (
     "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
-    "neus", "pixel-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
+    "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
 )  # fmt: skip
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""

@@ -21,6 +21,7 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.compositing.density import composite, composite_reference, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.encodings.integrated_directional import directional_encoding, directional_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
@@ -330,6 +331,12 @@ OPERATIONS = {
         spherical_harmonics_reference,
         lambda: {"directions": rand(9, 3)},
         ("spherical_harmonics", "spherical_harmonics_backward"),
+    ),
+    "directional encoding": Operation(
+        directional_encoding,
+        directional_encoding_reference,
+        lambda: {"directions": rand(9, 3), "roughness": rand(9)},
+        ("directional_encoding", "directional_encoding_backward"),
     ),
     "interval weights": Operation(
         interval_weights,

@@ -99,6 +99,13 @@ MUTANTS = {
         Mutant("orientation-penalty-sign", "normal_penalties", "A.clamp(min=0)", "A.clamp(max=0)",
             "normals that face the camera are punished", "fields/test_normals.py::test_penalties_in_closed_form"),
     ],
+    "nerfloom.fields.reflective": [
+        Mutant("reflected-through", "Reflection.forward", "A - 2 * B * C", "A + 2 * B * C",
+            "directions are reflected at another plane: shiny things show nothing of what is around them",
+            "test_ref_nerf.py::test_light_by_hand"),
+        Mutant("cosine-sign", "Reflection.forward", "-away", "away",
+            "the directional network is told that surfaces face away", "test_ref_nerf.py::test_light_by_hand"),
+    ],
     "nerfloom.geometry.alignment": [
         Mutant("refined-poses-aligned-mirrored", "align_cameras",
             "A @ torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(A @ B))]).double()) @ B", "B.T @ A.T",

@@ -39,6 +39,8 @@ ELSEWHERE = {
     r"ns-measure": "tests/test_scale.py",
     r"ns-stress": "tests/stress_command/test_runs.py",
     r"python -m nerfloom.dataparsers.procedural.solids": "tests/dataparsers/test_solids.py",
+    r"python -m nerfloom.dataparsers.procedural.shiny": "tests/dataparsers/test_shiny.py",
+    r"ns-eval outputs/mirror": "tests/test_ref_nerf.py",
     r"ns-(eval|compare) .*--reference-": "tests/cli/test_eval_geometry.py",
     r"torchrun": "tests/training/test_processes.py",
     r"python examples/": "tests/plug_and_play/test_examples.py",

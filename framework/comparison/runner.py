@@ -17,9 +17,9 @@ from rich.status import Status
 
 from nerfloom.base.console import console, say
 from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.signals import NUMBERS, Stopped, handled
 from nerfloom.comparison.measures import read_json
 from nerfloom.comparison.plan import Conditions, Job, Plan
-from nerfloom.training.signals import NUMBERS, Stopped, handled
 
 LOOK_EVERY = 0.5
 """Seconds between updates of the displayed last line of a run's output."""

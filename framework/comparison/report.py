@@ -76,15 +76,17 @@ class Cell:
     best: bool = False
 
 
-def write_report(plan: Plan, rows: Sequence[Row]) -> Path:
+def write_report(plan: Plan, rows: Sequence[Row], sharing: str | None = None) -> Path:
     """Write all four files, and return the path of report.html.
 
     Args:
         plan: the comparison.
         rows: results of the contenders.
+        sharing: what machines did besides a run, as a sentence; None if each run was alone.
     """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)
+    content["conditions"] += [] if sharing is None else [f"{sharing} Times are longer where runs share a machine."]
     template = files("nerfloom.comparison").joinpath("report.html.jinja").read_text(encoding="utf-8")
     import jinja2  # a dependency of PyTorch
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,10 +18,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from nerfloom.base.errors import printable
+
 LOOK_EVERY = 0.1
 """Seconds between looks at whether the job is to end early."""
 GRACE = 60.0
 """Seconds for a command to save before it is killed."""
+COMMAND = "$ "
+"""Start of a log's lines that show a command."""
 ALONE = "waiting until an earlier process of this job has ended"
 """Line of a log that another process still writes."""
 
@@ -75,7 +80,7 @@ def run(job: dict[str, Any], abandoned: threading.Event) -> str | None:
 
 def _run(command: list[str], log: BinaryIO, abandoned: threading.Event) -> int:
     """Run a command and return its exit status. Its output goes to the job's log."""
-    log.write(("$ " + " ".join(command) + "\n").encode())
+    log.write(f"{COMMAND}{printable(shlex.join(command))}\n".encode())
     log.flush()
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, preexec_fn=_end_with_parent())
     while True:
@@ -134,7 +139,8 @@ def reason(code: int, log: Path) -> str:
     if number in signal.valid_signals():
         name = signal.Signals(number).name
         return f"ended by {name}" + (" (too little memory?)" if name == "SIGKILL" else "")
-    return last_line(log).removeprefix("error: ") or f"exit status {code}"
+    said = last_line(log).removeprefix("error: ")
+    return f"exit status {code}" if not said or said.startswith(COMMAND) else said
 
 
 def last_line(log: Path) -> str:

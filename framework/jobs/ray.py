@@ -50,8 +50,6 @@ class Ray:
     def __post_init__(self) -> None:
         if self.at_once is not None and self.at_once < 1:
             raise FlagError(f"--jobs is {self.at_once}; it must be at least 1")
-        if (advice := install_command("cluster")) is not None:
-            raise ConfigError(f"--launcher ray needs a package that is not installed: {advice}")
 
     @property
     def sharing(self) -> str | None:
@@ -60,6 +58,8 @@ class Ray:
 
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
         """Run every unfinished job, as in `Launcher.run`."""
+        if (advice := install_command("cluster")) is not None:
+            raise ConfigError(f"--launcher ray needs a package that is not installed: {advice}")
         ledger = Ledger(jobs, on_finished)
         waiting = ledger.unfinished()
         if not waiting:

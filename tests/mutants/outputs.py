@@ -200,6 +200,16 @@ MUTANTS = {
             "a run that was stopped half way is compared with whole ones",
             "comparison/test_measures.py::test_a_run_is_done_once_it_was_judged_and_is_finite"),
     ],
+    "nerfloom.jobs.launcher": [
+        Mutant("empty-jobs-are-finished", "Ledger.ended", "reason is None and job.finished()", "reason is None",
+            "a job whose commands left nothing counts as finished",
+            "jobs/test_processes.py::test_failures_name_the_reason_and_the_others_go_on"),
+    ],
+    "nerfloom.jobs.processes": [
+        Mutant("cores-shared-twice", "places_for", "most * at_once > available", "most > available",
+            "simultaneous jobs slow each other down without a word",
+            "jobs/test_processes.py::test_a_machine_is_not_divided_into_more_than_it_has"),
+    ],
     "nerfloom.training.loaded": [
         Mutant("depth-in-scene-units", "Loaded.unit", "1 / self.placement.scale", "1.0",
             "depth files of a capture are in units of the scene, not of the input",

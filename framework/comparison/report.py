@@ -196,6 +196,8 @@ def measured(rows: Sequence[Row]) -> list[Column]:
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows of the table of results: label, colour, Pareto flag, and a cell for each column.
 
+    A row without results has no cells, and a word instead.
+
     Args:
         rows: results of the contenders.
     """
@@ -206,7 +208,13 @@ def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for index, row in enumerate(rows):
         cells = [_cell(column, row, finished) for column in measured(rows)] if row.runs else []
         result.append(
-            {"label": row.label, "color": plots.color_of(index), "front": row.label in on_front, "cells": cells}
+            {
+                "label": row.label,
+                "color": plots.color_of(index),
+                "front": row.label in on_front,
+                "cells": cells,
+                "instead": "failed" if row.failures else "not run",
+            }
         )
     return result
 
@@ -219,7 +227,7 @@ def console_table(rows: Sequence[Row]) -> Table:
     """
     result = Table("", *(row.label for row in rows))
     columns = measured(rows)
-    cells = [row["cells"] or [Cell("failed")] * len(columns) for row in table(rows)]
+    cells = [row["cells"] or [Cell(row["instead"])] * len(columns) for row in table(rows)]
     for column, figures in zip(columns, zip(*cells, strict=True), strict=True):
         result.add_row(column.title, *(cell.text for cell in figures))
     return result
@@ -312,7 +320,7 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     for row in rows:
         name = row["label"].replace("|", "\\|") + ("*" if row.get("front") else "")
         cells = [f"**{cell.text}**" if cell.best else cell.text for cell in row["cells"]]
-        lines.append("| " + " | ".join([name, *(cells or ["failed"] + [""] * (len(head) - 2))]) + " |")
+        lines.append("| " + " | ".join([name, *(cells or [row["instead"]] + [""] * (len(head) - 2))]) + " |")
     return lines
 
 

@@ -67,6 +67,7 @@ class Ray:
         with _cluster(self.address) as ray:
             for folder in {job.log.parent for job in waiting}:
                 _check_shared(ray, folder)
+            _warn_of_room(ray, waiting)
             with stoppable() as stopped:
                 _run(ray, waiting, self.at_once or len(waiting), ledger, stopped)
         return ledger.failures
@@ -111,8 +112,7 @@ def _check_shared(ray: Any, folder: Path) -> None:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from error
     try:
         look = ray.remote(num_cpus=0, max_retries=0)(_sees)
-        nodes = [node for node in ray.nodes() if node["Alive"]]
-        places = [NodeAffinitySchedulingStrategy(node["NodeID"], soft=False) for node in nodes]
+        places = [NodeAffinitySchedulingStrategy(node["NodeID"], soft=False) for node in _machines(ray)]
         answers = ray.get([look.options(scheduling_strategy=place).remote(str(token)) for place in places])
     finally:
         token.unlink()
@@ -121,6 +121,19 @@ def _check_shared(ray: Any, folder: Path) -> None:
             f"the machine {blind[0]} of the cluster does not see {folder}; name a folder on a file system that all of "
             "its machines share"
         )
+
+
+def _machines(ray: Any) -> list[dict[str, Any]]:
+    """Return Ray's descriptions of the machines that are there now."""
+    return [node for node in ray.nodes() if node["Alive"]]
+
+
+def _warn_of_room(ray: Any, jobs: Sequence[Job]) -> None:
+    """Say so if a job has to wait for a machine that is not there; a cluster may grow."""
+    for cores, gpus in sorted({(job.resources.cores or 1, job.resources.gpus) for job in jobs}):
+        found = [node["Resources"] for node in _machines(ray)]
+        if not any(each.get("CPU", 0) >= cores and each.get("GPU", 0) >= gpus for each in found):
+            say(f"warning: no machine of the cluster has {cores} cores and {gpus} GPUs; jobs wait until one has")
 
 
 def _sees(path: str) -> tuple[str, bool]:
@@ -175,7 +188,8 @@ def _submitted(ray: Any, work: Any, job: Job) -> Any:
     """Give a job to the cluster, and return Ray's reference of its result."""
     cores, environment = job.resources.cores, {k: v for k, v in os.environ.items() if k.startswith(PASSED_ON)}
     if cores is None:
-        cores = int(min(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]))
+        found = [int(node["Resources"].get("CPU", 0)) for node in _machines(ray)]
+        cores = min((each for each in found if each), default=1)  # a head may offer none
     else:
         environment["OMP_NUM_THREADS"] = str(cores)
     options = work.options(num_cpus=cores, num_gpus=job.resources.gpus)

@@ -48,6 +48,17 @@ def test_the_page_holds_everything_and_needs_nothing(compared: Plan) -> None:
     assert "{{" not in page
 
 
+def test_what_has_not_run_yet_has_not_failed_and_machines_that_were_shared_are_named(compared: Plan) -> None:
+    runs = [run for run in (measure(planned, CONDITIONS) for planned in compared.runs()) if run is not None]
+    write_report(compared, rows_of(LABELS, runs, {}), "2 runs at a time on one machine.")
+    text = (compared.folder / "report.md").read_text()
+    assert "| tensorf | not run |" in text
+    assert "- 2 runs at a time on one machine. " in text
+    page = (compared.folder / "report.html").read_text()
+    assert "2 runs at a time on one machine. " in page
+    assert ">not run</td>" in page
+
+
 def test_tables_in_markdown_and_csv_and_json(compared: Plan) -> None:
     text = (compared.folder / "report.md").read_text()
     row = next(line for line in text.splitlines() if line.startswith("| kplanes"))

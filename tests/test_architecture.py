@@ -137,6 +137,7 @@ def _fields(file: Path, base: str):
 
 LAYERS = (
     ("base",),
+    ("jobs",),
     ("geometry",),
     ("kernels",),
     ("cameras",),

@@ -15,6 +15,7 @@ from nerfloom.base.device import choose_device, peak_memory
 from nerfloom.base.errors import ConfigError, LostProcessError
 from nerfloom.base.extras import install_command
 from nerfloom.base.processes import from_first, joined_processes, processes
+from nerfloom.base.signals import Stopped, handled, signal_of
 from nerfloom.cli.common import check_weights
 from nerfloom.cli.next_steps import after_training
 from nerfloom.data.dataset import Dataset
@@ -31,7 +32,6 @@ from nerfloom.training.machine import kernels
 from nerfloom.training.outcome import Outcome
 from nerfloom.training.report import SUMMARY, write_evaluation, write_summary
 from nerfloom.training.run import Run, create_folder, write_report, write_transforms
-from nerfloom.training.signals import Stopped, handled, signal_of
 from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 

@@ -28,6 +28,7 @@ ELSEWHERE = {
     r"ns-process-data (polycam|record3d) ": "tests/truth/test_processing.py",
     r"ns-process-data images .*(FISHEYE|scan/images)": "tests/truth/test_processing.py",
     r"ns-process-data images .*--resume": "tests/processing/test_process_command.py",
+    r"ns-compare .*--(launcher|jobs)": "tests/jobs/test_ray.py",
     r"ns-compare --load-config": "tests/cli/test_compare_command.py",
     r"ns-bench gpu": "tests/benchmarks/test_gpu.py",
     r"python -m benchmarks (quadrature|processes|contention|cache|poses|tables)": (

@@ -45,6 +45,7 @@ def _command(arguments: list[str]) -> None:
     import time
 
     from nerfloom.base.console import say
+    from nerfloom.cameras.scale import write_scale
     from nerfloom.export.bake import Baking, bake
     from nerfloom.octrees.files import write_octree
 
@@ -52,6 +53,7 @@ def _command(arguments: list[str]) -> None:
     loaded = flags.load(found)
     settings = Baking(flags.resolution, 1e6 * flags.max_megabytes, flags.degree, flags.fine_tune_seconds)
     write_octree(path, bake(loaded, settings))
+    write_scale(path, loaded.scale)
     size = path.stat().st_size / 1e6
     say(f"{size:.2f} MB after {time.perf_counter() - start:.0f} s: {path}")
     if size > flags.max_megabytes:

@@ -82,7 +82,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     leaves, lost = packed(depths, coefficients)
     say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
     scene = model.scene
-    return Octree(layout, leaves, loaded.placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
+    return Octree(layout, leaves, loaded.input_placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
 
 
 def _bakeable(loaded: Loaded) -> RayModel:

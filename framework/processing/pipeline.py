@@ -83,7 +83,7 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
     if flags.mask_moving:
         from nerfloom.processing.moving_masks import mask_moving  # imports all that trains
 
-        with job.timed("masks"):
+        with state.timed("masks"):
             mask_moving(output, flags.num_downscales, max_seconds=flags.mask_seconds)
     for line in lines(summary):
         say(line)

@@ -12,6 +12,7 @@ from nerfloom.base.device import choose_device
 from nerfloom.base.errors import DataError
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.scale import read_scale
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import read_octree
 from nerfloom.training.file_data import DataFormat, scene_of, source_of
@@ -50,7 +51,7 @@ def load_octree(file: Path, data: Path | None, data_format: DataFormat | None, d
     if device.type != "cpu":
         say(f"octrees have no kernels for {device.type} yet: rays take PyTorch's own operations, which are slow")
     model = DrawnOctree(octree.to(device), scene.to(device))
-    return Loaded(model, octree.placement, METHOD, file, file, source=source)
+    return Loaded(model, octree.placement, METHOD, file, file, source=source).scaled(read_scale(file))
 
 
 def _same(one: Placement, two: Placement) -> bool:

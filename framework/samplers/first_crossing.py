@@ -1,5 +1,4 @@
-"""Sphere tracing (Hart 1996) of a signed distance: one sample for each surface that a ray meets, up to the first that
-covers it.
+"""Sphere tracing of a signed distance (Hart 1996): samples where rays meet surfaces, up to one that covers the ray.
 
 A ray advances by the distance at its position, so it takes few steps far from a surface. It stays in occupied cells;
 the space between them counts as outside. A learnt distance is no exact one: steps are shortened by its slope at the
@@ -88,7 +87,7 @@ class _Paths(NamedTuple):
     """Signed distance at `inside`."""
 
     def of(self, chosen: Tensor) -> _Paths:
-        """Return the rays that a mask selects."""
+        """Return the rays that `chosen`, a mask, selects."""
         index = chosen.nonzero().squeeze(-1)
         return _Paths(*(column.index_select(0, index) for column in self))
 
@@ -174,15 +173,18 @@ def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths, exact: flo
     """
     owners, (low, high, outside, inside) = entered.rays, entered[6:]
     at, left, evaluations = high.clone(), torch.arange(len(owners), device=owners.device), 0
+    side = torch.zeros_like(owners)
     for _ in range(REFINEMENTS):
         here = low + (high - low) * (outside / (outside - inside))
         value = distance(rays.points(owners, here))
         at[left], evaluations, is_outside = here, evaluations + len(here), value > 0
-        # The end that stays counts half, so that both ends approach.
-        outside, inside = torch.where(is_outside, value, outside / 2), torch.where(is_outside, inside / 2, value)
+        before, side = side, torch.where(is_outside, 1, -1)
+        half = torch.where(side == before, 0.5, 1.0).to(value)  # an end that stays twice, so that it approaches too
+        outside, inside = torch.where(is_outside, value, outside * half), torch.where(is_outside, inside * half, value)
         low, high = torch.where(is_outside, here, low), torch.where(is_outside, high, here)
         some = (value.abs() > exact).nonzero().squeeze(-1)
-        left, owners, low, high, outside, inside = (x[some] for x in (left, owners, low, high, outside, inside))
+        left, owners, side = left[some], owners[some], side[some]
+        low, high, outside, inside = (column[some] for column in (low, high, outside, inside))
     return at, evaluations
 
 

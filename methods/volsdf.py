@@ -21,7 +21,7 @@ from nerfloom.methods._surfaces import (
 
 
 @dataclass(frozen=True)
-class VolSDFConfig(SurfaceConfig):
+class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Settings of volsdf."""
 
 

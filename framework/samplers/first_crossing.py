@@ -74,7 +74,7 @@ class _Paths(NamedTuple):
     was: Tensor
     """Signed distance there; positive in space that is not searched, negative before the first position."""
     least: Tensor
-    """Least distance since the ray was last clear of a surface; infinite if there was none."""
+    """Least distance since the ray was last clear of a surface; -infinity if it has never been."""
     nearest: Tensor
     """Distance along the ray at that place."""
     outside: Tensor
@@ -110,8 +110,8 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     first = pieces.starts[pieces.offsets[:-1][active]]
     # The first piece may begin at the face of the box, behind which is the outside, or at the ray's own start.
     was = torch.where(first > rays.nears[active] + shortest, 1.0, -1.0).to(first)
-    none = torch.full_like(first, torch.inf)
-    paths = _Paths(active, first, first, was, none, first, -none, first, first, first)
+    unclear = torch.full_like(first, -torch.inf)
+    paths = _Paths(active, first, first, was, was * torch.inf, first, unclear, first, first, first)
     span = 2 * (float(pieces.ends.max()) + shortest) if len(active) else 1.0  # one number orders ray and distance
     ends = pieces.owners * span + pieces.ends.double()
     met, evaluations = [(paths.of(active < 0), first[:0])], 0
@@ -121,14 +121,15 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
         radius = radii[paths.rays] * paths.t
         paths = _noted(paths, value)
         covered = (paths.outside > -torch.inf) & (paths.least <= -radius) | value.isnan()  # a broken field shows
-        step = value.abs().clamp(min=shortest).maximum(radius / 2)
+        # At least a few units in the last place, so that a ray far away ends too.
+        step = value.abs().clamp(min=shortest).maximum(radius / 2).maximum(4 * torch.finfo(value.dtype).eps * paths.t)
         to = paths.t + step
         piece = torch.searchsorted(ends, paths.rays * span + to.double(), right=True)
         over = piece >= pieces.offsets[paths.rays + 1]
         start = pieces.starts[piece.clamp(max=len(ends) - 1)]
         gap = ~over & (start > to + shortest)
         clear = (value > radius) | over | gap
-        meets = covered | clear & (paths.least < radius)
+        meets = covered | clear & (paths.least < radius) & (paths.least > -torch.inf)
         share = torch.where(covered, 1.0, (0.5 - 0.5 * paths.least / radius).clamp(max=1))
         met.append((paths.of(meets), share[meets]))
         to, going = torch.maximum(to, start), ~covered & ~over

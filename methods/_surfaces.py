@@ -12,6 +12,7 @@ from torch import Tensor
 from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.device import HostValue
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.base import DensityFunction, Field
@@ -28,6 +29,7 @@ from nerfloom.losses.surfaces import (
     SurfacePoints,
 )
 from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
+from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.renderer import Renderer
@@ -46,6 +48,8 @@ SHARPER = 50.0
 """Multiple of the first inverse width that its bound has reached when it ends."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
+LONGEST, EVERY = 4.0, 16
+"""Maximum length of a training step, in steps of `num_steps`, and the number of training steps between its changes."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,7 @@ class SurfaceConfig(
         "start_sharpness": (1e-3, 1e6),
         "sharpness_learning_rate": AT_LEAST_0,
         "sharpen_until": (0, 1),
+        "step_widths": AT_LEAST_0,
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
@@ -106,6 +111,8 @@ class SurfaceConfig(
     """First inverse width of the surface, in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
+    step_widths: float = 2.0
+    """Length of a training step, in inverse widths of the surface; from one to four steps of --num-steps. 0: one."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
     sharpen_until: float = 0.8
@@ -213,6 +220,7 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
 class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
     """A model that learns the distance to a surface, and its colour."""
 
+    step_scale: Tensor
     losses = (
         SurfaceColorError(),
         SamplerLoss(),
@@ -232,11 +240,19 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
         edges = self.surface.box[1] - self.surface.box[0]
         self.surface.cell = float((edges / config.grid_resolution).norm())
+        self.register_buffer("step_scale", torch.tensor(1.0))
+        self._step_scale = HostValue()
 
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
         until = self.config.sharpen_until
         self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
+        for sampler in parts(self, OccupancySampler):
+            if step % EVERY == 0:
+                width = self.config.step_widths / float(self.surface.sharpness().detach())
+                scale = min(max(width / sampler.step_size, 1.0), LONGEST)
+                self._step_scale.change(self.step_scale, round(scale * 64) / 64)
+            sampler.stride = self._step_scale.of(self.step_scale)
 
     @property
     def surface(self) -> SurfaceField:

@@ -26,7 +26,7 @@ from nerfloom.samplers.inside import inside_foreground
 
 
 @dataclass(frozen=True)
-class VolSDFConfig(SurfaceConfig):
+class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Settings of volsdf."""
 
     samplers: ClassVar[tuple[str, ...]] = ("occupancy", "error-bounded")

@@ -29,8 +29,10 @@ from nerfloom.losses.surfaces import (
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.method import Method
 from nerfloom.registry import load_method
+from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
 from nerfloom.samplers.background import foreground_sphere
+from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.trainer import Trainer
@@ -106,6 +108,26 @@ def test_cells_that_hold_a_surface_are_occupied(name: str) -> None:
     around = field.density_around(Points(places()))[0]
     moved = places() + field.cell * torch.nn.functional.normalize(torch.randn(500, 3), dim=-1) * 0.99
     assert bool((field.density(Points(moved))[0] <= around * 1.1).all())
+
+
+@pytest.mark.parametrize(("sharpness", "widths", "scale"), [(0.25, 2.0, 4.0), (0.25, 0.75, 3.0), (8.0, 2.0, 1.0)])
+def test_steps_are_as_long_as_the_surface_is_wide(sharpness: float, widths: float, scale: float) -> None:
+    """`sharpness` is in inverse steps; the length lies between one and four steps, and pictures keep theirs."""
+    trainer = trainer_of("neus", step_widths=widths)
+    (sampler,) = parts(trainer.model, OccupancySampler)
+    field = trainer.model.field
+    with torch.no_grad():
+        field.sharpness.exponent.fill_(math.log(sharpness / sampler.step_size) / field.sharpness.SPEED)
+    trainer.model.before_step(0, 0.0)
+    assert trainer.model.step_scale.item() == pytest.approx(scale, abs=0.02)
+    rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
+    lengths = []
+    for training in (True, False):
+        samples = sampler.train(training).sample(rays, field, jitter=False)
+        lengths.append(samples.deltas.median().item() / sampler.step_size)
+    assert lengths == pytest.approx([scale, 1.0], rel=0.02)
+    trainer.model.before_step(1, 0.0)  # the same until it is asked again, as after a checkpoint
+    assert trainer.model.step_scale.item() == pytest.approx(scale, abs=0.02)
 
 
 @pytest.mark.medium

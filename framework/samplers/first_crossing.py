@@ -1,5 +1,4 @@
-"""Sphere tracing (Hart 1996) of a signed distance: one sample for each surface that a ray meets, up to the first that
-covers it.
+"""Sphere tracing of a signed distance (Hart 1996): samples where rays meet surfaces, up to one that covers the ray.
 
 A ray advances by the distance at its position, so it takes few steps far from a surface. It stays in occupied cells;
 the space between them counts as outside. A learnt distance is no exact one: steps are shortened by its slope at the
@@ -75,7 +74,7 @@ class _Paths(NamedTuple):
     was: Tensor
     """Signed distance there; positive in space that is not searched, negative before the first position."""
     least: Tensor
-    """Least distance since the ray was last clear of a surface; infinite if there was none."""
+    """Least distance since the ray was last clear of a surface; -infinity if it has never been."""
     nearest: Tensor
     """Distance along the ray at that place."""
     outside: Tensor
@@ -88,7 +87,7 @@ class _Paths(NamedTuple):
     """Signed distance at `inside`."""
 
     def of(self, chosen: Tensor) -> _Paths:
-        """Return the rays that a mask selects."""
+        """Return the rays that `chosen`, a mask, selects."""
         index = chosen.nonzero().squeeze(-1)
         return _Paths(*(column.index_select(0, index) for column in self))
 
@@ -111,8 +110,8 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     first = pieces.starts[pieces.offsets[:-1][active]]
     # The first piece may begin at the face of the box, behind which is the outside, or at the ray's own start.
     was = torch.where(first > rays.nears[active] + shortest, 1.0, -1.0).to(first)
-    none = torch.full_like(first, torch.inf)
-    paths = _Paths(active, first, first, was, none, first, -none, first, first, first)
+    unclear = torch.full_like(first, -torch.inf)
+    paths = _Paths(active, first, first, was, was * torch.inf, first, unclear, first, first, first)
     span = 2 * (float(pieces.ends.max()) + shortest) if len(active) else 1.0  # one number orders ray and distance
     ends = pieces.owners * span + pieces.ends.double()
     met, evaluations = [(paths.of(active < 0), first[:0])], 0
@@ -122,14 +121,15 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
         radius = radii[paths.rays] * paths.t
         paths = _noted(paths, value)
         covered = (paths.outside > -torch.inf) & (paths.least <= -radius) | value.isnan()  # a broken field shows
-        step = value.abs().clamp(min=shortest).maximum(radius / 2)
+        # At least a few units in the last place, so that a ray far away ends too.
+        step = value.abs().clamp(min=shortest).maximum(radius / 2).maximum(4 * torch.finfo(value.dtype).eps * paths.t)
         to = paths.t + step
         piece = torch.searchsorted(ends, paths.rays * span + to.double(), right=True)
         over = piece >= pieces.offsets[paths.rays + 1]
         start = pieces.starts[piece.clamp(max=len(ends) - 1)]
         gap = ~over & (start > to + shortest)
         clear = (value > radius) | over | gap
-        meets = covered | clear & (paths.least < radius)
+        meets = covered | clear & (paths.least < radius) & (paths.least > -torch.inf)
         share = torch.where(covered, 1.0, (0.5 - 0.5 * paths.least / radius).clamp(max=1))
         met.append((paths.of(meets), share[meets]))
         to, going = torch.maximum(to, start), ~covered & ~over
@@ -174,15 +174,18 @@ def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths, exact: flo
     """
     owners, (low, high, outside, inside) = entered.rays, entered[6:]
     at, left, evaluations = high.clone(), torch.arange(len(owners), device=owners.device), 0
+    side = torch.zeros_like(owners)
     for _ in range(REFINEMENTS):
         here = low + (high - low) * (outside / (outside - inside))
         value = distance(rays.points(owners, here))
         at[left], evaluations, is_outside = here, evaluations + len(here), value > 0
-        # The end that stays counts half, so that both ends approach.
-        outside, inside = torch.where(is_outside, value, outside / 2), torch.where(is_outside, inside / 2, value)
+        before, side = side, torch.where(is_outside, 1, -1)
+        half = torch.where(side == before, 0.5, 1.0).to(value)  # an end that stays twice, so that it approaches too
+        outside, inside = torch.where(is_outside, value, outside * half), torch.where(is_outside, inside * half, value)
         low, high = torch.where(is_outside, here, low), torch.where(is_outside, high, here)
         some = (value.abs() > exact).nonzero().squeeze(-1)
-        left, owners, low, high, outside, inside = (x[some] for x in (left, owners, low, high, outside, inside))
+        left, owners, side = left[some], owners[some], side[some]
+        low, high, outside, inside = (column[some] for column in (low, high, outside, inside))
     return at, evaluations
 
 

@@ -81,7 +81,8 @@ class Curvature(LossTerm):
     """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023), section 3.5.
 
     Each of some samples is compared with a place one sample's length away, in a random direction along its level set.
-    The term is the mean squared difference of their unit normals.
+    The term is the mean squared difference of their unit normals. It applies from the fraction `curvature_from` of the
+    training budget on.
     """
 
     def __init__(self) -> None:
@@ -89,9 +90,10 @@ class Curvature(LossTerm):
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
-        if samples is None or samples.features is None or not len(samples):
-            return None
         assert isinstance(field, SurfaceField)
+        early = field.progress < shown.model.config.curvature_from
+        if early or samples is None or samples.features is None or not len(samples):
+            return None
         first = int(torch.randint(EVERY, ()))
         normals = safe_normalize(samples.features[first::EVERY, :3])
         positions, lengths = samples.positions(shown.batch.rays)[first::EVERY], samples.deltas[first::EVERY]

@@ -99,7 +99,7 @@ class SurfaceConfig(
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
     """Fraction of the budget from which on that change has a weight: a surface has to find its place first."""
-    start_radius: float = 0.5
+    start_radius: float = 0.25
     """Radius of the ball that training starts from, in halves of the box's shortest edge."""
     start_sharpness: float = 20.0
     """First inverse width of the surface, in halves of the box's shortest edge."""

@@ -25,7 +25,6 @@ skipped; and for one in this many samples at a random place in the box."""
 
 BEHIND = 0.03
 """Thickness of what is taken for solid behind points of a reconstruction, in halves of the box's shortest edge."""
-
 ABSOLUTE = 0.1
 """Factor of the absolute error of colours, which is some ten times the squared error, so that the weights of the other
 terms suit both."""
@@ -78,7 +77,7 @@ class Silhouette(LossTerm):
 
 
 class Curvature(LossTerm):
-    """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023), section 3.5.
+    """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
     Each of some samples is compared with a place one sample's length away, in a random direction along its level set.
     The term is the mean squared difference of their unit normals. It applies from the fraction `curvature_from` of the
@@ -152,7 +151,7 @@ def known_points(batch: PixelBatch, box: Tensor) -> KnownPoints:
 
 
 class SurfacePoints(LossTerm):
-    """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022), equation 9.
+    """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022).
 
     It is the mean of how far |f| exceeds the point's standard deviation, in halves of the box's shortest edge.
     """

@@ -80,6 +80,7 @@ class SurfaceConfig(
         "points_loss_mult": AT_LEAST_0,
         "bounds_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
+        "curvature_from": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
         "sharpness_learning_rate": AT_LEAST_0,
@@ -103,9 +104,11 @@ class SurfaceConfig(
     """Weight of the distance at points of a reconstruction, where it should be 0."""
     bounds_loss_mult: float = 0.1
     """Weight of distances before such points that are negative, or larger than the distance to the point."""
-    curvature_loss_mult: float = 0.0
+    curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
-    start_radius: float = 0.5
+    curvature_from: float = 0.5
+    """Fraction of the budget from which on that change has a weight: a surface has to find its place first."""
+    start_radius: float = 0.25
     """Radius of the ball that training starts from, in halves of the box's shortest edge."""
     start_sharpness: float = 20.0
     """First inverse width of the surface, in halves of the box's shortest edge."""
@@ -245,7 +248,7 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
 
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
-        until = self.config.sharpen_until
+        self.surface.progress, until = progress, self.config.sharpen_until
         self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
         for sampler in parts(self, OccupancySampler):
             if step % EVERY == 0:

@@ -146,6 +146,8 @@ class SurfaceField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
         self.cell = 0.0
         """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
+        self.progress = 0.0
+        """Fraction of the training budget that is spent."""
 
     @property
     def grid(self) -> HashGrid:

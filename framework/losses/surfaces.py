@@ -25,7 +25,6 @@ skipped; and for one in this many samples at a random place in the box."""
 
 BEHIND = 0.03
 """Thickness of what is taken for solid behind points of a reconstruction, in halves of the box's shortest edge."""
-
 ABSOLUTE = 0.1
 """Factor of the absolute error of colours, which is some ten times the squared error, so that the weights of the other
 terms suit both."""
@@ -78,10 +77,11 @@ class Silhouette(LossTerm):
 
 
 class Curvature(LossTerm):
-    """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023), section 3.5.
+    """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
     Each of some samples is compared with a place one sample's length away, in a random direction along its level set.
-    The term is the mean squared difference of their unit normals.
+    The term is the mean squared difference of their unit normals. It applies from the fraction `curvature_from` of the
+    training budget on.
     """
 
     def __init__(self) -> None:
@@ -89,9 +89,10 @@ class Curvature(LossTerm):
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
-        if samples is None or samples.features is None or not len(samples):
-            return None
         assert isinstance(field, SurfaceField)
+        early = field.progress < shown.model.config.curvature_from
+        if early or samples is None or samples.features is None or not len(samples):
+            return None
         first = int(torch.randint(EVERY, ()))
         normals = safe_normalize(samples.features[first::EVERY, :3])
         positions, lengths = samples.positions(shown.batch.rays)[first::EVERY], samples.deltas[first::EVERY]
@@ -150,7 +151,7 @@ def known_points(batch: PixelBatch, box: Tensor) -> KnownPoints:
 
 
 class SurfacePoints(LossTerm):
-    """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022), equation 9.
+    """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022).
 
     It is the mean of how far |f| exceeds the point's standard deviation, in halves of the box's shortest edge.
     """

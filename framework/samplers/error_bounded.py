@@ -24,11 +24,11 @@ from nerfloom.kernels.surfaces.opacity import laplace_density
 from nerfloom.samplers.base import Sampler
 
 EPSILON = 0.1
-"""Largest error of the opacity: the paper's, appendix B."""
+"""Largest error of the opacity: that of the authors' code."""
 ROUNDS = 5
-"""Maximum number of times that samples are added: the paper's."""
+"""Maximum number of times that samples are added: that of the authors' code."""
 BISECTIONS = 10
-"""Steps of the bisection that finds the smallest beta for which the bound holds: the paper's."""
+"""Steps of the bisection that finds the smallest beta for which the bound holds, as in the authors' code."""
 PADDING = 1e-4
 """Added to the weights that samples are drawn from, so that every interval can be drawn."""
 MAX_EXPONENT = 60.0
@@ -36,7 +36,7 @@ MAX_EXPONENT = 60.0
 
 
 def nearest_in_intervals(distances: Tensor, lengths: Tensor) -> Tensor:
-    """Return the least distance to a surface within intervals: VolSDF, equation 14.
+    """Return the least distance to a surface within intervals: VolSDF, theorem 1.
 
     No surface is nearer than d to a place with the distance d. So the balls around the two ends are empty, and the
     nearest place to the interval outside both of them is the bound.
@@ -67,7 +67,7 @@ class Bounded(NamedTuple):
 
 
 def bounded_opacity(t: Tensor, distances: Tensor, beta: Tensor) -> Bounded:
-    """Return the opacity along rays, and a bound of its error: VolSDF, equations 9 to 12.
+    """Return the opacity along rays, and a bound of its error: VolSDF, section 3.3.
 
     Args:
         t: (R, S) sorted distances along the rays, scene units.

@@ -26,7 +26,7 @@ def test_a_person_is_masked_with_a_border_and_thin_lines_are_not() -> None:
     errors[20:22] = 0.1
     errors[130, ::7] = 0.1
     found = moving(errors, torch.tensor(1e-2))
-    assert bool(found[50:110, 80:110].all())
+    assert bool(found[52:108, 82:108].all())
     assert not bool(found[:40].any() | found[120:].any() | found[:, :74].any() | found[:, 116:].any())
 
 

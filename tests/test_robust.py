@@ -28,6 +28,8 @@ from nerfloom.losses.robust import (
     window_side,
 )
 from nerfloom.losses.term import RenderedBatch
+from nerfloom.losses.terms import COLOR_ERROR
+from nerfloom.ray_model import RayModel
 from nerfloom.registry import load_method
 from nerfloom.stress.scenes import Views, ball_views
 from nerfloom.stress.variants import with_distractors
@@ -169,6 +171,7 @@ def test_masked_pixels_of_a_patch_do_not_count_and_keypoints_follow() -> None:
     robust = RobustColors(load_method("instant-ngp").config, 24)
     weights = robust.pixel_weights(part.rgb + torch.linspace(0, 1, 10)[:, None], part, 10**9)  # single pixels
     assert float(weights[9]) == 0
+    assert part.weights is not None
     assert torch.equal(weights[:4], part.weights[:4])
 
 
@@ -178,11 +181,14 @@ def test_an_error_without_the_pixels_left_out_has_their_gradient_zero() -> None:
     config = dataclasses.replace(method.config, robust="percentile", robust_steps=0.0)
     data = with_distractors(BALL.train, 0.2)
     model, batch = method.build(config, data.scene), draw_batch(data, 1024, "black", patches=True)
+    assert isinstance(model, RayModel)
     rgb = (0.5 + 0.2 * torch.rand(len(batch), 3)).requires_grad_()
     rendered = dataclasses.replace(model.render(batch.rays, batch.background), rgb=rgb)
     shown = RenderedBatch(batch, rendered, model, 0)
-    value = model.losses[0](shown)
+    value = COLOR_ERROR(shown)
+    assert value is not None
     value.backward()
+    assert rgb.grad is not None
     wide, target = rgb.detach().double(), batch.rgb.double()
     errors = (wide - target).square().mean(-1)
     threshold = np.quantile(errors.numpy(), config.robust_quantile)
@@ -201,7 +207,8 @@ def test_an_error_without_the_pixels_left_out_has_their_gradient_zero() -> None:
 
 def test_a_step_in_one_native_call_has_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its value is the weighted mean square of its own colours, with the weights that the rule gave."""
-    given, made = [], RobustColors.pixel_weights
+    given: list[torch.Tensor] = []
+    made = RobustColors.pixel_weights
 
     def kept(*arguments: Any, **named: Any) -> torch.Tensor:
         given.append(made(*arguments, **named))

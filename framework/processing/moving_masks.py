@@ -21,10 +21,13 @@ from nerfloom.processing.images import save
 from nerfloom.processing.output import FINISHED
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.registry import load_dataparser, load_method
+from nerfloom.training.progress import ProgressBar
 from nerfloom.training.trainer import Trainer
 
-METHOD, SETTINGS = "nerfacto", {"max_num_iterations": None, "robust": "percentile", "vis": "none"}
-"""The method that looks for what moves, and its settings."""
+METHOD = "nerfacto"
+"""The method that looks for what moves."""
+SETTINGS: dict[str, Any] = {"max_num_iterations": None, "robust": "percentile", "vis": "none"}
+"""Its settings."""
 LONGER_SIDE = 400
 """Longer side of the images that it learns from, pixels, at least; images are reduced by 2, 4 or 8."""
 
@@ -86,9 +89,9 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     dataset, method = load_dataset(parsed, "train"), load_method(METHOD)
     config = from_plain(method.config, {**SETTINGS, **settings}, "masks")
     trainer = Trainer(method, config, dataset)
-    say(f"looking for what moves, {config.max_seconds:g} s")
-    for _ in trainer.steps():
-        pass
+    with ProgressBar(f"{METHOD}, to find what moves") as bar:
+        for report in trainer.steps():
+            bar.show(report)
     masks, names, share = found_masks(trainer.model, trainer.train_set, config.robust_quantile), [], 0.0
     for mask, path in zip(masks, parsed.image_paths, strict=True):
         name = Path(*path.relative_to(output).parts[1:]).as_posix()

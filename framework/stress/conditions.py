@@ -125,6 +125,7 @@ CONDITIONS = (
         _train(lambda d: with_distractors(d, DISTRACTED)),
         _fixed(robust="percentile", robust_steps=ROBUST_STEPS),
         reason="a dozen small photographs: what a disc hides is seen in few others",
+        may_refuse=True,
     ),
     # -- cameras
     Condition(

@@ -70,6 +70,8 @@ class RefNeRFConfig(
     """Allowed range of each numeric setting."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the paper's networks of 8 layers, for GPUs."""
+    max_resolution: Auto[int] = AUTO
+    """Cells per axis at the finest level. auto: a power of two, at least 1 cell per pixel of the images (hash-grid)."""
     learning_rate: Auto[float] = AUTO
     """Initial learning rate of Adam. auto: 0.01 on a hash grid, 0.0005 for the paper's networks."""
     hidden_width: Auto[int] = AUTO
@@ -83,7 +85,8 @@ class RefNeRFConfig(
     open_levels_until: float = 0.3
     """Fraction of the budget during which levels of the hash grid open, from coarse to fine (hash-grid)."""
     normal_loss_mult: Auto[float] = AUTO
-    """Weight of the difference between predicted normals and those of the density. auto: 0.0003 in the paper."""
+    """Weight of the difference between predicted normals and those of the density. auto: 0.003 on a hash grid, 0.0003
+    for the paper's networks."""
     orientation_loss_mult: float = 0.1
     """Weight of the penalty on predicted normals that face away from the camera."""
 
@@ -117,9 +120,12 @@ def decide(config: RefNeRFConfig, scene: Scene) -> tuple[RefNeRFConfig, list[Dec
         Choice("learning_rate", 1e-2 if on_grid else 5e-4, reason),
         Choice("hidden_width", 64 if on_grid else 256, reason),
         Choice("bottleneck_width", 16 if on_grid else 128, reason),
-        Choice("normal_loss_mult", 3e-4, reason),
+        Choice("normal_loss_mult", 3e-3 if on_grid else 3e-4, reason),
     )
-    return config, made + samples
+    finest = 2 ** (scene.image_size - 1).bit_length()
+    each = f"each of the images' {scene.image_size} pixels gets one or more"
+    config, cells = fill(config, Choice("max_resolution", finest, each, "finest cells along an axis"))
+    return config, made + samples + (cells if on_grid else [])
 
 
 def make_field(config: RefNeRFConfig, scene: Scene) -> ReflectiveField:

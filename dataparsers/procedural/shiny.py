@@ -43,7 +43,7 @@ DIFFUSE_ROUGHNESS = 0.6
 
 
 class Material(NamedTuple):
-    """How a solid reflects light.
+    """Reflection of light by a solid.
 
     Args:
         reflectance: share of light that it mirrors head-on; the rest is diffuse. More at grazing angles (Schlick 1994).

@@ -8,7 +8,6 @@ density's gradient (`nerfloom.fields.normals`).
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from dataclasses import replace
 from typing import ClassVar, NamedTuple
@@ -34,8 +33,9 @@ NORMALS, DIFFUSE, TINT, ROUGHNESS = slice(1, 4), slice(4, 7), slice(7, 10), 10
 """Columns of a point's outputs; the first is the log-density, or what softplus makes the density of."""
 NUM_OUTPUTS = 11
 """Number of these columns. The bottleneck, which the directional network takes, follows."""
-DIFFUSE_BIAS, ROUGHNESS_BIAS = -math.log(3.0), -1.0
-"""Added before the activation functions: dim diffuse colours and medium roughness at first (supplement)."""
+DIFFUSE_BIAS, ROUGHNESS_BIAS = -3.0, -1.0
+"""Added before the activation functions: medium roughness at first, and diffuse colours so dim that reflections learn
+before them. With the paper's -log 3 on a hash grid, the diffuse colours learnt all and the reflections went out."""
 TAP_DISTANCE = 1 / 512
 """Distance along each axis of the places between which a grid's density is compared, in shortest edges of the box."""
 
@@ -73,7 +73,12 @@ class Reflection(nn.Module):
 
     @staticmethod
     def num_inputs(bottleneck: int, bands: int) -> int:
-        """Return the number of features that the network takes."""
+        """Return the number of features that the network takes.
+
+        Args:
+            bottleneck: number B of features of the bottleneck.
+            bands: number of bands of the directional encoding.
+        """
         return num_features(bands) + 1 + bottleneck
 
     def forward(self, outputs: Tensor, directions: Tensor) -> Light:

@@ -11,12 +11,7 @@ COARSE_SHARE = 0.1
 
 
 class NormalPenalty(LossTerm):
-    """Mean over rays of a penalty of `normal_penalties`, which the renderer adds to its extras.
-
-    Args:
-        name: name of the penalty, "normals" or "orientation".
-        weight: factor of the term, or the name of the setting that holds it.
-    """
+    """Mean over rays of a penalty of `normal_penalties`, "normals" or "orientation", from the renderer's extras."""
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         rendered, key = shown.rendered, f"{self.name}_penalty"

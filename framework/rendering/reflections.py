@@ -28,12 +28,7 @@ EVERY = 4
 
 
 class ReflectionRenderer(VolumeRenderer):
-    """Volume rendering with the parts of colours and predicted normals or, in training, the normals' penalties.
-
-    Args:
-        unit_length: gradients are scaled within this distance from the camera, scene units; None for no scaling.
-        thin: samples are thinned below this fraction of the mean gradient; 0 for none.
-    """
+    """Volume rendering with the parts of colours and predicted normals or, in training, the normals' penalties."""
 
     outputs = (DIFFUSE, SPECULAR, NORMALS, ROUGHNESS)
 

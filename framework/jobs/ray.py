@@ -65,8 +65,7 @@ class Ray:
         if not waiting:
             return ledger.failures
         with _cluster(self.address) as ray:
-            for folder in {job.log.parent for job in waiting}:
-                _check_shared(ray, folder)
+            _check_shared(ray, Path(os.path.commonpath([job.log.parent for job in waiting])))
             _warn_of_room(ray, waiting)
             with stoppable() as stopped:
                 _run(ray, waiting, self.at_once or len(waiting), ledger, stopped)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class JobFlags:
-    """Where jobs run, and how many at a time."""
+    """Choose where jobs run, and how many at a time."""
 
     launcher: Literal["processes", "ray", "slurm"] = "processes"
     """What runs the jobs: processes on this machine, a Ray cluster, or Slurm by a script that is written. All leave the

@@ -112,6 +112,7 @@ def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
     """Return the measurements of a planned run; None if it is not finished or its images are not finite.
 
     Args:
+        planned: the run.
         conditions: the conditions of the comparison.
     """
     summary, evaluation = read_json(planned.folder / "summary.json"), read_json(planned.evaluation)

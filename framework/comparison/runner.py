@@ -57,7 +57,7 @@ def _gpus(device_type: str) -> int:
 
 
 def is_done(planned: PlannedRun) -> bool:
-    """Return whether a run is completely trained and evaluated, with finite images."""
+    """Return whether the run `planned` is completely trained and evaluated, with finite images."""
     summary, evaluation = read_json(planned.folder / "summary.json"), read_json(planned.evaluation)
     if not isinstance(summary, dict) or summary.get("interrupted") is not False or not isinstance(evaluation, dict):
         return False

@@ -25,7 +25,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Resources:
-    """What a job needs of the machine that it runs on.
+    """Needs of a job on the machine that runs it.
 
     Args:
         cores: number of CPU cores; None for all of a machine.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from nerfloom.base.console import say
 from nerfloom.jobs.job import Failure, Job
@@ -13,7 +13,7 @@ def nothing(job: Job) -> None:
     """Ignore a finished job."""
 
 
-class Launcher(Protocol):
+class Launcher(ABC):
     """A way to run jobs: on this machine, or on others that share its files.
 
     Jobs leave the same files whichever launcher runs them. A job that is finished is not run again, and one that was
@@ -21,9 +21,11 @@ class Launcher(Protocol):
     """
 
     @property
+    @abstractmethod
     def sharing(self) -> str | None:
-        """What a job's machine did besides, as a sentence for reports; None if jobs ran one after the other."""
+        """A sentence for reports on what a job's machine did besides; None if jobs ran one after the other."""
 
+    @abstractmethod
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
         """Run every unfinished job; failures are reported, and the other jobs continue.
 

@@ -18,11 +18,11 @@ from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import last_line
 from nerfloom.jobs.execution import execute
 from nerfloom.jobs.job import Failure, Job
-from nerfloom.jobs.launcher import Ledger, nothing
+from nerfloom.jobs.launcher import Launcher, Ledger, nothing
 
 
 @dataclass(frozen=True)
-class Processes:
+class Processes(Launcher):
     """The launcher of jobs on this machine.
 
     Args:
@@ -37,11 +37,9 @@ class Processes:
 
     @property
     def sharing(self) -> str | None:
-        """What a job's machine did besides."""
         return None if self.at_once == 1 else f"{self.at_once} runs at a time on one machine."
 
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
-        """Run every unfinished job, as in `Launcher.run`."""
         ledger = Ledger(jobs, on_finished)
         waiting = ledger.unfinished()
         places: Queue[Mapping[str, str]] = Queue()

@@ -25,7 +25,7 @@ from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import GRACE
 from nerfloom.jobs.execution import execute
 from nerfloom.jobs.job import Failure, Job
-from nerfloom.jobs.launcher import Ledger, nothing
+from nerfloom.jobs.launcher import Launcher, Ledger, nothing
 
 LOOK_EVERY = 0.2
 """Seconds between looks at a signal of the user while jobs run."""
@@ -36,7 +36,7 @@ PASSED_ON = "NERFLOOM_"
 
 
 @dataclass(frozen=True)
-class Ray:
+class Ray(Launcher):
     """The launcher of jobs on a Ray cluster.
 
     Args:
@@ -53,11 +53,9 @@ class Ray:
 
     @property
     def sharing(self) -> str | None:
-        """What a job's machine did besides."""
         return "Ray chose the machines, and may have run several at a time on one."
 
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
-        """Run every unfinished job, as in `Launcher.run`."""
         if (advice := install_command("cluster")) is not None:
             raise ConfigError(f"--launcher ray needs a package that is not installed: {advice}")
         ledger = Ledger(jobs, on_finished)
@@ -65,8 +63,7 @@ class Ray:
         if not waiting:
             return ledger.failures
         with _cluster(self.address) as ray:
-            for folder in {job.log.parent for job in waiting}:
-                _check_shared(ray, folder)
+            _check_shared(ray, Path(os.path.commonpath([job.log.parent for job in waiting])))
             _warn_of_room(ray, waiting)
             with stoppable() as stopped:
                 _run(ray, waiting, self.at_once or len(waiting), ledger, stopped)

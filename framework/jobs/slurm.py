@@ -15,14 +15,14 @@ from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, printable
 from nerfloom.jobs.job import Failure, Job, Step
-from nerfloom.jobs.launcher import Ledger, nothing
+from nerfloom.jobs.launcher import Launcher, Ledger, nothing
 
 SCRIPT = "jobs.sh"
 """Name of the script."""
 
 
 @dataclass(frozen=True)
-class Slurm:
+class Slurm(Launcher):
     """The launcher that writes a script for Slurm, and leaves it to the user to submit.
 
     Args:
@@ -39,11 +39,9 @@ class Slurm:
 
     @property
     def sharing(self) -> str | None:
-        """What a job's machine did besides."""
         return "Slurm chose the machines, and may have run several at a time on one."
 
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
-        """Write a script for the unfinished jobs; no job fails."""
         ledger = Ledger(jobs, on_finished)
         if waiting := ledger.unfinished():
             path = self.folder / SCRIPT

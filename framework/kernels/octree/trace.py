@@ -121,6 +121,7 @@ def _compiled(
     inputs = raw.contiguous(), coefficients.contiguous()
     placeholder = None
     if deferred is not None and torch.is_grad_enabled():  # autograd must see a reason to go backward
-        inputs, placeholder = tuple(values.detach() for values in inputs), torch.zeros(1, requires_grad=True)
+        inputs = inputs[0].detach(), inputs[1].detach()
+        placeholder = torch.zeros(1, requires_grad=True)
     rest = layout, contiguous(rays), background.contiguous(), stop, deferred
     return OctreeLight(*_Trace.apply(*inputs, placeholder, *rest))

@@ -20,9 +20,11 @@ from nerfloom.method import Method
 from nerfloom.registry import load_method
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
+from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
+from nerfloom.training.skipping import skip_report
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY, chosen, said_otherwise
 
@@ -96,6 +98,17 @@ def test_cells_that_hold_a_surface_are_occupied(name: str) -> None:
     around = field.density_around(Points(places()))[0]
     moved = places() + field.cell * torch.nn.functional.normalize(torch.randn(500, 3), dim=-1) * 0.99
     assert bool((field.density(Points(moved))[0] <= around * 1.1).all())
+
+
+def test_the_report_says_what_tracing_saves() -> None:
+    trainer = trainer_of("neus", max_num_iterations=5, eval_rendering="surface")
+    for _ in trainer.steps():
+        pass
+    rungs = {rung.name: rung for rung in skip_report(trainer)}
+    assert rungs["samples, traced"].switch == "--eval-rendering volume"
+    assert 0.2 < rungs["samples, traced"].skipped < 1  # a ball in a grid that is not known yet
+    assert rungs["the samples left, hidden"].skipped > 0  # of the volume, although pictures are traced
+    assert all(tracer.traces for tracer in parts(trainer.model, FirstCrossing))
 
 
 @pytest.mark.parametrize(("sharpness", "widths", "scale"), [(0.25, 2.0, 4.0), (0.25, 0.75, 3.0), (8.0, 2.0, 1.0)])

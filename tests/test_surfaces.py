@@ -117,6 +117,7 @@ def test_steps_are_as_long_as_the_surface_is_wide(sharpness: float, widths: floa
     trainer = trainer_of("neus", step_widths=widths)
     (sampler,) = parts(trainer.model, OccupancySampler)
     field = trainer.model.field
+    assert isinstance(field, SurfaceField)
     with torch.no_grad():
         field.sharpness.exponent.fill_(math.log(sharpness / sampler.step_size) / field.sharpness.SPEED)
     trainer.model.before_step(0, 0.0)

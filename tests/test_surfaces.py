@@ -32,9 +32,11 @@ from nerfloom.registry import load_method
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
 from nerfloom.samplers.background import foreground_sphere
+from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
+from nerfloom.training.skipping import skip_report
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY, chosen, said_otherwise
 
@@ -110,12 +112,24 @@ def test_cells_that_hold_a_surface_are_occupied(name: str) -> None:
     assert bool((field.density(Points(moved))[0] <= around * 1.1).all())
 
 
+def test_the_report_says_what_tracing_saves() -> None:
+    trainer = trainer_of("neus", max_num_iterations=5, eval_rendering="surface")
+    for _ in trainer.steps():
+        pass
+    rungs = {rung.name: rung for rung in skip_report(trainer)}
+    assert rungs["samples, traced"].switch == "--eval-rendering volume"
+    assert 0 <= rungs["samples, traced"].skipped < 1
+    assert "instead of" in rungs["samples, traced"].says
+    assert all(tracer.traces for tracer in parts(trainer.model, FirstCrossing))
+
+
 @pytest.mark.parametrize(("sharpness", "widths", "scale"), [(0.25, 2.0, 4.0), (0.25, 0.75, 3.0), (8.0, 2.0, 1.0)])
 def test_steps_are_as_long_as_the_surface_is_wide(sharpness: float, widths: float, scale: float) -> None:
     """`sharpness` is in inverse steps; the length lies between one and four steps, and pictures keep theirs."""
     trainer = trainer_of("neus", step_widths=widths)
     (sampler,) = parts(trainer.model, OccupancySampler)
     field = trainer.model.field
+    assert isinstance(field, SurfaceField)
     with torch.no_grad():
         field.sharpness.exponent.fill_(math.log(sharpness / sampler.step_size) / field.sharpness.SPEED)
     trainer.model.before_step(0, 0.0)

@@ -127,7 +127,7 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
         with _tracing(tracers, True):
             seconds, evaluated = _probe(model, rays)[0], sum(tracer.evaluations for tracer in tracers)
         says = _along_rays("if pictures are traced (--eval-rendering surface)", count, evaluated, usual / seconds)
-        share = 1 - evaluated / max(count, 1)
+        share = max(1 - evaluated / max(count, 1), 0.0)
         rungs.append(Rung("samples, traced", share, usual / seconds, "--eval-rendering volume", says))
     if drawn is not None and (kept is None or len(drawn) < len(kept)):  # otherwise masks alone choose the drawn pixels
         share = 1 - len(drawn) / len(trainer.train_set.pixels if kept is None else kept)

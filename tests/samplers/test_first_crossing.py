@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.metrics import psnr
+from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.samplers.first_crossing import FirstCrossing, Pieces, crossings
 from nerfloom.testing.ball import RADIUS
@@ -219,5 +220,5 @@ def test_a_learnt_ball_is_drawn_as_its_volume(name: str) -> None:
     assert (surface.extras["normals"] * volume.extras["normals"]).sum(-1)[solid].median() > 0.98
     points = view.camera.pixel_rays(view.pixels().reshape(-1)[solid.reshape(-1)], 0.0, 10.0)
     where = points.origins + points.directions * surface.depth[solid][:, None]
-    distances = trainer.model.field.shape(where).distances.abs()
-    assert distances.quantile(0.95) < 1e-3 * RADIUS
+    distances, _ = model.signed_distance(Points(where))
+    assert distances.abs().quantile(0.95) < 1e-3 * RADIUS

@@ -1,29 +1,23 @@
-"""NeRF-W: its loss, compositing of two parts, what held-out views show, and what it learns behind distractors."""
+"""NeRF-W: its loss, compositing of two parts, what held-out views show, and where transient vectors are."""
 
 import dataclasses
-from pathlib import Path
 
-import imageio.v3 as iio
 import pytest
 import torch
 from torch import Tensor
 
 from nerfloom import Field, Points, Rays, Samples
-from nerfloom.dataparsers.procedural import Procedural
-from nerfloom.dataparsers.procedural.photographs import SHOWN
-from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.fields.transient import TransientHead
+from nerfloom.losses.functions import doubted_error
 from nerfloom.methods import nerf_w
-from nerfloom.methods.nerf_w import START, TransientHead, WildRenderer, doubted_error
-from nerfloom.registry import load_method
+from nerfloom.methods.nerf_w import START, WildRenderer
 from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
 from nerfloom.testing.ball import cameras_at
-from nerfloom.training.datasets import load_split
-from nerfloom.training.run import Run, create_folder
-from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY
 
 LEAST = 0.1
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
 
 def test_the_loss_is_the_likelihood_of_a_normal_distribution() -> None:
@@ -70,7 +64,7 @@ class Given(TransientHead):
     """A transient part of given values, the same in every image."""
 
     def __init__(self, density: Tensor, color: Tensor, doubt: Tensor) -> None:
-        super().__init__(3, 2, 1, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.eye(3, 4).repeat(4, 1, 1))
+        super().__init__(3, 2, 1, 8, BOX, torch.eye(3, 4).repeat(4, 1, 1), 0.1)
         self.given = density, color, doubt
 
     def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -136,7 +130,7 @@ def test_rays_of_no_training_image_show_the_static_part() -> None:
 def test_before_training_the_transient_part_is_nearly_transparent() -> None:
     box = torch.tensor([[-3.0] * 3, [3.0] * 3])
     torch.manual_seed(0)
-    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1))
+    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1), START / half_edge(box))
     positions = 6 * torch.rand(1000, 3) - 3
     density, color, doubt = head(torch.randn(1000, 16), positions, torch.randn(1000, 16))
     assert density.shape == doubt.shape == (1000,)
@@ -151,7 +145,7 @@ def test_before_training_the_transient_part_is_nearly_transparent() -> None:
 def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
     """Each image's vectors are linear over it, so that what is looked up is that function of the pixel's place."""
     cameras = cameras_at(torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-3.0, 1, 2]]), 40, 9)
-    head = TransientHead(16, 3, resolution, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]), cameras.camera_to_worlds)
+    head = TransientHead(16, 3, resolution, 8, BOX, cameras.camera_to_worlds, 0.1)
     head.reach.fill_(float((cameras.widths / cameras.fx).max()) / 2)
     place = torch.linspace(-1, 1, resolution) if resolution > 1 else torch.zeros(1)
     row, column = torch.meshgrid(place, place, indexing="ij")
@@ -172,33 +166,3 @@ def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
 @pytest.mark.medium
 def test_the_papers_networks_pass() -> None:
     assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))
-
-
-# -- learning behind distractors --------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_it_learns_what_is_behind_people(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clean held-out views are better than those of instant-ngp, and images are doubted where the truth says so."""
-    monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path / "cache"))
-    parser = Procedural(size=64, num_train=40, courtyard=True, distractors=0.2)
-    found = {}
-    for name in ("instant-ngp", "nerf-w"):
-        settings = {"log2_table_size": 14, "grid_resolution": 64, "num_steps": 256, "samples_per_batch": 2**14}
-        config = dataclasses.replace(load_method(name).config, max_num_iterations=600, vis="none", **settings)
-        run = Run(name, config, "procedural", parser, tmp_path / name)
-        create_folder(run)
-        trainer = Trainer.of(run, load_split(run, "train"))
-        trainer.train()
-        found[name] = evaluate(trainer.model, load_split(run, "test")).results["psnr"]
-    model, training = trainer.model, load_split(run, "train")
-    doubted, moving = [], []
-    for index in range(0, 40, 4):
-        doubted.append(model.render_view(training.view(index), model.background).of("uncertainty"))
-        path = parser.parse(None, "train").image_paths[index]
-        moving.append(torch.from_numpy(iio.imread(path.with_name(f"{path.stem}_truth.png"))) == SHOWN)
-    where, doubt = torch.stack(moving), torch.stack(doubted)
-    means = float(doubt[where].mean()), float(doubt[~where].mean())
-    print(f"clean views: {found}; uncertainty of distractors {means[0]:.3f}, elsewhere {means[1]:.3f}")
-    assert found["nerf-w"] > found["instant-ngp"] + 0.5
-    assert means[0] > 1.5 * means[1]

@@ -1,25 +1,16 @@
-"""NeRF-W: its loss, compositing of two parts, what held-out views show, and what it learns behind distractors."""
+"""NeRF-W: its loss, compositing of two parts, what held-out views show, and where transient vectors are."""
 
 import dataclasses
-from pathlib import Path
-
-import imageio.v3 as iio
 import pytest
 import torch
 from torch import Tensor
 
 from nerfloom import Field, Points, Rays, Samples
-from nerfloom.dataparsers.procedural import Procedural
-from nerfloom.dataparsers.procedural.photographs import SHOWN
-from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.methods import nerf_w
 from nerfloom.methods.nerf_w import START, TransientHead, WildRenderer, doubted_error
-from nerfloom.registry import load_method
 from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
-from nerfloom.training.datasets import load_split
-from nerfloom.training.run import Run, create_folder
-from nerfloom.training.trainer import Trainer
+from nerfloom.testing.ball import cameras_at
 from tests.training.helpers import TINY
 
 LEAST = 0.1
@@ -69,10 +60,10 @@ class Given(TransientHead):
     """A transient part of given values, the same in every image."""
 
     def __init__(self, density: Tensor, color: Tensor, doubt: Tensor) -> None:
-        super().__init__(3, 2, 4, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        super().__init__(3, 2, 1, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.eye(3, 4).repeat(4, 1, 1))
         self.given = density, color, doubt
 
-    def forward(self, features: Tensor, positions: Tensor, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return self.given
 
 
@@ -89,27 +80,24 @@ def two_parts() -> tuple[Rays, Samples, Slabs, Given]:
 
 
 def test_two_parts_are_composited_as_many_thin_slices() -> None:
-    """Reference: 20,000 slices of each interval, whose light is that of equation 8."""
+    """Reference: 20,000 slices of each interval, whose light is that of equation 8; and equation 11."""
     rays, samples, field, head = two_parts()
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     found = WildRenderer(head, LEAST, None).render(rays, samples, field, background)
     density, color, doubt = (x.double() for x in head.given)
     count = 20_000
     for ray in range(2):
-        passed, rgb, transient, uncertain, static, alone = (
-            1.0,
-            *torch.zeros(2, 3).double(),
-            LEAST,
-            torch.zeros(3).double(),
-            1.0,
-        )
+        passed = alone = hazy = 1.0  # transmittance of both parts, of the static one, and of the transient one
+        rgb, transient, static = torch.zeros(3, 3).double()
+        uncertain = torch.tensor(LEAST).double()
         for i in range(5 * ray, 5 * ray + 5):
             thin = float(samples.deltas[i]) / count
             one, other = (-torch.expm1(-x * thin) for x in (field.sigma[i], density[i]))
             ahead = passed * torch.exp(-(field.sigma[i] + density[i]) * thin * torch.arange(count).double()).sum()
             rgb = rgb + ahead * (one * field.rgb[i] + other * color[i])
             transient = transient + ahead * other * color[i]
-            uncertain = uncertain + ahead * other * doubt[i]
+            uncertain = uncertain + hazy * -torch.expm1(-density[i] * samples.deltas[i]) * doubt[i]
+            hazy = hazy * torch.exp(-density[i] * samples.deltas[i])
             passed = passed * torch.exp(-(field.sigma[i] + density[i]) * samples.deltas[i])
             static = static + alone * -torch.expm1(-field.sigma[i] * samples.deltas[i]) * field.rgb[i]
             alone = alone * torch.exp(-field.sigma[i] * samples.deltas[i])
@@ -138,47 +126,39 @@ def test_rays_of_no_training_image_show_the_static_part() -> None:
 def test_before_training_the_transient_part_is_nearly_transparent() -> None:
     box = torch.tensor([[-3.0] * 3, [3.0] * 3])
     torch.manual_seed(0)
-    head = TransientHead(16, 16, 5, 64, box)
-    positions, images = 6 * torch.rand(1000, 3) - 3, torch.randint(5, (1000,))
-    density, color, doubt = head(torch.randn(1000, 16), positions, images)
+    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1))
+    positions = 6 * torch.rand(1000, 3) - 3
+    density, color, doubt = head(torch.randn(1000, 16), positions, torch.randn(1000, 16))
     assert density.shape == doubt.shape == (1000,)
     assert color.shape == (1000, 3)
     assert float(density.median()) * 2 * half_edge(box) < 4 * START  # optical depth across the box
     assert float(doubt.min()) > 0
-    other = head(torch.zeros(1, 16), torch.zeros(1, 3), torch.tensor([1]))
-    assert not torch.equal(other[1], head(torch.zeros(1, 16), torch.zeros(1, 3), torch.tensor([2]))[1])
+    other = head(torch.zeros(1, 16), torch.zeros(1, 3), torch.ones(1, 16))
+    assert not torch.equal(other[1], head(torch.zeros(1, 16), torch.zeros(1, 3), torch.zeros(1, 16))[1])
+
+
+@pytest.mark.parametrize("resolution", [1, 2, 5])
+def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
+    """Each image's vectors are linear over it, so that what is looked up is that function of the pixel's place."""
+    cameras = cameras_at(torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-3.0, 1, 2]]), 40, 9)
+    head = TransientHead(16, 3, resolution, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]), cameras.camera_to_worlds)
+    head.reach.fill_(float((cameras.widths / cameras.fx).max()) / 2)
+    place = torch.linspace(-1, 1, resolution) if resolution > 1 else torch.zeros(1)
+    row, column = torch.meshgrid(place, place, indexing="ij")
+    with torch.no_grad():
+        maps = torch.stack([torch.stack([column, row, torch.full_like(row, i)], -1) for i in range(3)])
+        head.vectors.copy_(maps.view(-1, 3))
+    for index in range(3):
+        rays = cameras.pixel_rays(cameras.image_pixels(index).flatten(), 1.0, 9.0)
+        found = head.vectors_of(rays)
+        assert found is not None
+        across = (torch.arange(9) + 0.5) / 4.5 - 1
+        down, along = torch.meshgrid(-across, across, indexing="ij")  # the camera's y axis points up
+        linear = torch.stack([along, down], -1).view(-1, 2) if resolution > 1 else torch.zeros(81, 2)
+        torch.testing.assert_close(found[:, :2], linear, atol=1e-5, rtol=0)
+        assert bool((found[:, 2] == index).all())
 
 
 @pytest.mark.medium
 def test_the_papers_networks_pass() -> None:
     assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))
-
-
-# -- learning behind distractors --------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_it_learns_what_is_behind_people(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clean held-out views are better than those of instant-ngp, and images are doubted where the truth says so."""
-    monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path / "cache"))
-    parser = Procedural(size=64, num_train=40, courtyard=True, distractors=0.2)
-    found = {}
-    for name in ("instant-ngp", "nerf-w"):
-        settings = {"log2_table_size": 14, "grid_resolution": 64, "num_steps": 256, "samples_per_batch": 2**14}
-        config = dataclasses.replace(load_method(name).config, max_num_iterations=600, vis="none", **settings)
-        run = Run(name, config, "procedural", parser, tmp_path / name)
-        create_folder(run)
-        trainer = Trainer.of(run, load_split(run, "train"))
-        trainer.train()
-        found[name] = evaluate(trainer.model, load_split(run, "test")).results["psnr"]
-    model, training = trainer.model, load_split(run, "train")
-    doubted, moving = [], []
-    for index in range(0, 40, 4):
-        doubted.append(model.render_view(training.view(index), model.background).of("uncertainty"))
-        path = parser.parse(None, "train").image_paths[index]
-        moving.append(torch.from_numpy(iio.imread(path.with_name(f"{path.stem}_truth.png"))) == SHOWN)
-    where, doubt = torch.stack(moving), torch.stack(doubted)
-    means = float(doubt[where].mean()), float(doubt[~where].mean())
-    print(f"clean views: {found}; uncertainty of distractors {means[0]:.3f}, elsewhere {means[1]:.3f}")
-    assert found["nerf-w"] > found["instant-ngp"] + 0.5
-    assert means[0] > 1.5 * means[1]

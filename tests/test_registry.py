@@ -19,6 +19,7 @@ BUILT_IN = {
     "mip-nerf",
     "mip-nerf-360",
     "nerf-plus-plus",
+    "nerf-w",
     "nerfacto",
     "neus",
     "pixel-nerf",

@@ -37,6 +37,8 @@ from nerfloom.training.trainer import BetweenSteps, Trainer
 
 MAX_PICTURES = 4
 """Maximum number of held-out views whose pictures are written at the end."""
+MAX_TRAINING = 3
+"""Maximum number of training images whose pictures are written, if the method shows what they have alone."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
 
@@ -197,6 +199,10 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     if evaluation.warning is not None:
         say(f"warning: {evaluation.warning}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
+    if any(output.of_training for output in trainer.model.outputs):
+        folder = run.folder / "pictures" / "training"
+        evaluate(trainer.model, trainer.train_set, max_images=MAX_TRAINING, pictures=folder, title="Training images")
+        say(f"what training images have alone: {folder}")
 
 
 def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:

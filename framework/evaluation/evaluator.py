@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -310,7 +310,9 @@ def _judge(
     """Return the report on a view, and its images."""
     target = composite(dataset.image(index).float() / 255, background)
     with held_out_appearance(model, dataset, index, background):
-        picture, spent = timed_view(model, dataset.view(index), background)
+        picture, spent = timed_view(model, view := dataset.view(index), background)
+    if view.image is None:
+        picture = replace(picture, outputs=tuple(output for output in picture.outputs if not output.of_training))
     rgb = picture.rgb.clamp(0, 1)
     if round_to_uint8:
         rgb = (rgb * 255).round() / 255

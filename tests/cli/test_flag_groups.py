@@ -20,8 +20,8 @@ from nerfloom.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerfacto", "neus",
-    "pixel-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
+    "neus", "pixel-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
 )  # fmt: skip
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""

@@ -54,9 +54,10 @@ TINY: dict[str, dict[str, Any]] = {
         "num_levels": 4,
         "max_resolution": 64,
         "log2_table_size": 12,
-        "grid_resolution": 16,
-        "num_steps": 64,
-        "samples_per_batch": 4096,
+        "num_proposal_samples": (24, 12),
+        "num_nerf_samples": 8,
+        "num_rays_per_batch": 256,
+        "transient_resolution": 4,
     },
     "nerf-w+frequency": {
         "encoding": "frequency",

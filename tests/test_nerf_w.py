@@ -1,6 +1,7 @@
 """NeRF-W: its loss, compositing of two parts, what held-out views show, and where transient vectors are."""
 
 import dataclasses
+
 import pytest
 import torch
 from torch import Tensor

@@ -59,7 +59,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
-        self.robust = None if config.robust == "off" else RobustColors(config, scene.image_size)
+        self.robust = None if config.robust == "off" else RobustColors(config)
         self.poses: PoseRefinement | None = None
         """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)

@@ -123,7 +123,7 @@ def test_a_running_quantile_follows_batches_of_any_size(count: int) -> None:
     assert abs(np.mean(np.log10(found[100:])) - wanted) < 0.1
     assert np.std(np.log10(found[100:])) < 0.15
     if count == 256:
-        assert np.std(np.log10(exact)) > 0.4  # of one batch alone
+        assert np.std(np.log10(exact)) > 0.12  # of one batch alone
 
 
 def test_a_quantile_of_what_is_not_finite_or_does_not_count() -> None:
@@ -133,24 +133,26 @@ def test_a_quantile_of_what_is_not_finite_or_does_not_count() -> None:
     assert float(error_quantile(error_counts(errors, counted), 0.5)) == pytest.approx(1e-3, rel=0.02)
 
 
-def test_patches_are_whole_and_hold_the_pixels_they_are_drawn_around() -> None:
+@pytest.mark.parametrize("stride", [1, 3])
+def test_patches_are_whole_and_start_in_their_image(stride: int) -> None:
     cameras = BALL.train.cameras
     sizes = dataclasses.replace(
         cameras,
         widths=torch.tensor([40, 9, 16] * 4),
-        heights=torch.tensor([17, 50, 5] * 4),
+        heights=torch.tensor([17, 50, 3] * 4),
     )
     pixels = torch.randint(int(sizes.offsets[-1]), (500,), generator=torch.Generator().manual_seed(0))
-    found = patches_around(pixels, sizes).view(-1, PATCH, PATCH)
+    found = patches_around(pixels, sizes, stride).view(-1, PATCH, PATCH)
     images = torch.searchsorted(sizes.offsets, found, right=True) - 1
     assert bool((images == images[:, :1, :1]).all())
     within, widths = found - sizes.offsets[images], sizes.widths[images]
     rows, columns = within // widths, within % widths
-    assert bool((found == pixels[:, None, None]).flatten(1).any(1).all())
+    inner = (found == pixels[:, None, None]).flatten(1).any(1)
+    assert bool(inner.all()) if stride == 1 else float(inner.float().mean()) > 0.3  # others were moved inside
     for places, lengths, axis in ((rows, sizes.heights, 1), (columns, sizes.widths, 2)):
         steps = places.diff(dim=axis)
-        whole = lengths[images[:, 0, 0]] >= PATCH
-        assert bool((steps[whole] == 1).all())
+        whole = lengths[images[:, 0, 0]] > stride * (PATCH - 1)
+        assert bool((steps[whole] == stride).all())
         assert bool((steps >= 0).all())
         assert bool((places < lengths[images]).all())
 
@@ -168,7 +170,7 @@ def test_masked_pixels_of_a_patch_do_not_count_and_keypoints_follow() -> None:
     assert float(batch.weights.mean()) == pytest.approx(1, rel=1e-5)
     part = batch[torch.arange(10)]
     assert (part.patches, len(part)) == (0, 10)
-    robust = RobustColors(load_method("instant-ngp").config, 24)
+    robust = RobustColors(load_method("instant-ngp").config)
     weights = robust.pixel_weights(part.rgb + torch.linspace(0, 1, 10)[:, None], part, 10**9)  # single pixels
     assert float(weights[9]) == 0
     assert part.weights is not None
@@ -193,7 +195,7 @@ def test_an_error_without_the_pixels_left_out_has_their_gradient_zero() -> None:
     errors = (wide - target).square().mean(-1)
     threshold = np.quantile(errors.numpy(), config.robust_quantile)
     every = np.stack(
-        [by_loops(e, threshold, np.ones((PATCH, PATCH), bool)) for e in errors.view(4, PATCH, PATCH).numpy()]
+        [by_loops(e, threshold, np.ones((PATCH, PATCH), bool)) for e in errors.view(-1, PATCH, PATCH).numpy()]
     )
     left = torch.from_numpy(every.reshape(-1))
     assert 0 < float((~left).double().mean()) < 0.25
@@ -229,7 +231,7 @@ def test_a_step_in_one_native_call_has_the_same_weights(monkeypatch: pytest.Monk
 
 
 def test_at_first_all_pixels_count_and_later_only_those_that_agree() -> None:
-    robust = RobustColors(dataclasses.replace(load_method("instant-ngp").config, robust_steps=100.0), 80)
+    robust = RobustColors(dataclasses.replace(load_method("instant-ngp").config, robust_steps=100.0))
     target = torch.zeros(80, 80, 3)
     rgb = target + 0.01
     rgb[20:60, 20:60] = 0.5

@@ -7,8 +7,9 @@ covers a connected region. RobustNeRF (Sabour et al. 2023) counts a pixel as an 
 - if most of the 3 x 3 pixels around it are below, so that single pixels of fine texture count, or
 - if enough of the 16 x 16 pixels around its tile of 8 x 8 are below, so that edges in an agreeing region count.
 
-The errors of all other pixels have no effect. In small images, where somebody covers fewer pixels, the third rule has
-windows of 8 x 8 or 4 x 4 pixels and tiles of half their side.
+The errors of all other pixels have no effect. Patches of rays have 4 x 4 pixels, spread over the same area
+(`data/pixels/patches.py`), around a tile of 2 x 2. In whole images the third rule has windows of 16, 8 or 4 pixels, by
+their size, around tiles of half the side.
 
 SpotLessSplats (Sabour et al. 2024) takes the quantile from a running histogram and counts all pixels at first: a pixel
 is counted anyway with a probability that falls exponentially with the steps.
@@ -24,13 +25,12 @@ from torch.nn.functional import avg_pool2d, pad
 
 from nerfloom.base.config import RobustConfig
 from nerfloom.data.pixels.batch import PixelBatch
-from nerfloom.data.pixels.patches import PATCH
+from nerfloom.data.pixels.patches import PATCH, PATCHES_ALONG
 
 NEIGHBOURS, MOST = 3, 0.5
 """Side of a pixel's neighbourhood, and the share of it that must be exceeded."""
-ENOUGH, WINDOWS_ALONG = 0.6, 25
-"""Share of a window around a tile that must be exceeded, and the number of windows along an image's longer side; a
-window's side is the nearest power of two, from 4 to PATCH pixels."""
+ENOUGH, MAX_WINDOW = 0.6, 16
+"""Share of a window around a tile that must be exceeded, and the largest side of a window in whole images, pixels."""
 BINS_PER_DECADE, DECADES = 128, 8
 """Bins of the histogram of squared errors for a factor of 10, and the number of such factors below 1."""
 RECENT_PIXELS, KEPT_BY_IMAGE = 16_384, 0.95
@@ -76,10 +76,10 @@ def window_side(image_side: int) -> int:
     Args:
         image_side: longer side of the image, pixels.
     """
-    return min(max(2 ** round(math.log2(max(image_side / WINDOWS_ALONG, 1))), 4), PATCH)
+    return min(max(2 ** round(math.log2(max(image_side / PATCHES_ALONG, 1))), 4), MAX_WINDOW)
 
 
-def inliers(errors: Tensor, threshold: Tensor, window: int = PATCH, counted: Tensor | None = None) -> Tensor:
+def inliers(errors: Tensor, threshold: Tensor, window: int, counted: Tensor | None = None) -> Tensor:
     """Return the pixels of patches that other images do not contradict: RobustNeRF (Sabour et al. 2023), section 4.2.
 
     Tiles lie a quarter of a window or more inside, so that their windows do; a patch of one window has one tile.
@@ -136,15 +136,13 @@ class RobustColors(nn.Module):
 
     Args:
         config: settings of the rule.
-        image_side: longer side of the largest training image, pixels.
     """
 
     counts: Tensor
     """Histogram of recent squared errors."""
 
-    def __init__(self, config: RobustConfig, image_side: int) -> None:
+    def __init__(self, config: RobustConfig) -> None:
         super().__init__()
-        self.window = window_side(image_side)
         self.quantile, self.steps = config.robust_quantile, config.robust_steps
         self.register_buffer("counts", torch.zeros(DECADES * BINS_PER_DECADE))
 
@@ -174,9 +172,7 @@ class RobustColors(nn.Module):
         self._learn(errors, known, max(1 - len(errors) / RECENT_PIXELS, 0))
         first, threshold = batch.patches * PATCH**2, self.threshold
         of_patches, known_there = (each[:first].view(batch.patches, PATCH, PATCH) for each in (errors, known))
-        found = torch.cat(
-            [inliers(of_patches, threshold, self.window, known_there).view(-1), errors[first:] < threshold]
-        )
+        found = torch.cat([inliers(of_patches, threshold, PATCH, known_there).view(-1), errors[first:] < threshold])
         weights = self._drawn(found, step).to(errors)
         return weights if batch.weights is None else weights * batch.weights
 

@@ -162,7 +162,7 @@ def test_masked_pixels_of_a_patch_do_not_count_and_keypoints_follow() -> None:
     mask[::3] = mask[1::7] = True
     kept = PixelSet.of_mask(mask)
     dataset = dataclasses.replace(BALL.train, kept=kept, drawn=kept)
-    batch = draw_batch(dataset, 3 * PATCH**2 + 40, "black", patches=True)
+    batch = draw_batch(dataset, 3 * PATCH**2 + 4, "black", patches=True)
     assert batch.patches == 3
     assert len(batch) == 3 * PATCH**2
     assert batch.weights is not None

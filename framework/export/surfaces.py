@@ -19,7 +19,7 @@ from nerfloom.training.trainer import Trainer
 MAX_PASSES = 16
 """Maximum number of times that rays are drawn, since some end on no surface."""
 
-ROBUST_SHARE = 0.1
+ROBUST_SHARE = 0.5
 """Maximum of `robust_steps` relative to the number of steps, which are few."""
 
 
@@ -66,7 +66,9 @@ def found_surfaces(
         background=config.background,
     )
     robust = {"robust": config.robust, "robust_quantile": config.robust_quantile}
-    settings = from_plain(settings, {**robust, "robust_steps": min(config.robust_steps, ROBUST_SHARE * steps)}, "start")
+    settings = from_plain(
+        settings, {**robust, "robust_steps": min(config.robust_steps, int(ROBUST_SHARE * steps))}, "start"
+    )
     trainer = Trainer(method, settings, dataset)
     for report in track(trainer.steps(), "Looking for surfaces", total=steps):
         if report.seconds >= seconds:

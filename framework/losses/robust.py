@@ -11,8 +11,9 @@ The errors of all other pixels have no effect. Patches of rays have 4 x 4 pixels
 (`data/pixels/patches.py`), around a tile of 2 x 2. In whole images the third rule has windows of 16, 8 or 4 pixels, by
 their size, around tiles of half the side.
 
-SpotLessSplats (Sabour et al. 2024) takes the quantile from a running histogram and counts all pixels at first: a pixel
-is counted anyway with a probability that falls exponentially with the steps.
+SpotLessSplats (Sabour et al. 2024) takes the quantile from a running histogram, and counts all pixels at first. Here
+all pixels count in the first steps, and rays come in patches only afterwards: before there is a scene, large errors are
+the scene itself.
 """
 
 from __future__ import annotations
@@ -36,8 +37,6 @@ BINS_PER_DECADE, DECADES = 128, 8
 RECENT_PIXELS, KEPT_BY_IMAGE = 16_384, 0.95
 """Number of single pixels that the histogram remembers, as many as a batch of RobustNeRF; and the share that remains
 of it after each whole image, as in SpotLessSplats."""
-CERTAIN_UNTIL = 8
-"""Multiple of `robust_steps` after which no pixel is counted anyway: the probability is then 0.0003."""
 
 
 def error_counts(errors: Tensor, counted: Tensor | None = None) -> Tensor:
@@ -151,50 +150,42 @@ class RobustColors(nn.Module):
         """The squared error () below which a pixel agrees with the other images."""
         return error_quantile(self.counts, self.quantile)
 
-    def varies(self, step: int) -> bool:
-        """Return whether the share of pixels that count anyway still changes.
+    def waits(self, step: int) -> bool:
+        """Return whether all pixels still count.
 
         Args:
             step: number of training steps done.
         """
-        return step < CERTAIN_UNTIL * self.steps
+        return step < self.steps
 
-    def pixel_weights(self, rgb: Tensor, batch: PixelBatch, step: int) -> Tensor:
+    def pixel_weights(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
         """Return the factors (P,) of the colour errors of a batch: its own, and 0 for pixels that do not count.
 
         Args:
             rgb: (P, 3) rendered colours.
             batch: P pixels with their true colours.
-            step: number of training steps done.
         """
         errors = (rgb.detach() - batch.rgb).square().mean(-1)
         known = torch.ones_like(errors, dtype=torch.bool) if batch.weights is None else batch.weights > 0
         self._learn(errors, known, max(1 - len(errors) / RECENT_PIXELS, 0))
         first, threshold = batch.patches * PATCH**2, self.threshold
         of_patches, known_there = (each[:first].view(batch.patches, PATCH, PATCH) for each in (errors, known))
-        found = torch.cat([inliers(of_patches, threshold, PATCH, known_there).view(-1), errors[first:] < threshold])
-        weights = self._drawn(found, step).to(errors)
+        found = inliers(of_patches, threshold, PATCH, known_there).view(-1)
+        weights = torch.cat([found, errors[first:] < threshold]).to(errors)
         return weights if batch.weights is None else weights * batch.weights
 
-    def image_pixels(self, rgb: Tensor, target: Tensor, counted: Tensor | None, step: int) -> Tensor:
+    def image_pixels(self, rgb: Tensor, target: Tensor, counted: Tensor | None) -> Tensor:
         """Return the pixels (H, W) bool of a training image that count.
 
         Args:
             rgb: (H, W, 3) rendered colours.
             target: (H, W, 3) true colours.
             counted: (H, W) bool, pixels that masks keep; None for all.
-            step: number of training steps done.
         """
         errors = (rgb.detach() - target).square().mean(-1)
         self._learn(errors, counted, KEPT_BY_IMAGE)
-        found = self._drawn(image_inliers(errors, self.threshold, counted), step)
+        found = image_inliers(errors, self.threshold, counted)
         return found if counted is None else found & counted
 
     def _learn(self, errors: Tensor, counted: Tensor | None, kept: float) -> None:
         self.counts.mul_(kept).add_(error_counts(errors, counted))
-
-    def _drawn(self, found: Tensor, step: int) -> Tensor:
-        """Return inliers and, with a probability that falls with the steps, other pixels."""
-        if not self.varies(step):
-            return found
-        return found | (torch.rand(found.shape, device=found.device) < math.exp(-step / self.steps))

@@ -55,7 +55,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
 
     def __init__(self, config: SplattingConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
-        self.robust = None if config.robust == "off" else RobustColors(config, scene.image_size)
+        self.robust = None if config.robust == "off" else RobustColors(config)
         self.position_rate = config.rate_factor * config.position_rate
         self.columns = self.declared_columns()
         for name, column in self.columns.items():

@@ -59,7 +59,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
-        self.robust = None if config.robust == "off" else RobustColors(config, scene.image_size)
+        self.robust = None if config.robust == "off" else RobustColors(config)
         self.poses: PoseRefinement | None = None
         """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
@@ -102,7 +102,8 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         if not self.plain or self.poses is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
-        weigh = None if self.robust is None else partial(self.robust.pixel_weights, batch=batch, step=step)
+        robust = None if self.robust is None or self.robust.waits(step) else self.robust
+        weigh = None if robust is None else partial(robust.pixel_weights, batch=batch)
         parts, thin = (self.sampler, self.field, self.renderer), self.config.thin_gradients
         return error_of_traced(batch.rays, pixels, *parts, thin, weigh)
 
@@ -173,8 +174,8 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         for term in self.losses:
             if (reason := term.varies(self.config)) is not None:
                 return StepKind(varies=reason)
-        if self.robust is not None and self.robust.varies(step):
-            return StepKind(varies="the share of pixels that count in any case still falls")
+        if self.robust is not None and self.robust.waits(step):
+            return StepKind(varies="all pixels still count")
         if not all(opening.complete for opening in parts(self, OpenLevels)):
             return StepKind(varies="levels are still opening")
         return self.sampler.step_kind(step)

@@ -130,9 +130,10 @@ def test_steps_are_as_long_as_the_surface_is_wide(sharpness: float, widths: floa
     (sampler,) = parts(trainer.model, OccupancySampler)
     field = trainer.model.field
     assert isinstance(field, SurfaceField)
+    field.sharpness.first = sharpness / sampler.step_size  # the least value
     with torch.no_grad():
         field.sharpness.exponent.fill_(math.log(sharpness / sampler.step_size) / field.sharpness.SPEED)
-    trainer.model.before_step(0, 0.0)
+    trainer.model.before_step(0, 1.0)
     assert trainer.model.step_scale.item() == pytest.approx(scale, abs=0.02)
     rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
     lengths = []
@@ -140,7 +141,7 @@ def test_steps_are_as_long_as_the_surface_is_wide(sharpness: float, widths: floa
         samples = sampler.train(training).sample(rays, field, jitter=False)
         lengths.append(samples.deltas.median().item() / sampler.step_size)
     assert lengths == pytest.approx([scale, 1.0], rel=0.02)
-    trainer.model.before_step(1, 0.0)  # the same until it is asked again, as after a checkpoint
+    trainer.model.before_step(1, 1.0)  # the same until it is asked again, as after a checkpoint
     assert trainer.model.step_scale.item() == pytest.approx(scale, abs=0.02)
 
 

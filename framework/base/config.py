@@ -147,7 +147,7 @@ class TrainConfig:
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
-    robust_quantile, robust_steps = 0.8, 500.0
+    robust_quantile, robust_steps = 0.8, 1_000
 
     def __init_subclass__(cls, **defaults: Any) -> None:
         """Change defaults of inherited settings, as in `class MyConfig(RayConfig, learning_rate=1e-2)`.
@@ -195,8 +195,8 @@ class RobustConfig(TrainConfig):
     out regions with large errors (RobustNeRF, SpotLessSplats); off: learn from all pixels."""
     robust_quantile: float = 0.8
     """Share of pixels that agree with the other images for certain (percentile); fine texture and edges are added."""
-    robust_steps: float = 500.0
-    """Steps after which the share of pixels that count in any case has fallen to 37 % (percentile); 0: none does."""
+    robust_steps: int = 1_000
+    """Steps during which all pixels count, until there is a scene that images can contradict (percentile)."""
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ class PixelSource(BatchSource):
         keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
         clear: (M,) distances from cameras that images show to be empty; None if they are not used.
         num_images: number of images that the pixels of a step come from; None for all.
-        patches: whether pixels come in square patches.
+        patches_from: step from which on pixels come in square patches; None for single pixels.
     """
 
     def __init__(
@@ -120,9 +120,9 @@ class PixelSource(BatchSource):
         keypoints: float = 0.0,
         clear: Tensor | None = None,
         num_images: int | None = None,
-        patches: bool = False,
+        patches_from: int | None = None,
     ) -> None:
-        self.clear, self.num_images, self.patches = clear, num_images, patches
+        self.clear, self.num_images, self.patches_from = clear, num_images, patches_from
         self.dataset, self.background, self.seed = dataset, background, seed
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
@@ -150,9 +150,12 @@ class PixelSource(BatchSource):
             return batch
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
 
+    def _in_patches(self, step: int) -> bool:
+        return self.patches_from is not None and step >= self.patches_from
+
     def _look_up(self, step: int) -> LookUp | None:
         """Return the function that looks up a step's colours read ahead from a file; None if none are."""
-        if self.dataset.mapped is None or self.num_images is not None or self.patches:
+        if self.dataset.mapped is None or self.num_images is not None or self._in_patches(step):
             return None
         self.stream = self.stream or PixelStream(self.dataset, self.seed)
         return partial(self.stream.look_up, step)
@@ -165,7 +168,7 @@ class PixelSource(BatchSource):
             keypoints=self.keypoints,
             clear=self.clear,
             num_images=self.num_images,
-            patches=self.patches,
+            patches_from=self.patches_from,
         )
         source.errors = self.errors
         return source
@@ -266,7 +269,7 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
-    patches, by_error = config.robust != "off", config.draw_by_error
-    if patches and by_error:
+    by_error, patches_from = config.draw_by_error, None if config.robust == "off" else config.robust_steps
+    if patches_from is not None and by_error:
         raise ConfigError("--draw-by-error prefers large errors, and --robust leaves them out: choose one of them")
-    return PixelSource(dataset, background, config.machine.seed, by_error, keypoints, clear, num_images, patches)
+    return PixelSource(dataset, background, config.machine.seed, by_error, keypoints, clear, num_images, patches_from)

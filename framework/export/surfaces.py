@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import TrainConfig, from_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.points import SurfacePoints, joined, surface_points
@@ -18,9 +18,6 @@ from nerfloom.training.trainer import Trainer
 
 MAX_PASSES = 16
 """Maximum number of times that rays are drawn, since some end on no surface."""
-
-ROBUST_SHARE = 0.1
-"""Maximum of `robust_steps` relative to the number of steps, which are few."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ def found_surfaces(
         method: the method of the field, which casts rays: instant-ngp, or nerfacto where there may be something outside
             the scene's box, which instant-ngp does not see.
         dataset: the images.
-        config: settings of the calling run; machine, background and the robust loss are used.
+        config: settings of the calling run; machine and background are used.
         steps: maximum number of training steps of the field.
         seconds: maximum training time of the field, seconds; infinity for no limit.
         count: maximum number of points.
@@ -65,8 +62,6 @@ def found_surfaces(
         machine=config.machine,
         background=config.background,
     )
-    robust = {"robust": config.robust, "robust_quantile": config.robust_quantile}
-    settings = from_plain(settings, {**robust, "robust_steps": min(config.robust_steps, ROBUST_SHARE * steps)}, "start")
     trainer = Trainer(method, settings, dataset)
     for report in track(trainer.steps(), "Looking for surfaces", total=steps):
         if report.seconds >= seconds:

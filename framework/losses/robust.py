@@ -7,11 +7,13 @@ covers a connected region. RobustNeRF (Sabour et al. 2023) counts a pixel as an 
 - if most of the 3 x 3 pixels around it are below, so that single pixels of fine texture count, or
 - if enough of the 16 x 16 pixels around its tile of 8 x 8 are below, so that edges in an agreeing region count.
 
-The errors of all other pixels have no effect. In small images, where somebody covers fewer pixels, the third rule has
-windows of 8 x 8 or 4 x 4 pixels and tiles of half their side.
+The errors of all other pixels have no effect. Patches of rays have 4 x 4 pixels, spread over the same area
+(`data/pixels/patches.py`), around a tile of 2 x 2. In whole images the third rule has windows of 16, 8 or 4 pixels, by
+their size, around tiles of half the side.
 
-SpotLessSplats (Sabour et al. 2024) takes the quantile from a running histogram and counts all pixels at first: a pixel
-is counted anyway with a probability that falls exponentially with the steps.
+SpotLessSplats (Sabour et al. 2024) takes the quantile from a running histogram, and counts all pixels at first. Here
+all pixels count in the first steps, and rays come in patches only afterwards: before there is a scene, large errors are
+the scene itself.
 """
 
 from __future__ import annotations
@@ -24,20 +26,17 @@ from torch.nn.functional import avg_pool2d, pad
 
 from nerfloom.base.config import RobustConfig
 from nerfloom.data.pixels.batch import PixelBatch
-from nerfloom.data.pixels.patches import PATCH
+from nerfloom.data.pixels.patches import PATCH, PATCHES_ALONG
 
 NEIGHBOURS, MOST = 3, 0.5
 """Side of a pixel's neighbourhood, and the share of it that must be exceeded."""
-ENOUGH, WINDOWS_ALONG = 0.6, 25
-"""Share of a window around a tile that must be exceeded, and the number of windows along an image's longer side; a
-window's side is the nearest power of two, from 4 to PATCH pixels."""
+ENOUGH, MAX_WINDOW = 0.6, 16
+"""Share of a window around a tile that must be exceeded, and the largest side of a window in whole images, pixels."""
 BINS_PER_DECADE, DECADES = 128, 8
 """Bins of the histogram of squared errors for a factor of 10, and the number of such factors below 1."""
 RECENT_PIXELS, KEPT_BY_IMAGE = 16_384, 0.95
 """Number of single pixels that the histogram remembers, as many as a batch of RobustNeRF; and the share that remains
 of it after each whole image, as in SpotLessSplats."""
-CERTAIN_UNTIL = 8
-"""Multiple of `robust_steps` after which no pixel is counted anyway: the probability is then 0.0003."""
 
 
 def error_counts(errors: Tensor, counted: Tensor | None = None) -> Tensor:
@@ -76,10 +75,10 @@ def window_side(image_side: int) -> int:
     Args:
         image_side: longer side of the image, pixels.
     """
-    return min(max(2 ** round(math.log2(max(image_side / WINDOWS_ALONG, 1))), 4), PATCH)
+    return min(max(2 ** round(math.log2(max(image_side / PATCHES_ALONG, 1))), 4), MAX_WINDOW)
 
 
-def inliers(errors: Tensor, threshold: Tensor, window: int = PATCH, counted: Tensor | None = None) -> Tensor:
+def inliers(errors: Tensor, threshold: Tensor, window: int, counted: Tensor | None = None) -> Tensor:
     """Return the pixels of patches that other images do not contradict: RobustNeRF (Sabour et al. 2023), section 4.2.
 
     Tiles lie a quarter of a window or more inside, so that their windows do; a patch of one window has one tile.
@@ -136,15 +135,13 @@ class RobustColors(nn.Module):
 
     Args:
         config: settings of the rule.
-        image_side: longer side of the largest training image, pixels.
     """
 
     counts: Tensor
     """Histogram of recent squared errors."""
 
-    def __init__(self, config: RobustConfig, image_side: int) -> None:
+    def __init__(self, config: RobustConfig) -> None:
         super().__init__()
-        self.window = window_side(image_side)
         self.quantile, self.steps = config.robust_quantile, config.robust_steps
         self.register_buffer("counts", torch.zeros(DECADES * BINS_PER_DECADE))
 
@@ -153,52 +150,42 @@ class RobustColors(nn.Module):
         """The squared error () below which a pixel agrees with the other images."""
         return error_quantile(self.counts, self.quantile)
 
-    def varies(self, step: int) -> bool:
-        """Return whether the share of pixels that count anyway still changes.
+    def waits(self, step: int) -> bool:
+        """Return whether all pixels still count.
 
         Args:
             step: number of training steps done.
         """
-        return step < CERTAIN_UNTIL * self.steps
+        return step < self.steps
 
-    def pixel_weights(self, rgb: Tensor, batch: PixelBatch, step: int) -> Tensor:
+    def pixel_weights(self, rgb: Tensor, batch: PixelBatch) -> Tensor:
         """Return the factors (P,) of the colour errors of a batch: its own, and 0 for pixels that do not count.
 
         Args:
             rgb: (P, 3) rendered colours.
             batch: P pixels with their true colours.
-            step: number of training steps done.
         """
         errors = (rgb.detach() - batch.rgb).square().mean(-1)
         known = torch.ones_like(errors, dtype=torch.bool) if batch.weights is None else batch.weights > 0
         self._learn(errors, known, max(1 - len(errors) / RECENT_PIXELS, 0))
         first, threshold = batch.patches * PATCH**2, self.threshold
         of_patches, known_there = (each[:first].view(batch.patches, PATCH, PATCH) for each in (errors, known))
-        found = torch.cat(
-            [inliers(of_patches, threshold, self.window, known_there).view(-1), errors[first:] < threshold]
-        )
-        weights = self._drawn(found, step).to(errors)
+        found = inliers(of_patches, threshold, PATCH, known_there).view(-1)
+        weights = torch.cat([found, errors[first:] < threshold]).to(errors)
         return weights if batch.weights is None else weights * batch.weights
 
-    def image_pixels(self, rgb: Tensor, target: Tensor, counted: Tensor | None, step: int) -> Tensor:
+    def image_pixels(self, rgb: Tensor, target: Tensor, counted: Tensor | None) -> Tensor:
         """Return the pixels (H, W) bool of a training image that count.
 
         Args:
             rgb: (H, W, 3) rendered colours.
             target: (H, W, 3) true colours.
             counted: (H, W) bool, pixels that masks keep; None for all.
-            step: number of training steps done.
         """
         errors = (rgb.detach() - target).square().mean(-1)
         self._learn(errors, counted, KEPT_BY_IMAGE)
-        found = self._drawn(image_inliers(errors, self.threshold, counted), step)
+        found = image_inliers(errors, self.threshold, counted)
         return found if counted is None else found & counted
 
     def _learn(self, errors: Tensor, counted: Tensor | None, kept: float) -> None:
         self.counts.mul_(kept).add_(error_counts(errors, counted))
-
-    def _drawn(self, found: Tensor, step: int) -> Tensor:
-        """Return inliers and, with a probability that falls with the steps, other pixels."""
-        if not self.varies(step):
-            return found
-        return found | (torch.rand(found.shape, device=found.device) < math.exp(-step / self.steps))

@@ -38,7 +38,9 @@ class RenderedBatch:
     def weights(self) -> Tensor | None:
         """Factors (P,) of the pixels' colour errors: the batch's, and 0 for pixels that a robust loss leaves out."""
         batch, robust = self.batch, self.model.robust
-        return batch.weights if robust is None else robust.pixel_weights(self.pixels.rgb, batch, self.step)
+        if robust is None or robust.waits(self.step):
+            return batch.weights
+        return robust.pixel_weights(self.pixels.rgb, batch)
 
 
 class LossTerm(ABC):

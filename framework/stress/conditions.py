@@ -29,7 +29,7 @@ If test views are easier than the plain ones (all white, black or transparent), 
 degrees), the maximum is `MAX_LOSS`.
 """
 
-DISTRACTED, ROBUST_STEPS = 0.1, 50.0
+DISTRACTED, ROBUST_STEPS = 0.1, 100
 """Share of pixels that distractors cover, and `robust_steps` of such a short run."""
 A_THIRD = "a third of the steps teach nothing, as they should"
 

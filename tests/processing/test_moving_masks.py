@@ -60,7 +60,7 @@ def test_what_moves_is_masked_in_files_that_the_format_reads(tmp_path: Path) -> 
         "max_num_iterations": 250,
         "log2_table_size": 14,
         "num_rays_per_batch": 1024,
-        "robust_steps": 50.0,
+        "robust_steps": 100,
     }
     mask_moving(tmp_path / "data", 1, **small)
     parsed = load_dataparser("nerfstudio")().parse(tmp_path / "data", "train")

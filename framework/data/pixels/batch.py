@@ -14,7 +14,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.depths import ray_distances
 from nerfloom.data.pixels.error_map import ErrorMap
-from nerfloom.data.pixels.patches import PATCH, patches_around
+from nerfloom.data.pixels.patches import PATCH, patch_stride, patches_around
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.argument_checks import check_indices
@@ -206,7 +206,7 @@ def draw_batch(
     flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
     stored = None
     if patches:
-        flat = patches_around(flat, dataset.cameras)
+        flat = patches_around(flat, dataset.cameras, patch_stride(dataset.scene.image_size))
         uniform, count = len(flat), len(flat) + keypoints
     if not dataset.resident:
         stored = dataset.stored(flat) if look_up is None else look_up(flat).to(dataset.device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.dispatch import CPP
-from nerfloom.kernels.octree.layout import OctreeLayout, cells_of
+from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.leaf_gradient import LeafGradient
 from nerfloom.kernels.octree.light import MAX_DEGREE, OctreeLight, error_bound
 from nerfloom.kernels.octree.trace import trace_octree
@@ -104,23 +104,6 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
             deferred = density.deferred, color.deferred
         stop = STOP if self.training else stop
         return trace_octree(self.layout, density.table, color.table, rays, background, stop, deferred)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Return where the leaves are, for a checkpoint."""
-        layout = self.layout
-        numbers = torch.tensor([*layout.origin.tolist(), layout.cell], dtype=torch.float64)
-        return {"grid": numbers, "size": list(layout.size), "places": layout.places(), "masks": layout.masks}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Place leaves as in a checkpoint, before their values are loaded.
-
-        Raises:
-            ValueError: if the state is of no octree.
-        """
-        numbers, cells = state["grid"].tolist(), cells_of(state["places"], state["masks"])
-        layout, _ = OctreeLayout.build(torch.tensor(numbers[:3]), numbers[3], state["size"], cells)
-        count, width = layout.num_leaves, self.colors.table.shape[1]
-        self.set_octree(layout, torch.zeros(count, 1), torch.zeros(count, width))
 
     @property
     def largest(self) -> float:

@@ -90,15 +90,15 @@ def fitted_colors(model: RayModel, centers: Tensor, size: float, seen: Seen, deg
         away = centers[part, None] - seen.positions[order]
         directions = torch.nn.functional.normalize(away, dim=-1)
         with model.rendering():
-            colors = _colors(model.field, centers[part], directions, size)
-        out[part] = fitted(directions, colors, weights + 1e-3, degree)
+            found = _colors(model.field, centers[part].to(model.device), directions.to(model.device), size)
+        out[part] = fitted(directions, found.cpu(), weights + 1e-3, degree)
     return out
 
 
 def _colors(field: Field, positions: Tensor, directions: Tensor, size: float) -> Tensor:
     """Return the field's colours (B, D, 3) at positions (B, 3) in directions (B, D, 3)."""
     count, number = directions.shape[:2]
-    points = Points(positions, None, torch.full((count,), size / 2)).sized(size / 12**0.5)
+    points = Points(positions, None, torch.full((count,), size / 2, device=positions.device)).sized(size / 12**0.5)
     features = field.density(points)[1]
     repeated = features.repeat_interleave(number, 0)
     return field.color(repeated, directions.reshape(-1, 3)).float().view(count, number, 3)

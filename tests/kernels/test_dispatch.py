@@ -42,6 +42,10 @@ from nerfloom.kernels.march.occupancy import REFRESH_OCCUPANCY, Occupancy
 from nerfloom.kernels.march.ray_order import SORT_BY_RAY
 from nerfloom.kernels.march.waves import MARCH, March, march
 from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, NETWORK
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.packed import TRACE_PACKED, PackedLeaves
+from nerfloom.kernels.octree.trace import TRACE_OCTREE
+from nerfloom.kernels.octree.weights import RAISE_WEIGHTS
 from nerfloom.kernels.rows import GATHER_ROWS
 from nerfloom.kernels.splats.blend import BLEND
 from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
@@ -103,6 +107,17 @@ def grid_density() -> GridDensity:
     size = BOX[1] - BOX[0]
     table, weights = 4 * torch.rand(GRID.num_entries, 2) - 2, [torch.randn(8, 6), torch.randn(5, 8)]
     return GridDensity(1 / size, -BOX[0] / size, table, GRID, None, weights)
+
+
+def octree() -> OctreeLayout:
+    """40 leaves around the origin."""
+    cells = torch.stack([torch.arange(40) % 7, torch.arange(40) % 11, torch.arange(40) % 13], -1)
+    return OctreeLayout.build(torch.full((3,), -1.0), 0.125, (2, 2, 2), cells + 1)[0]
+
+
+def packed_leaves() -> PackedLeaves:
+    codes, colors = (torch.randint(256, shape, dtype=torch.uint8) for shape in ((40,), (40, 27)))
+    return PackedLeaves(codes, torch.linspace(0, 0.1, 256), colors, rand(27) / 255, rand(27))
 
 
 def excluded() -> Tensor:
@@ -188,6 +203,9 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     FILL: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 100, None, (2048, 2048)),
     REACH: lambda: (fill(*CASES[FILL]()).placed, rand(2048), 4.6, 100),
     TRACE: lambda: (marched(), grid_density()),
+    TRACE_OCTREE: lambda: (octree(), rand(40, 1) - 4, rand(40, 12), rays(), rand(100, 3)),
+    TRACE_PACKED: lambda: (octree(), packed_leaves(), rays(), rand(100, 3)),
+    RAISE_WEIGHTS: lambda: (octree(), rand(40, 1) - 4, rays(), torch.zeros(40)),
     TRACED_COLORS: lambda: (marched(), grid_density(), grid_color(), rand(100, 3)),
     TRACED_ERROR: lambda: (marched(), grid_density(), grid_color(), PixelTargets(rand(100, 3), rand(25, 3), rand(25))),
     REFRESH_OCCUPANCY: lambda: (torch.rand(200) * 0.4, torch.zeros(200, dtype=torch.bool), 0.9, 0.05, 0.01),

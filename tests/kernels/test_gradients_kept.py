@@ -44,6 +44,8 @@ from nerfloom.kernels.histograms.intervals import (
 from nerfloom.kernels.histograms.step_functions import blurred_excess, blurred_excess_reference
 from nerfloom.kernels.images.ssim import photometric_loss, photometric_reference
 from nerfloom.kernels.networks.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.trace import trace_octree, trace_octree_reference
 from nerfloom.kernels.splats.blend import blend, blend_reference
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists
@@ -65,6 +67,7 @@ GRID = HashGridLayout.build(3, 4, 20, 8)
 PLANES = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
 BANDS: tuple[Band, ...] = ((0, 0, 1, 3), (0, 2, 0, 7), (1, 1, 9, 1), (1, 1, 8, 2))
 OFFSETS = torch.tensor([0, 3, 3, 8, 12])
+TREE = OctreeLayout.build(torch.zeros(3), 0.1, (1, 1, 1), torch.cartesian_prod(*[torch.arange(1, 8, 2)] * 3))[0]
 Function = Callable[..., Tensor]
 
 
@@ -95,6 +98,12 @@ class DeferredVariation(torch.autograd.Function):
         ctx.found.backward(grad)
         found: Tensor = ctx.deferred.summed(ctx.table.detach())
         return found
+
+
+def rays_through_tree() -> Rays:
+    random = torch.Generator().manual_seed(0)
+    targets, origins = 0.8 * torch.rand(40, 3, generator=random), torch.randn(40, 3, generator=random)
+    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), fars=torch.full((40,), 9.0))
 
 
 def rand(*shape: int) -> Tensor:
@@ -391,6 +400,14 @@ OPERATIONS = {
         },
         ("camera_rays",),
     ),
+    "octree": Operation(
+        lambda raw, coefficients: trace_octree(TREE, raw, coefficients, rays_through_tree(), torch.ones(3)).color,
+        lambda raw, coefficients: trace_octree_reference(
+            TREE, raw, coefficients, rays_through_tree(), torch.ones(40, 3)
+        ).color,
+        lambda: {"raw": rand(TREE.num_leaves, 1), "coefficients": rand(TREE.num_leaves, 12)},
+        ("octree_trace", "octree_trace_backward"),
+    ),
     "colours": Operation(
         lambda behind: gather_colors(COLORS, torch.arange(9), behind)[0],
         lambda behind: gather_colors_reference(COLORS, torch.arange(9), behind)[0],
@@ -411,6 +428,7 @@ WITHOUT_A_GRADIENT = {
     "hash_grid_tangent_forward",  # of the optimiser; and refused where a gradient is asked for
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
     "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
+    "octree_weights", "octree_adam", "octree_trace_packed",  # documented to have none; of the optimiser; of bytes
     "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for
 }  # fmt: skip
 

@@ -33,6 +33,11 @@ MUTANTS = {
             "in normalised device coordinates cameras that stand before or behind the middle see shifted pictures",
             "test_ndc.py::test_rays_are_where_the_projection_matrix_puts_their_points"),
     ],
+    "nerfloom.kernels.octree.layout": [
+        Mutant("octree-too-far", "_with_distances", "near[0, 0] == 0", "near[0, 0] > -1",
+            "rays through an octree jump over leaves", "kernels/test_octree.py"
+            "::test_distances_between_bricks_are_those_by_brute_force"),
+    ],
     "nerfloom.cameras.poses": [
         Mutant("held-out-in-order-of-files", "held_out", "sorted(A, key=lambda index: names[index])", "list(A)",
             "which photographs are held out depends on their order in the file, so figures are not nerfstudio's",

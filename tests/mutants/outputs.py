@@ -124,6 +124,11 @@ MUTANTS = {
             "meshes show density where the renderer never looks",
             "export/test_density.py::test_cells_that_the_renderer_skips_are_empty_and_not_evaluated"),
     ],
+    "nerfloom.export.octree_colors": [
+        Mutant("octree-colours-unweighted", "fitted", "weights / A", "torch.ones_like(weights) / weights.shape[-1]",
+            "an octree's leaves have the colours that hardly any camera sees",
+            "export/test_bake.py::test_harmonics_are_fitted_as_by_numpy"),
+    ],
     "nerfloom.export.mesh": [
         Mutant("hollows-open", "cavities", "A != 2", "A == 2",
             "walls that leave the box are dropped, and hollows are kept",

@@ -37,7 +37,7 @@ def trace_octree(
     stop: float = 0.0,
     deferred: tuple[LeafGradient, LeafGradient] | None = None,
 ) -> OctreeLight:
-    """Return the light of R rays through an octree, with a gradient of its leaves; the rays get none.
+    """Return the light of R rays through an octree, with a gradient of its leaves. Other gradients take the reference.
 
     Args:
         layout: where the L leaves are.

@@ -54,7 +54,7 @@ class ReflectionRenderer(VolumeRenderer):
 
 def _of_some(rays: Rays, samples: Samples, field: ReflectiveField) -> Tensor:
     """Return unit normals (N, 3) of the density at one in `EVERY` samples, and 0 at the others."""
-    places = torch.arange(int(torch.randint(EVERY, ())), len(samples), EVERY, device=samples.t_starts.device)
+    places = torch.arange(len(samples), device=samples.t_starts.device)[int(torch.randint(EVERY, ())) :: EVERY]
     owners, starts, ends = (each[places] for each in (samples.ray_indices, samples.t_starts, samples.t_ends))
     some = Wave(starts, ends, owners, rays.points(owners, (starts + ends) / 2).detach())
     found = field.density_normals(interval_points(rays, owners, some, some.positions, field.footprint))

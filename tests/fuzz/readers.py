@@ -23,6 +23,7 @@ from nerfloom.cameras.scale import Scale, read_scale, write_scale
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
+from nerfloom.data.normals import read_normals
 from nerfloom.data.pixels.cache import PixelMemory, pack, unpack
 from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.ply import read_points
@@ -402,6 +403,18 @@ def read_exr_depths(folder: Path, scratch: Path) -> None:
         require(read_depth(file, 20, 15).shape == (15, 20), "another shape")
 
 
+def write_normals(folder: Path) -> None:
+    for index, channels in enumerate((3, 4)):
+        iio.imwrite(folder / f"{index}_normal.png", noise(20, 15, index, channels))
+
+
+def read_images_of_normals(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.png")):
+        normals = read_normals(file, 20, 15)
+        require(normals.shape == (15, 20, 3), "another shape")
+        require(bool(((normals.norm(dim=-1) - 1).abs() < 1e-3).all()), "other lengths than 1")
+
+
 def write_archive(folder: Path) -> None:
     """Text, an image, and an entry that is stored as it is."""
     with zipfile.ZipFile(folder / "scenes.zip", "w") as archive:
@@ -466,6 +479,7 @@ READERS: dict[str, Reader] = {
     "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),
     "depths": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("depths/*",)),
     "depths-exr": Reader(write_exr_depths, read_exr_depths, ("*.exr",)),
+    "normals": Reader(write_normals, read_images_of_normals, ("*.png",)),
     "photographs": Reader(write_photographs, read_photographs, ("*",)),
     "polycam-raw": Reader(write_polycam, convert_polycam, ("keyframes/cameras/*.json",), ("blur_score", "fx", "width")),
     "record3d-raw": Reader(

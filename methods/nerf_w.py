@@ -104,12 +104,13 @@ class WildRenderer(VolumeRenderer):
         head: the transient part.
         least: uncertainty where nothing is transient.
         unit_length: gradients are scaled within this distance from the camera, scene units; None for no scaling.
+        thin: samples are thinned below this fraction of the mean gradient of the static part; 0 for none.
     """
 
     outputs = (STATIC, TRANSIENT, UNCERTAINTY)
 
-    def __init__(self, head: TransientHead, least: float, unit_length: float | None) -> None:
-        super().__init__(unit_length)
+    def __init__(self, head: TransientHead, least: float, unit_length: float | None, thin: float = 0.0) -> None:
+        super().__init__(unit_length, thin)
         self.head, self.least = head, least
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
@@ -236,7 +237,7 @@ def renderer(config: NerfWConfig, scene: Scene) -> WildRenderer:
     if poses is None:
         poses = torch.eye(3, 4).repeat(scene.num_cameras, 1, 1)
     head = TransientHead(features, config.transient_embedding_dim, config.transient_resolution, width, scene.box, poses)
-    return WildRenderer(head, config.least_uncertainty, scaled_up_to(config, scene))
+    return WildRenderer(head, config.least_uncertainty, scaled_up_to(config, scene), config.thin_gradients)
 
 
 METHOD = Method(

@@ -160,7 +160,7 @@ def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
         down, along = torch.meshgrid(-across, across, indexing="ij")  # the camera's y axis points up
         linear = torch.stack([along, down], -1).view(-1, 2) if resolution > 1 else torch.zeros(81, 2)
         torch.testing.assert_close(found[:, :2], linear, atol=1e-5, rtol=0)
-        assert bool((found[:, 2] == index).all())
+        torch.testing.assert_close(found[:, 2], torch.full((81,), float(index)), atol=1e-5, rtol=0)
 
 
 @pytest.mark.medium

@@ -108,31 +108,6 @@ def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
     return samples.evaluated(*field.density(points))
 
 
-def shade(
-    rays: Rays,
-    samples: Samples,
-    field: Field,
-    background: Tensor,
-    gradient_factors: Tensor | None = None,
-    thin: float = 0.0,
-) -> Rendered:
-    """Compute the colours of samples and composite them.
-
-    Args:
-        rays: R rays.
-        samples: N samples along the rays, with density or alpha, and features, attached.
-        field: the field, which computes colours from features and directions.
-        background: (R, 3) or (3,) colour in [0, 1] of the background.
-        gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
-        thin: samples are thinned below this fraction of the mean gradient; 0 for none.
-
-    Raises:
-        ValueError: if the samples have no density or no features.
-    """
-    values = sample_values(rays, samples, field, gradient_factors, thin)
-    return volume_render(rays, samples, *values, background, is_alpha=samples.alpha is not None)
-
-
 def sample_values(
     rays: Rays, samples: Samples, field: Field, gradient_factors: Tensor | None = None, thin: float = 0.0
 ) -> tuple[Tensor, Tensor]:

@@ -91,7 +91,7 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
     density, color, doubt = (x.double() for x in head.given)
     count = 20_000
     for ray in range(2):
-        passed = alone = hazy = 1.0  # transmittance of both parts, of the static one, and of the transient one
+        passed = alone = hazy = torch.ones(()).double()  # transmittance: both parts, the static, the transient one
         rgb, transient, static = torch.zeros(3, 3).double()
         uncertain = torch.tensor(LEAST).double()
         for i in range(5 * ray, 5 * ray + 5):

@@ -91,7 +91,7 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
     density, color, doubt = (x.double() for x in head.given)
     count = 20_000
     for ray in range(2):
-        passed = alone = hazy = 1.0  # transmittance of both parts, of the static one, and of the transient one
+        passed = alone = hazy = torch.ones(()).double()  # transmittance: both parts, the static, the transient one
         rgb, transient, static = torch.zeros(3, 3).double()
         uncertain = torch.tensor(LEAST).double()
         for i in range(5 * ray, 5 * ray + 5):
@@ -135,8 +135,8 @@ def test_before_training_the_transient_part_is_nearly_transparent() -> None:
     density, color, doubt = head(torch.randn(1000, 16), positions, torch.randn(1000, 16))
     assert density.shape == doubt.shape == (1000,)
     assert color.shape == (1000, 3)
-    assert float(density.median()) * 2 * half_edge(box) < 4 * START  # optical depth across the box
-    assert float(doubt.min()) > 0
+    assert float(density.detach().median()) * 2 * half_edge(box) < 4 * START  # optical depth across the box
+    assert float(doubt.detach().min()) > 0
     other = head(torch.zeros(1, 16), torch.zeros(1, 3), torch.ones(1, 16))
     assert not torch.equal(other[1], head(torch.zeros(1, 16), torch.zeros(1, 3), torch.zeros(1, 16))[1])
 

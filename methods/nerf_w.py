@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from nerfloom import Decision, Field, Method, Picture, Rays, Rendered, Sampler, Samples, Scene, View
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
@@ -24,13 +23,11 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.data.dataset import Dataset
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
-from nerfloom.fields.base import MLP
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.nerf import NeRFField
+from nerfloom.fields.transient import TransientHead
 from nerfloom.kernels.compositing.density import ray_sum
-from nerfloom.kernels.encodings.contraction import contract_to_unit
-from nerfloom.kernels.encodings.frequency import frequency_encoding
-from nerfloom.kernels.table_memory import require
+from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_capture
@@ -45,8 +42,6 @@ PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features of a hidden layer, of the paper's networks and of those on a hash grid. The heads of the first have half."""
 PAPER_RATE = 0.05
 """Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
-FREQUENCIES = 6
-"""Number of frequencies of positions for the transient head, whose features need not tell where they are."""
 START = 0.2
 """Transient density before training, per half edge of the box."""
 SAMPLES = 2**15
@@ -96,72 +91,6 @@ class NerfWConfig(
     bounded_sampler = "proposal"
 
 
-class TransientHead(nn.Module):
-    """Density, colour and uncertainty that one image has alone: NeRF-W, equation 10.
-
-    Each image has a map of vectors, interpolated between the vertices of a square grid over it. A map of one vertex is
-    the paper's transient vector.
-
-    Args:
-        num_features: number F of features of the field.
-        size: length S of a vector.
-        resolution: vertices along each side of an image's map.
-        width: features of a hidden layer.
-        box: (2, 3) corners of the box, scene units.
-        camera_to_worlds: (M, 3, 4) poses of the training cameras.
-    """
-
-    box: Tensor
-    turns: Tensor
-    reach: Tensor
-
-    def __init__(
-        self, num_features: int, size: int, resolution: int, width: int, box: Tensor, camera_to_worlds: Tensor
-    ) -> None:
-        super().__init__()
-        require(4.0 * len(camera_to_worlds) * resolution**2 * size, "the transient vectors of all images")
-        self.resolution = resolution
-        self.vectors = nn.Parameter(torch.zeros(len(camera_to_worlds) * resolution**2, size))
-        self.network = MLP(num_features + size + 3 + 6 * FREQUENCIES, width, width, 5)
-        self.register_buffer("box", box.clone())
-        self.register_buffer("turns", camera_to_worlds[:, :, :3].clone())
-        self.register_buffer("reach", torch.ones(()))  # tangent of the widest angle between a ray and its camera's axis
-        self.start = START / half_edge(box)
-        self.shown_image: int | None = None
-        """Training image whose transient part is rendered outside of training; None for none."""
-
-    def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return transient density (N,), 1/length, colour (N, 3) in [0, 1], and uncertainty (N,), all of float32.
-
-        Args:
-            features: (N, F) features of the field.
-            positions: (N, 3) scene coordinates.
-            vectors: (N, S) vector of each sample's image where its ray crosses the image.
-        """
-        placed = frequency_encoding(2 * contract_to_unit(positions, self.box) - 1, FREQUENCIES)
-        density, found = self.network.density(features, vectors.to(features.dtype), placed.to(features.dtype))
-        return self.start * density, found[:, 1:4].float().sigmoid(), functional.softplus(found[:, 4].float())
-
-    def vectors_of(self, rays: Rays) -> Tensor | None:
-        """Return the vector (R, S) of each ray's image where the ray crosses it; None for rays of no training image."""
-        images = rays.camera_indices
-        if images is None and self.shown_image is not None:
-            images = torch.full((len(rays),), self.shown_image, device=rays.origins.device)
-        if images is None:
-            return None
-        local = torch.einsum("rij,ri->rj", self.turns.to(rays.directions)[images], rays.directions.detach())
-        across = local[:, :2] / (local[:, 2:].neg().clamp(min=1e-3) * self.reach)  # -1 and 1 at the edges
-        place = (across.clamp(-1, 1) + 1) / 2 * (self.resolution - 1)
-        low = place.floor().clamp(max=max(self.resolution - 2, 0))
-        share, total = place - low, torch.zeros((), device=place.device)
-        for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            column, row = ((low[:, k] + s).clamp(max=self.resolution - 1).long() for k, s in ((0, x), (1, y)))
-            weight = (share[:, 0] if x else 1 - share[:, 0]) * (share[:, 1] if y else 1 - share[:, 1])
-            vertex = (images * self.resolution + row) * self.resolution + column
-            total = total + weight[:, None].to(self.vectors) * functional.embedding(vertex, self.vectors)
-        return total
-
-
 class WildRenderer(VolumeRenderer):
     """Volume rendering of the static field alone, and together with the transient part of the rays' images.
 
@@ -186,13 +115,11 @@ class WildRenderer(VolumeRenderer):
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         sigma, rgb = self.values(rays, samples, field)
         static = volume_render(rays, samples, sigma, rgb, background)
-        vectors, extras = self.head.vectors_of(rays), {STATIC.name: static.rgb}
+        extras = {STATIC.name: static.rgb, TRANSIENT.name: torch.zeros_like(static.rgb)}
+        extras[UNCERTAINTY.name] = torch.full_like(static.depth, self.least)
+        vectors = self.head.vectors_of(rays)
         if vectors is None:
-            nothing = {
-                TRANSIENT.name: torch.zeros_like(static.rgb),
-                UNCERTAINTY.name: static.accumulation.new_full((len(rays),), self.least),
-            }
-            return replace(static, extras=extras | nothing)
+            return replace(static, extras=extras)
         assert samples.features is not None
         density, color, doubt = self.head(
             samples.features, samples.positions(rays).detach(), vectors.index_select(0, samples.ray_indices)
@@ -205,26 +132,6 @@ class WildRenderer(VolumeRenderer):
         extras[UNCERTAINTY.name] = self.least + volume_render(rays, samples, density, doubts, nothing_behind).rgb[:, 0]
         extras["transient_density"] = ray_sum(density, samples) / samples.counts.clamp(min=1)
         return replace(static, rgb=both.rgb, extras=extras)
-
-
-def doubted_error(rgb: Tensor, true: Tensor, doubt: Tensor, least: float, weights: Tensor | None = None) -> Tensor:
-    """Return the error () of colours in units of their uncertainty, which must not be large: NeRF-W, equation 13.
-
-    It is the negative logarithm of a normal distribution, mean(e^2 / (2 doubt^2) + log(doubt / least)), times
-    2 least^2, so that it is the mean squared error where the uncertainty is least.
-
-    Args:
-        rgb: (P, 3) rendered colours.
-        true: (P, 3) true colours.
-        doubt: (P,) standard deviation of each pixel's colour.
-        least: the least standard deviation.
-        weights: (P,) factor of each pixel; None for 1.
-    """
-    if not len(rgb):
-        return rgb.sum()
-    ratio = doubt / least
-    each = (rgb - true).square().mean(-1) / ratio.square() + 2 * least**2 * ratio.log()
-    return (each if weights is None else each * weights).mean()
 
 
 class DoubtedError(LossTerm):

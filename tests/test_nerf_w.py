@@ -7,14 +7,17 @@ import torch
 from torch import Tensor
 
 from nerfloom import Field, Points, Rays, Samples
+from nerfloom.fields.transient import TransientHead
+from nerfloom.losses.functions import doubted_error
 from nerfloom.methods import nerf_w
-from nerfloom.methods.nerf_w import START, TransientHead, WildRenderer, doubted_error
+from nerfloom.methods.nerf_w import START, WildRenderer
 from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
 from nerfloom.testing.ball import cameras_at
 from tests.training.helpers import TINY
 
 LEAST = 0.1
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 
 
 def test_the_loss_is_the_likelihood_of_a_normal_distribution() -> None:
@@ -61,7 +64,7 @@ class Given(TransientHead):
     """A transient part of given values, the same in every image."""
 
     def __init__(self, density: Tensor, color: Tensor, doubt: Tensor) -> None:
-        super().__init__(3, 2, 1, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.eye(3, 4).repeat(4, 1, 1))
+        super().__init__(3, 2, 1, 8, BOX, torch.eye(3, 4).repeat(4, 1, 1), 0.1)
         self.given = density, color, doubt
 
     def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -88,7 +91,7 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
     density, color, doubt = (x.double() for x in head.given)
     count = 20_000
     for ray in range(2):
-        passed = alone = hazy = 1.0  # transmittance of both parts, of the static one, and of the transient one
+        passed = alone = hazy = torch.ones(()).double()  # transmittance: both parts, the static, the transient one
         rgb, transient, static = torch.zeros(3, 3).double()
         uncertain = torch.tensor(LEAST).double()
         for i in range(5 * ray, 5 * ray + 5):
@@ -127,7 +130,7 @@ def test_rays_of_no_training_image_show_the_static_part() -> None:
 def test_before_training_the_transient_part_is_nearly_transparent() -> None:
     box = torch.tensor([[-3.0] * 3, [3.0] * 3])
     torch.manual_seed(0)
-    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1))
+    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1), START / half_edge(box))
     positions = 6 * torch.rand(1000, 3) - 3
     density, color, doubt = head(torch.randn(1000, 16), positions, torch.randn(1000, 16))
     assert density.shape == doubt.shape == (1000,)
@@ -142,7 +145,7 @@ def test_before_training_the_transient_part_is_nearly_transparent() -> None:
 def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
     """Each image's vectors are linear over it, so that what is looked up is that function of the pixel's place."""
     cameras = cameras_at(torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-3.0, 1, 2]]), 40, 9)
-    head = TransientHead(16, 3, resolution, 8, torch.tensor([[-1.0] * 3, [1.0] * 3]), cameras.camera_to_worlds)
+    head = TransientHead(16, 3, resolution, 8, BOX, cameras.camera_to_worlds, 0.1)
     head.reach.fill_(float((cameras.widths / cameras.fx).max()) / 2)
     place = torch.linspace(-1, 1, resolution) if resolution > 1 else torch.zeros(1)
     row, column = torch.meshgrid(place, place, indexing="ij")

@@ -42,7 +42,7 @@ WARMTH = 0.4
 
 @dataclass(frozen=True)
 class Changing:
-    """What differs between training images."""
+    """Differences between training images."""
 
     exposure: bool = False
     """Whether the camera's exposure differs."""

@@ -155,7 +155,7 @@ _LIGHT_AZIMUTH, _LIGHT_HEIGHT = math.radians(-118.0), math.radians(54.0)
 
 
 def sun_at(azimuth: float, height: float) -> Colour:
-    """Return the unit vector towards the sun at an azimuth and a height above the horizon, radians."""
+    """Return the unit vector towards the sun at an `azimuth` and a `height` above the horizon, radians."""
     return math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)
 
 
@@ -164,7 +164,7 @@ LIGHT = sun_at(_LIGHT_AZIMUTH, _LIGHT_HEIGHT)
 
 
 class Light(NamedTuple):
-    """What an image may have of its own: where the sun stands, and how the camera weighs light.
+    """Light of one image: where the sun stands, and how the camera weighs light.
 
     Args:
         sun: unit vector towards the sun.

@@ -136,7 +136,14 @@ def shade(
 def sample_values(
     rays: Rays, samples: Samples, field: Field, gradient_factors: Tensor | None = None, thin: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Return the density or alpha (N,) of samples, and their colours (N, 3); the arguments are those of `shade`.
+    """Return the density or alpha (N,) of samples, and their colours (N, 3).
+
+    Args:
+        rays: R rays.
+        samples: N samples along the rays, with density or alpha, and features, attached.
+        field: the field, which computes colours from features and directions.
+        gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
+        thin: samples are thinned below this fraction of the mean gradient; 0 for none.
 
     Raises:
         ValueError: if the samples have no density or no features.

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,10 @@ import torch
 
 from nerfloom.base.config import RobustConfig, from_plain
 from nerfloom.base.errors import ConfigError
-from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_batch
 from nerfloom.data.pixels.patches import PATCH, patches_around
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.sources import Request, make_source
-from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.losses.robust import (
     BINS_PER_DECADE,
     RobustColors,
@@ -30,12 +27,20 @@ from nerfloom.losses.term import RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR
 from nerfloom.ray_model import RayModel
 from nerfloom.registry import load_method
-from nerfloom.stress.scenes import Views, ball_views
+from nerfloom.stress.scenes import ball_views
 from nerfloom.stress.variants import with_distractors
 from nerfloom.training.trainer import Trainer
 
 BALL = ball_views()
 AT_ONCE: Any = from_plain(load_method("instant-ngp").config, {"robust_steps": 0}, "test")
+SMALL = {
+    "log2_table_size": 12,
+    "max_resolution": 64,
+    "num_steps": 64,
+    "num_rays_per_batch": 1024,
+    "samples_per_batch": None,
+}
+"""Settings of a small field."""
 BIN = 10 ** (1 / BINS_PER_DECADE)
 
 
@@ -254,38 +259,3 @@ def test_what_contradicts_the_setting_is_refused() -> None:
         make_source("pixels", BALL.train, config)
     with pytest.raises(ConfigError, match="--robust-quantile is 0; it must be from"):
         dataclasses.replace(config, robust_quantile=0)
-
-
-def learnt(method: str, views: Views, change: Callable[[Dataset], Dataset], steps: int, **settings: object) -> float:
-    """PSNR of the test views after some steps on changed training images."""
-    loaded = load_method(method)
-    plain = {"max_num_iterations": steps, "vis": "none", "machine": {"seed": 1}, **settings}
-    trainer = Trainer(loaded, from_plain(loaded.config, plain, "test"), change(views.train))
-    for _ in trainer.steps():
-        pass
-    return float(evaluate(trainer.model, views.test).results["psnr"])
-
-
-SMALL = {
-    "log2_table_size": 12,
-    "max_resolution": 64,
-    "num_steps": 64,
-    "num_rays_per_batch": 1024,
-    "samples_per_batch": None,
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "settings", "steps"),
-    [("instant-ngp", SMALL, 300), ("gaussian-splatting", {"num_gaussians": 2000, "start": "silhouettes"}, 400)],
-)
-def test_test_views_are_better_where_discs_cover_the_photographs(
-    method: str, settings: dict[str, object], steps: int
-) -> None:
-    plain = learnt(method, BALL, lambda d: with_distractors(d, 0.15), steps, **settings)
-    robust = learnt(
-        method, BALL, lambda d: with_distractors(d, 0.15), steps, robust="percentile", robust_steps=100, **settings
-    )
-    print(method, plain, robust)
-    assert robust > plain + 2

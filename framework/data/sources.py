@@ -144,7 +144,7 @@ class PixelSource(BatchSource):
             look_up,
             keypoints,
             self.num_images,
-            self.patches,
+            self._in_patches(request.step),
         )
         if self.clear is None or batch.rays.camera_indices is None:
             return batch

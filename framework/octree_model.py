@@ -7,7 +7,6 @@ from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from nerfloom.base.config import AT_LEAST_0, Range, RayConfig
 from nerfloom.base.optimised import Optimised
@@ -17,13 +16,13 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.dispatch import CPP
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.leaf_gradient import LeafGradient
-from nerfloom.kernels.octree.light import MAX_DEGREE, OctreeLight, error_bound
+from nerfloom.kernels.octree.light import MAX_DEGREE, OctreeLight, depths_of, error_bound
 from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.model import Loss, Model
 from nerfloom.octrees.drawn import DrawsOctree
 
-STOP = 1e-3
+STOP = 1e-2
 """Transmittance below which rays end in training."""
 
 
@@ -95,7 +94,7 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
 
     def depths(self) -> Tensor:
         """Return the optical depth (L,) of a cell's edge, of each leaf, without gradient."""
-        return functional.softplus(self.densities.table.detach()[:, 0])
+        return depths_of(self.densities.table.detach()[:, 0])
 
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
         density, color = self.densities, self.colors

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from nerfloom.base.console import say, track
@@ -20,17 +19,18 @@ from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, fitted_colors, seen_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.method import Method
 from nerfloom.octree_model import OctreeConfig, OctreeModel
 from nerfloom.octrees.octree import Octree
-from nerfloom.octrees.packing import packed, raw_of
+from nerfloom.octrees.packing import packed
 from nerfloom.ray_model import RayModel
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.trainer import Trainer
 
 METHOD = Method(OctreeConfig(), paper="arXiv:2103.14024", model=OctreeModel, name="octree")
 """Learning of an octree from photographs."""
-MIN_WEIGHT = 0.01
+MIN_WEIGHT = 0.02
 """Minimum of a leaf's largest weight on training rays."""
 MAX_BYTES = 30e6
 """Size of a file without another limit."""
@@ -76,7 +76,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     raw, seen = raw[kept], replace(seen, largest=seen.largest[kept], by_view=seen.by_view[kept])
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
     coefficients = fitted_colors(model, layout.centers(), layout.cell, seen, degree)
-    depths = torch.nn.functional.softplus(raw[:, 0])
+    depths = depths_of(raw[:, 0])
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
     leaves, lost = packed(depths, coefficients)

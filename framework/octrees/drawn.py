@@ -28,7 +28,7 @@ RAYS_AT_ONCE = 2**18
 class DrawsOctree(RendersRays):
     """A renderable whose pictures are light through an octree."""
 
-    early_stop: float = 1 / 1024
+    early_stop: float = 1 / 255
     """Maximum error of a colour channel in [0, 1] because rays end where little light is left."""
 
     @abstractmethod

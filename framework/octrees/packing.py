@@ -60,12 +60,6 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
     return leaves, Rounding(float(opacity), 0.2821 * float(color))
 
 
-def raw_of(depths: Tensor) -> Tensor:
-    """Return the raw densities whose softplus is `depths`, optical depths of cells' edges, of any shape."""
-    small = depths.clamp(1e-6, 20)
-    return torch.where(depths < 20, torch.log(torch.expm1(small)), depths)
-
-
 def _range(coefficients: Tensor) -> tuple[Tensor, Tensor]:
     """Return the quantiles (3 K,) between which coefficients (L, 3 K) are stored."""
     count = len(coefficients)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.adam.adam import sparse_adam_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
 from nerfloom.kernels.octree.layout import BRICK, OctreeLayout
 from nerfloom.kernels.octree.leaf_gradient import LeafGradient
@@ -75,7 +76,7 @@ def by_hand(layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays,
         through, color, moment, median = 1.0, torch.zeros(3, dtype=torch.float64), 0.0, float(far)
         basis = spherical_harmonics_reference(direction[None], math.isqrt(coefficients.shape[1] // 3))[0]
         for leaf in met.tolist():
-            sigma = math.log1p(math.exp(float(raw[leaf]))) / layout.cell
+            sigma = depth_of(float(raw[leaf])) / layout.cell
             depth = sigma * float(end[leaf] - start[leaf])
             weight = through * -math.expm1(-depth)
             color = color + weight * (coefficients[leaf].double().view(3, -1) @ basis)
@@ -86,6 +87,10 @@ def by_hand(layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays,
         color = color + through * behind
         out.append((color, torch.tensor(1 - through), torch.tensor(moment), torch.tensor(median)))
     return OctreeLight(*(torch.stack([row[i] for row in out]).double() for i in range(4)))
+
+
+def depth_of(raw: float) -> float:
+    return raw if raw > 1 else math.exp(raw - 1)
 
 
 def same(found: OctreeLight, truth: OctreeLight, tolerance: float, medians: float = 0.0) -> None:
@@ -141,9 +146,9 @@ def test_a_closed_form() -> None:
     start = layout.origin + layout.cell * torch.tensor([-5.0, 3.5, 5.5])
     rays = Rays(start[None], torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1), torch.full((1,), 20.0))
     found = trace_octree(layout, raw, torch.zeros(16, 3), rays, torch.ones(1, 3))
-    depth = 16 * math.log1p(math.exp(0.3))
+    depth = 16 * depth_of(0.3)
     assert float(found.opacity) == pytest.approx(1 - math.exp(-depth), abs=1e-6)
-    half = math.log(2) / math.log1p(math.exp(0.3)) * layout.cell
+    half = math.log(2) / depth_of(0.3) * layout.cell
     assert float(found.median) == pytest.approx(5 * layout.cell + half, abs=1e-5)
 
 
@@ -198,11 +203,32 @@ def test_the_deferred_gradient_is_the_gradient() -> None:
     kept = LeafGradient(), LeafGradient()
     trace_octree(layout, raw, coefficients, rays, background).color.square().sum().backward()
     trace_octree(layout, raw, coefficients, rays, background, deferred=kept).color.square().sum().backward()
+    leaves, rows = kept[1].parts[0]
+    assert bool((leaves.diff() > 0).all())
+    assert torch.equal(rows, coefficients.grad[leaves.long()])
     assert torch.equal(kept[0].summed(raw), raw.grad)
-    assert torch.equal(kept[1].gradients[0], coefficients.grad)
-    kept[1].clear()
-    assert not kept[1].pending
-    assert not kept[1].rows(coefficients).any()
+    assert not kept[0].pending
+
+
+@needs_kernels
+@pytest.mark.parametrize("width", [1, 3, 12, 27, 48])
+def test_adam_of_rows_is_sparse_adam(width: int) -> None:
+    torch.manual_seed(width)
+    tables = torch.randn(3, 500, width)
+    tables[2] = tables[2].square()
+    gradient, seen = torch.zeros(500, width), torch.randint(5, (500,)).float()
+    leaves = torch.randperm(500)[:200].sort().values.int()
+    gradient[leaves.long()] = torch.randn(200, width)
+    gradient[leaves[3]] = 0  # met, and without a gradient
+    truth, counts = [table.double().clone() for table in tables], seen.double()
+    sparse_adam_reference(truth[0], gradient.double(), truth[1], truth[2], counts, 0.1, (0.9, 0.99), 1e-8)
+    kept = LeafGradient()
+    kept.parts.append((leaves, gradient[leaves.long()]))
+    kept.adam(tables[0], tables[1], tables[2], seen, 0.1, (0.9, 0.99), 1e-8)
+    for found, exact in zip(tables, truth, strict=True):
+        assert relative_error(found, exact) < 1e-5
+    assert torch.equal(seen.double(), counts)
+    assert not kept.pending
 
 
 @needs_kernels

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional
 
 from nerfloom.base.errors import DataError
+from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.octrees.files import NAMES, read_octree, write_octree
-from nerfloom.octrees.packing import MAX_DEPTH, packed, raw_of
+from nerfloom.octrees.packing import MAX_DEPTH, packed
 from tests.octrees.balls import ball
 
 
@@ -116,4 +116,4 @@ def test_a_truncated_file(tmp_path: Path) -> None:
 
 def test_raw_densities_have_the_depths_they_came_from() -> None:
     depths = torch.tensor([1e-3, 0.5, 3.0, 19.0, 21.0, 1e4])
-    torch.testing.assert_close(functional.softplus(raw_of(depths)), depths, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(depths_of(raw_of(depths)), depths, rtol=1e-4, atol=1e-7)

@@ -47,6 +47,22 @@ class OctreeLight(NamedTuple):
     """(R,) distance where the transmittance is 0.5, or the far end; without gradient."""
 
 
+def depths_of(raw: Tensor) -> Tensor:
+    """Return optical depths of cells' edges: exp(raw - 1), and from 1 on raw itself, so that none has to be negative.
+
+    It is the activation of SVRaster (Sun et al. 2025) without its sharper slope.
+
+    Args:
+        raw: raw densities of any shape.
+    """
+    return torch.where(raw > 1, raw, torch.exp(raw.clamp(max=1) - 1))
+
+
+def raw_of(depths: Tensor) -> Tensor:
+    """Return the raw densities of optical `depths` of any shape: the inverse of `depths_of`."""
+    return torch.where(depths > 1, depths, 1 + torch.log(depths.clamp(1e-9, 1)))
+
+
 def light_of(
     layout: OctreeLayout, depths: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float
 ) -> OctreeLight:

@@ -11,27 +11,47 @@ namespace {
 constexpr int64_t RAYS = 1024;  // rays of a chunk
 constexpr int MOST = 48;        // values of a leaf: 16 harmonics of 3 channels
 
-// Leaves of floats: the optical depth of a cell's edge is softplus(raw).
+// Leaves of floats: the optical depth of a cell's edge is exp(raw - 1), from 1 on raw itself.
 struct Raw {
+    static constexpr float NONE = -1e9f;  // the value where there is no leaf
     const float *raw, *colors;
     int values;
-    float depth(int32_t leaf) const {
-        const float x = raw[leaf];
-        return x > 15 ? x : std::log1p(std::exp(x));
+    float value(int32_t leaf) const { return raw[leaf]; }
+    static Floats depth(Floats x) {
+        const Floats low = exponential(smaller(x, splat(1)) - 1.0f);
+        return x > 1.0f ? x : low;
     }
-    float slope(int32_t leaf) const { return 1 / (1 + std::exp(-raw[leaf])); }
     const float* row(int32_t leaf) const { return colors + int64_t(leaf) * values; }
     float decoded(int, float sum, float) const { return sum; }
 };
 
 // Leaves of bytes: a table of optical depths; a coefficient is scale * byte + offset.
 struct Packed {
+    static constexpr float NONE = 0;
     const uint8_t *codes, *colors;
     const float *table, *scales, *offsets;
     int values;
-    float depth(int32_t leaf) const { return table[codes[leaf]]; }
+    float value(int32_t leaf) const { return table[codes[leaf]]; }
+    static Floats depth(Floats x) { return x; }
     const uint8_t* row(int32_t leaf) const { return colors + int64_t(leaf) * values; }
     float decoded(int value, float sum, float weight) const { return scales[value] * sum + offsets[value] * weight; }
+};
+
+// A step of all lanes: optical depth of an edge, length in cells, and weight of each lane's leaf.
+struct Step {
+    alignas(64) float edge[LANES], length[LANES], weight[LANES], left[LANES];
+
+    template <typename Leaves>
+    Step(const Leaves& leaves, const int32_t* leaf, Floats t0, Floats t1, float per_cell, float* through, float limit,
+         int32_t* ends) {
+        alignas(64) float value[LANES];
+        for (int lane = 0; lane < LANES; lane++) value[lane] = leaf[lane] < 0 ? Leaves::NONE : leaves.value(leaf[lane]);
+        const Floats of_edge = Leaves::depth(load(value)), cells = (t1 - t0) * per_cell, before = load(through);
+        const Floats share = before * opacity_of(of_edge * cells), after = before - share;
+        store(edge, of_edge), store(length, cells), store(weight, share), store(left, before), store(through, after);
+        const Ints over = after < splat(limit);
+        std::memcpy(ends, &over, sizeof over);
+    }
 };
 
 void basis_of(const float* direction, int basis, float* out) {
@@ -53,23 +73,28 @@ struct Shade {
     const Results& out;
     float per_cell, limit;
     alignas(64) float sums[LANES][N];
-    float through[LANES], moment[LANES], median[LANES];
+    alignas(64) float through[LANES], moment[LANES], median[LANES];
 
     void start(int lane, int64_t) {
         for (int k = 0; k < N; k++) sums[lane][k] = 0;
         through[lane] = 1, moment[lane] = 0, median[lane] = -1;
     }
 
-    bool meet(int lane, int32_t leaf, float t0, float t1) {
-        const float depth = leaves.depth(leaf) * (t1 - t0) * per_cell, left = through[lane];
-        const float weight = left * -std::expm1(-depth);
-        const auto* row = leaves.row(leaf);
-        float* to = sums[lane];
-        for (int k = 0; k < N; k++) to[k] += weight * float(row[k]);
-        moment[lane] += weight * 0.5f * (t0 + t1);
-        through[lane] = left - weight;
-        if (median[lane] < 0 && through[lane] <= 0.5f) median[lane] = t0 + (t1 - t0) * (std::log(2 * left) / depth);
-        return !(through[lane] < limit);
+    void meet(const int32_t* leaf, const float* t0, const float* t1, int32_t* ends) {
+        const Floats begin = load(t0), end = load(t1);
+        const Step step(leaves, leaf, begin, end, per_cell, through, limit, ends);
+        store(moment, load(moment) + load(step.weight) * 0.5f * (begin + end));
+        for (int lane = 0; lane < LANES; lane++) {
+            if (leaf[lane] < 0) continue;
+            const float weight = step.weight[lane];
+            const auto* row = leaves.row(leaf[lane]);
+            float* to = sums[lane];
+            for (int k = 0; k < N; k++) to[k] += weight * float(row[k]);
+            if (median[lane] < 0 && through[lane] <= 0.5f) {
+                const float depth = step.edge[lane] * step.length[lane];
+                median[lane] = t0[lane] + (t1[lane] - t0[lane]) * (std::log(2 * step.left[lane]) / depth);
+            }
+        }
     }
 
     void finish(int lane, int64_t r) {
@@ -117,21 +142,21 @@ struct Visit {
 struct Record {
     struct Part {
         int32_t leaf;
-        float length;
+        float edge, length, weight;
     };
     const Raw& leaves;
     float per_cell, limit;
     std::vector<Part> met[LANES];
-    float through[LANES];
+    alignas(64) float through[LANES];
     std::vector<std::vector<Part>>& rays;
     int64_t first;
 
     void start(int lane, int64_t) { met[lane].clear(), through[lane] = 1; }
-    bool meet(int lane, int32_t leaf, float t0, float t1) {
-        met[lane].push_back({leaf, (t1 - t0) * per_cell});
-        const float left = through[lane];
-        through[lane] = left - left * -std::expm1(-leaves.depth(leaf) * met[lane].back().length);
-        return !(through[lane] < limit);
+    void meet(const int32_t* leaf, const float* t0, const float* t1, int32_t* ends) {
+        const Step step(leaves, leaf, load(t0), load(t1), per_cell, through, limit, ends);
+        for (int lane = 0; lane < LANES; lane++)
+            if (leaf[lane] >= 0)
+                met[lane].push_back({leaf[lane], step.edge[lane], step.length[lane], step.weight[lane]});
     }
     void finish(int lane, int64_t r) { rays[size_t(r - first)].swap(met[lane]); }
 };
@@ -151,12 +176,11 @@ void differentiate(const std::vector<Record::Part>& met, int32_t ray, const floa
     const float opaque = grad.opacity ? grad.opacity[ray] : 0;
     float left = 1;
     for (const auto& part : met) {
-        const float weight = left * -std::expm1(-leaves.depth(part.leaf) * part.length);
         const float* row = leaves.row(part.leaf);
         float shown = opaque;
         for (int k = 0; k < n; k++) shown += mixed[k] * row[k];
-        left -= weight;
-        visits.push_back({part.leaf, ray, weight, shown});
+        left -= part.weight;
+        visits.push_back({part.leaf, ray, part.weight, shown});
     }
     float behind = 0;
     for (int c = 0; c < 3; c++) behind += grad.color[3 * ray + c] * grad.background[3 * ray + c];
@@ -164,11 +188,35 @@ void differentiate(const std::vector<Record::Part>& met, int32_t ray, const floa
     for (size_t i = met.size(); i-- > 0;) {
         Visit& v = visits[begin + i];
         const float value = v.slope;
-        // d/dtau of w value + (all behind) is (transmittance behind the leaf) value - (all behind).
-        v.slope = (left * value - behind) * met[i].length * leaves.slope(v.leaf);
+        // d/dtau of w value + (all behind) is (transmittance behind the leaf) value - (all behind). The slope of the
+        // depth by raw is the depth itself, up to 1.
+        v.slope = (left * value - behind) * met[i].length * std::min(met[i].edge, 1.0f);
         behind += v.weight * value;
         left += v.weight;
     }
+}
+
+// Gives each leaf that a ray has visited a row, in ascending order. Returns the rows; `slots` has each leaf's, or -1.
+int64_t give_rows(const std::vector<std::vector<Visit>>& chunks, int64_t leaves, int64_t shares, int threads,
+                  std::vector<int32_t>& slots, int32_t* touched) {
+    slots.assign(size_t(leaves), -1);
+    std::vector<int64_t> rows(size_t(shares) + 1, 0);
+    for_chunks(threads, shares, [&](int64_t share, int) {
+        const int32_t from = int32_t(leaves * share / shares), to = int32_t(leaves * (share + 1) / shares);
+        int64_t count = 0;
+        for (const auto& visits : chunks)
+            for (const Visit& v : visits)
+                if (v.leaf >= from && v.leaf < to && slots[size_t(v.leaf)] < 0) slots[size_t(v.leaf)] = 0, count++;
+        rows[size_t(share) + 1] = count;
+    });
+    for (int64_t share = 0; share < shares; share++) rows[size_t(share) + 1] += rows[size_t(share)];
+    for_chunks(threads, shares, [&](int64_t share, int) {
+        const int32_t from = int32_t(leaves * share / shares), to = int32_t(leaves * (share + 1) / shares);
+        int64_t row = rows[size_t(share)];
+        for (int32_t leaf = from; leaf < to; leaf++)
+            if (slots[size_t(leaf)] >= 0) touched[row] = leaf, slots[size_t(leaf)] = int32_t(row++);
+    });
+    return rows.back();
 }
 
 }  // namespace
@@ -200,14 +248,15 @@ EXPORT int octree_trace_packed(const float* origin, float cell, const int64_t* s
     });
 }
 
-// Adds the gradient of L leaves. Each thread has a share of the leaves and visits all rays in order, so the sums do not
-// depend on their number. grad_opacity may be null.
+// The gradient of L leaves. Each thread has a share of the leaves and visits all rays in order, so the sums do not depend
+// on their number. With `touched`, gradients have a row for each leaf that a ray has visited, which it lists; their
+// number is `rows_used`. Without, they have a row for each leaf, and are added to. grad_opacity may be null.
 EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
                                  const int64_t* masks, const int32_t* firsts, const float* raw, const float* colors,
                                  int values, int64_t leaves, const float* origins, const float* directions,
                                  const float* nears, const float* fars, int64_t rays, const float* background,
                                  float limit, const float* grad_color, const float* grad_opacity, float* grad_raw,
-                                 float* grad_colors, int threads) {
+                                 float* grad_colors, int32_t* touched, int threads, int64_t* rows_used) {
     return guarded([&] {
         const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
         const octree::Beams beams{origins, directions, nears, fars};
@@ -228,13 +277,24 @@ EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t*
             }
         });
         const int64_t shares = std::max(threads, 1);
+        std::vector<int32_t> slots;
+        *rows_used = touched ? give_rows(chunks, leaves, shares, threads, slots, touched) : 0;
         for_chunks(threads, shares, [&](int64_t share, int) {
-            const int32_t from = int32_t(leaves * share / shares), to = int32_t(leaves * (share + 1) / shares);
+            if (touched) {
+                const int64_t first = *rows_used * share / shares, last = *rows_used * (share + 1) / shares;
+                std::fill(grad_raw + first, grad_raw + last, 0.0f);
+                std::fill(grad_colors + first * values, grad_colors + last * values, 0.0f);
+            }
+        });
+        for_chunks(threads, shares, [&](int64_t share, int) {
+            const int64_t rows = touched ? *rows_used : leaves;
+            const int32_t from = int32_t(rows * share / shares), to = int32_t(rows * (share + 1) / shares);
             for (const auto& visits : chunks) {
                 for (const Visit& v : visits) {
-                    if (v.leaf < from || v.leaf >= to) continue;
-                    grad_raw[v.leaf] += v.slope;
-                    float* row = grad_colors + int64_t(v.leaf) * values;
+                    const int32_t at = touched ? slots[size_t(v.leaf)] : v.leaf;
+                    if (at < from || at >= to) continue;
+                    grad_raw[at] += v.slope;
+                    float* row = grad_colors + int64_t(at) * values;
                     const float* harmonic = &y[size_t(v.ray) * 16];
                     for (int c = 0; c < 3; c++) {
                         const float share_of = v.weight * grad_color[3 * v.ray + c];
@@ -265,9 +325,8 @@ EXPORT int octree_weights(const float* origin, float cell, const int64_t* size, 
             for (int64_t r = begin; r < end; r++) {
                 float left = 1;
                 for (const auto& part : met[size_t(r - begin)]) {
-                    const float weight = left * -std::expm1(-known.depth(part.leaf) * part.length);
-                    found.push_back({part.leaf, weight});
-                    left -= weight;
+                    found.push_back({part.leaf, part.weight});
+                    left -= part.weight;
                 }
                 opacity[r] = 1 - left;
             }

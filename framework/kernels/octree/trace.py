@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
@@ -19,13 +19,14 @@ from nerfloom.kernels.octree.light import (
     OctreeLight,
     check_leaves,
     contiguous,
+    depths_of,
     light_of,
     outputs_of,
     ray_arguments,
 )
 
 _trace = native.Function("octree_trace", LAYOUT + "ppi" + RAYS + "pfppppi")
-_backward = native.Function("octree_trace_backward", LAYOUT + "ppiq" + RAYS + "pfppppi")
+_backward: Callable[..., int] = native.Function("octree_trace_backward", LAYOUT + "ppiq" + RAYS + "pfpppppi", "q")
 
 
 def trace_octree(
@@ -41,8 +42,7 @@ def trace_octree(
 
     Args:
         layout: where the L leaves are.
-        raw: (L, 1) raw densities: the optical depth of a cell's edge is softplus(raw), so a leaf without light can
-            still change.
+        raw: (L, 1) raw densities: the optical depth of a cell's edge is `depths_of(raw)`.
         coefficients: (L, 3 K) coefficients of K = 1, 4, 9 or 16 harmonics, channel by channel.
         rays: the rays.
         background: (R, 3) or (3,) colour of the background.
@@ -64,7 +64,7 @@ def trace_octree_reference(
     The gradient is autograd's. `layout`, `raw`, `coefficients`, `rays`, `background`, `stop` and `deferred` are as in
     `trace_octree`; `deferred` is not used.
     """
-    return light_of(layout, functional.softplus(raw[:, 0]), coefficients, rays, background, stop)
+    return light_of(layout, depths_of(raw[:, 0]), coefficients, rays, background, stop)
 
 
 TRACE_OCTREE: Operation[..., OctreeLight] = Operation("trace_octree", trace_octree_reference)
@@ -98,18 +98,21 @@ class _Trace(torch.autograd.Function):
         count, values = coefficients.shape
         color = torch.zeros_like(background) if grads[0] is None else grads[0].contiguous()
         opacity = None if grads[1] is None else grads[1].contiguous()
-        if ctx.deferred is None:
-            into = [torch.zeros_like(raw), torch.zeros_like(coefficients)]
-        else:
-            into = [kept.rows(table) for kept, table in zip(ctx.deferred, (raw, coefficients), strict=True)]
-        _backward(
+        leaves = None if ctx.deferred is None else torch.empty(count, dtype=torch.int32)
+        make = torch.zeros_like if leaves is None else torch.empty_like  # memory that is not used is never there
+        into = [make(raw), make(coefficients)]
+        used = _backward(
             *ctx.layout.arguments(), raw.data_ptr(), coefficients.data_ptr(), values, count, *ray_arguments(rays),
             background.data_ptr(), ctx.stop, native.pointer(color, "the colour's gradient", (len(rays), 3)),
             None if opacity is None else native.pointer(opacity, "the opacity's gradient", (len(rays),)),
             native.pointer(into[0], "the densities' gradient", (count, 1)),
-            native.pointer(into[1], "the coefficients' gradient", (count, values)), native.threads(),
+            native.pointer(into[1], "the coefficients' gradient", (count, values)),
+            None if leaves is None else leaves.data_ptr(), native.threads(),
         )  # fmt: skip
-        found = into if ctx.deferred is None else [None, None]
+        if leaves is not None:
+            for kept, rows in zip(ctx.deferred, into, strict=True):
+                kept.parts.append((leaves[:used], rows[:used]))
+        found = into if leaves is None else [None, None]
         return (*found, None, None, None, None, None, None)
 
 

@@ -29,7 +29,8 @@ struct Beams {  // R rays
 };
 
 // The walk of one ray in each lane. `Light` follows what a ray has met:
-//   start(lane, ray), bool meet(lane, leaf, t0, t1): false if the ray ends, finish(lane, ray).
+//   start(lane, ray); finish(lane, ray);
+//   meet(leaf, t0, t1, ends): a step of all lanes through leaves (-1: none) from t0 to t1; sets ends for rays that end.
 template <typename Light>
 class Walk {
 public:
@@ -45,11 +46,9 @@ public:
             for (int lane = 0; lane < LANES; lane++)
                 if (ray[lane] >= 0) look(lane);
             advance();
+            light.meet(leaf, before, after, ends);
             for (int lane = 0; lane < LANES; lane++) {
-                if (ray[lane] < 0) continue;
-                bool goes_on = !(t[lane] >= far[lane]);
-                if (leaf[lane] >= 0) goes_on &= light.meet(lane, leaf[lane], before[lane], after[lane]);
-                if (goes_on) continue;
+                if (ray[lane] < 0 || !(ends[lane] || t[lane] >= far[lane])) continue;
                 light.finish(lane, ray[lane]);
                 ray[lane] = -1;
                 walking -= !take(lane);
@@ -63,7 +62,7 @@ private:
     Light& light;
     int64_t next = 0, stop = 0;
     int32_t last[3];
-    alignas(64) int32_t cell[3][LANES], low[3][LANES], size[LANES], leaf[LANES];
+    alignas(64) int32_t cell[3][LANES], low[3][LANES], size[LANES], leaf[LANES], ends[LANES];
     alignas(64) float p[3][LANES], d[3][LANES], inverse[3][LANES];  // in cells; 1 / d
     alignas(64) float t[LANES], before[LANES], after[LANES], far[LANES];
     int64_t ray[LANES];

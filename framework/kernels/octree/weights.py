@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.compositing.density import exclusive_sum, ray_sum
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
-from nerfloom.kernels.octree.light import LAYOUT, RAYS, contiguous, ray_arguments
+from nerfloom.kernels.octree.light import LAYOUT, RAYS, contiguous, depths_of, ray_arguments
 from nerfloom.kernels.octree.walk import leaf_samples
 
 _weights = native.Function("octree_weights", LAYOUT + "pq" + RAYS + "fppi")
@@ -36,7 +35,7 @@ def raise_weights_reference(
 ) -> Tensor:
     """Compute `raise_weights` in PyTorch; `layout`, `raw`, `rays`, `weights` and `stop` are as there."""
     samples, leaves = leaf_samples(layout, rays)
-    tau = functional.softplus(raw[leaves, 0]) * samples.deltas / layout.cell
+    tau = depths_of(raw[leaves, 0]) * samples.deltas / layout.cell
     through = torch.exp(-exclusive_sum(tau, samples))
     found = torch.where(through >= stop, through * -torch.expm1(-tau), torch.zeros_like(tau))
     weights.scatter_reduce_(0, leaves, found.to(weights), "amax")

@@ -81,13 +81,17 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
     (output / "colmap" / "summary.json").write_text(json.dumps(summary.as_json(), indent=2))
     transforms.write(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
     if flags.mask_moving:
-        from nerfloom.processing.moving_masks import mask_moving  # imports all that trains
-
-        with state.timed("masks"):
-            mask_moving(output, flags.num_downscales, max_seconds=flags.mask_seconds)
+        _mask_moving(state)
     for line in lines(summary):
         say(line)
     say(ready(output))
+
+
+def _mask_moving(state: Reconstruction) -> None:
+    from nerfloom.processing.moving_masks import mask_moving  # imports all that trains
+
+    with state.timed("masks"):
+        mask_moving(state.flags.output_dir, state.flags.num_downscales, max_seconds=state.flags.mask_seconds)
 
 
 def _frames(model: colmap.Model, prepared: list[PreparedImage], masks: dict[str, str]) -> list[transforms.Frame]:

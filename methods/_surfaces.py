@@ -108,8 +108,9 @@ class SurfaceConfig(
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
     """Fraction of the budget from which on that change has a weight: a surface has to find its place first."""
-    start_radius: float = 0.25
-    """Radius of the ball that training starts from, in halves of the box's shortest edge."""
+    start_radius: Auto[float] = AUTO
+    """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
+    background, otherwise 0.25."""
     start_sharpness: float = 20.0
     """First inverse width of the surface, in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
@@ -136,13 +137,15 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     if config.sampler not in config.samplers:
         raise ConfigError(f"--sampler {config.sampler}: take --sampler {' or '.join(config.samplers)}")
     config, samples = decide_samples(config, SAMPLES)
-    color = Choice("color_loss", "squared", "nothing is behind the surfaces")
+    error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
     if config.background_model == "sphere":
-        color = Choice("color_loss", "absolute", "a background could explain what has no texture", "error of colours")
+        error, start, reason = "absolute", 0.5, "a background could explain what has no texture"
+    color = Choice("color_loss", error, reason, "error of colours")
+    radius = Choice("start_radius", start, reason, "radius of the first ball")
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     light = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, own = fill(config, color, light)
+    config, own = fill(config, color, radius, light)
     return config, made + samples + own
 
 

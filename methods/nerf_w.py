@@ -235,7 +235,8 @@ def renderer(config: NerfWConfig, scene: Scene) -> WildRenderer:
     poses = scene.camera_to_worlds
     if poses is None:
         poses = torch.eye(3, 4).repeat(scene.num_cameras, 1, 1)
-    head = TransientHead(features, config.transient_embedding_dim, config.transient_resolution, width, scene.box, poses)
+    sizes = features, config.transient_embedding_dim, config.transient_resolution, width
+    head = TransientHead(*sizes, scene.box, poses, START / half_edge(scene.box))
     return WildRenderer(head, config.least_uncertainty, scaled_up_to(config, scene))
 
 

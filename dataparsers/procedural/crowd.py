@@ -120,7 +120,7 @@ def _fill(
     for _ in range(_TRIES):
         if hidden.mean() >= wanted - _SLACK:
             break
-        figure = figures[random.integers(len(figures))]
+        figure = figures[int(random.integers(len(figures)))]
         spot = _spot(pose, figure, list(placed.values()), random)
         if spot is None:
             continue

@@ -233,10 +233,9 @@ def sampler(config: NerfWConfig, scene: Scene) -> Sampler:
 def renderer(config: NerfWConfig, scene: Scene) -> WildRenderer:
     """Return the renderer, with the transient head."""
     features, width = (PAPER_WIDTH, PAPER_WIDTH // 2) if config.encoding == "frequency" else (NUM_FEATURES, GRID_WIDTH)
-    known = scene.camera_to_worlds
+    known, sizes = scene.camera_to_worlds, (config.transient_embedding_dim, config.transient_resolution, width)
     poses = torch.eye(3, 4).repeat(scene.num_cameras, 1, 1) if known is None else known
-    sizes = features, config.transient_embedding_dim, config.transient_resolution, width
-    head = TransientHead(*sizes, scene.box, poses, START / half_edge(scene.box))
+    head = TransientHead(features, *sizes, scene.box, poses, START / half_edge(scene.box))
     return WildRenderer(head, config.least_uncertainty, scaled_up_to(config, scene), config.thin_gradients)
 
 

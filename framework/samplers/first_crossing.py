@@ -225,7 +225,8 @@ class FirstCrossing(Sampler):
         if not (waves := marched.waves):
             return Pieces(rays.nears[:0], rays.nears[:0], order, offsets)
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
-        return Pieces(*gather_rows(columns, order), offsets)
+        starts, ends, owners = gather_rows(columns, order)
+        return Pieces(starts, ends, owners, offsets)
 
     def update(self, step: int, density: DensityFunction) -> None:
         """Update the other sampler."""

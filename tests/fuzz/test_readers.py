@@ -20,9 +20,9 @@ FEW, MANY = 6, 200
 """Inputs for each reader, in the fast set and in the slow one."""
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
-    "phototourism", "ply", "surfaces", "splats", "octree", "camera-path", "images", "images-to-a-file", "masks", "depths",
+    "phototourism", "ply", "surfaces", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths",
     "photographs", "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
-    "lpips-weights", "depths-exr", "dtu", "sdfstudio",
+    "lpips-weights", "depths-exr", "dtu", "sdfstudio", "octree",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""
 ASKED = [

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from nerfloom.base.errors import printable
+from nerfloom.base.file_lock import locked
 
 LOOK_EVERY = 0.1
 """Seconds between looks at whether the job is to end early."""
@@ -60,11 +61,11 @@ def run(job: dict[str, Any], abandoned: threading.Event) -> str | None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab") as log:
-            if not _locked(log):
+            if not locked(log.fileno()):
                 print(ALONE, file=sys.stderr)
                 log.write(f"{ALONE}\n".encode())
                 log.flush()
-                while not _locked(log):
+                while not locked(log.fileno()):
                     if abandoned.wait(LOOK_EVERY):
                         return "stopped"
             for step in job["steps"]:
@@ -107,25 +108,6 @@ def _end_with_parent() -> Callable[[], object] | None:
         return None
     prctl, set_parent_death_signal = ctypes.CDLL(None).prctl, 1
     return lambda: prctl(set_parent_death_signal, signal.SIGTERM)
-
-
-def _locked(log: BinaryIO) -> bool:
-    """Lock a log for this process and its commands; return False if an earlier process of the job has locked it.
-
-    Commands inherit the lock with the open file, so it lasts as long as any of them. True without effect on systems
-    and file systems without locks.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return True
-    try:
-        fcntl.flock(log, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True
 
 
 def reason(code: int, log: Path) -> str:

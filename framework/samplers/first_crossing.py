@@ -16,14 +16,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nerfloom.base.step_kind import StepKind
-from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.fields.base import Field
 from nerfloom.fields.surface import SurfaceField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.rows import gather_rows
-from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.samplers.wrapping import WrappingSampler
 
 SAFETY = 1.25
 """Factor by which a learnt distance may be steeper on the way than at the position where it was evaluated."""
@@ -189,7 +188,7 @@ def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths, exact: flo
     return at, evaluations
 
 
-class FirstCrossing(Sampler):
+class FirstCrossing(WrappingSampler):
     """Samples of another sampler, or in evaluation those where a ray meets a surface, up to the first that covers it.
 
     Args:
@@ -197,9 +196,11 @@ class FirstCrossing(Sampler):
         traces: whether pictures are traced; otherwise they have the other sampler's samples.
     """
 
+    sampler: OccupancySampler
+
     def __init__(self, sampler: OccupancySampler, traces: bool) -> None:
-        super().__init__()
-        self.sampler, self.traces, self.samples_per_step = sampler, traces, sampler.samples_per_step
+        super().__init__(sampler)
+        self.traces = traces
         self.evaluations = 0
         """Number of evaluations for the last traced rays."""
 
@@ -227,16 +228,3 @@ class FirstCrossing(Sampler):
         columns = [[w.t_starts for w in waves], [w.t_ends for w in waves], [w.owners for w in waves]]
         starts, ends, owners = gather_rows(columns, order)
         return Pieces(starts, ends, owners, offsets)
-
-    def update(self, step: int, density: DensityFunction) -> None:
-        """Update the other sampler."""
-        self.sampler.update(step, density)
-
-    def step_kind(self, step: int) -> StepKind:
-        return self.sampler.step_kind(step)
-
-    def read_counts(self) -> None:
-        self.sampler.read_counts()
-
-    def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
-        return self.sampler.loss(samples, weights)

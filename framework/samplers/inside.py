@@ -8,17 +8,17 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from nerfloom.base.step_kind import StepKind
 from nerfloom.data.scene import Scene
-from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.fields.base import Field
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.geometry.spheres import intersect_sphere
 from nerfloom.samplers.background import BackgroundConfig, foreground, foreground_sphere
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import make_sampler
+from nerfloom.samplers.wrapping import WrappingSampler
 
 
-class InsideSphere(Sampler):
+class InsideSphere(WrappingSampler):
     """Samples of another sampler, clipped where rays leave a sphere.
 
     Args:
@@ -29,9 +29,7 @@ class InsideSphere(Sampler):
     sphere: Tensor
 
     def __init__(self, sampler: Sampler, sphere: Tensor) -> None:
-        super().__init__()
-        self.sampler, self.samples_per_step = sampler, sampler.samples_per_step
-        self.has_coarse_level, self.learns_from_weights = sampler.has_coarse_level, sampler.learns_from_weights
+        super().__init__(sampler)
         self.register_buffer("sphere", sphere.clone())
 
     def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
@@ -43,19 +41,6 @@ class InsideSphere(Sampler):
             return samples
         coarse = replace(samples.coarse, samples=clipped(samples.coarse.samples, nears, fars))
         return replace(samples, coarse=coarse)
-
-    def update(self, step: int, density: DensityFunction) -> None:
-        """Update the other sampler."""
-        self.sampler.update(step, density)
-
-    def step_kind(self, step: int) -> StepKind:
-        return self.sampler.step_kind(step)
-
-    def read_counts(self) -> None:
-        self.sampler.read_counts()
-
-    def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
-        return self.sampler.loss(samples, weights)
 
 
 def make_foreground_sampler(

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.file_lock import locked
 
 LOCK = ".lock"
 """Name of the lock file. It names the process that holds the lock; its content is meaningless when unlocked."""
@@ -36,7 +37,7 @@ def sole_user(folder: Path) -> Iterator[None]:
     try:
         if not os.access(folder, os.W_OK):  # an old lock file may be writable in a read-only folder
             raise ConfigError(f"cannot write the run's folder {folder}: {os.strerror(errno.EACCES)}")
-        if not _locked(opened):
+        if not locked(opened):
             owner = os.read(opened, 200).decode("utf-8", "replace") or "another process"
             raise ConfigError(f"{folder} is in use by {owner}; wait until it has ended, or stop it")
         with suppress(OSError):  # on a full disk, the owner stays unnamed
@@ -45,18 +46,3 @@ def sole_user(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(opened)
-
-
-def _locked(opened: int) -> bool:
-    """Lock an open file; return False if another process has locked it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return True
-    try:
-        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True

@@ -92,15 +92,7 @@ def export_page(
     else:
         cameras, names = pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
     near = smallest_depth(model.scene)
-    if isinstance(model, HasGaussians):
-        found, look = model.gaussians(moment), model.look()
-    elif isinstance(model, RendersRays) and dataset is not None:
-        if not fit_seconds > 0:
-            raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
-        machine = loaded.run.config.machine
-        found, look = fit_gaussians(model, splatting, dataset, cameras, fit_seconds, machine), OURS
-    else:
-        raise ConfigError(f"ns-export web: {loaded.method} has neither Gaussians nor rays, so it cannot be shown")
+    found, look = _gaussians(loaded, splatting, dataset, cameras, fit_seconds, moment)
     good = _finite(found)
     turn = upright(cameras)
     order = in_order(names)  # data formats sort 10.jpg before 2.jpg
@@ -132,6 +124,25 @@ def export_page(
     views = dataset if held_out is None else _at(held_out.to(model.device), moment)
     seen = cameras.to(model.device) if views is None else views.cameras
     say(closeness(model, back, seen, views, near, look, moment).line())
+
+
+def _gaussians(
+    loaded: Loaded,
+    splatting: Method,
+    dataset: Dataset | None,
+    cameras: Cameras,
+    fit_seconds: float,
+    moment: float | None,
+) -> tuple[Gaussians, Look]:
+    """Return the Gaussians of a model, or those fitted to pictures of its field, and how they are drawn."""
+    model = loaded.model
+    if isinstance(model, HasGaussians):
+        return model.gaussians(moment), model.look()
+    if not isinstance(model, RendersRays) or dataset is None:
+        raise ConfigError(f"ns-export web: {loaded.method} has neither Gaussians nor rays, so it cannot be shown")
+    if not fit_seconds > 0:
+        raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
+    return fit_gaussians(model, splatting, dataset, cameras, fit_seconds, loaded.run.config.machine), OURS
 
 
 def _finite(found: Gaussians) -> Gaussians:

@@ -111,7 +111,8 @@ class MeasurePanel:
         ends = torch.stack([point for point, _ in self._points])
         loaded = self._queue.loaded
         try:
-            length = str(loaded.measure(*loaded.placement.original_points(ends), self._time))
+            start, end = loaded.placement.original_points(ends)
+            length = str(loaded.measure(start, end, self._time))
         except NerfloomError as error:
             self._tell(f"{plain(str(error))}.")
             return

@@ -7,6 +7,7 @@ look; on Linux, set it up for torch's CPU builds first, or each session installs
     nox -s lowest -- tests/test_config.py        with arguments for pytest, in place of the fast set
     NERFLOOM_TORCH=2.13.0 nox -s lowest          the lowest dependencies, but this torch
     nox -s without_torch                         what needs no torch, under every Python, in a minute each
+    nox -s cluster                               jobs on a real Ray cluster, with the version in constraints.txt
 
 docs/start/install.md says what ran and what did not.
 """
@@ -96,6 +97,13 @@ def without_torch(session: nox.Session) -> None:
     session.run("python", "-c", COMPILE, silent=True)
     plugins = ("--noconftest", "-p", "tests.downloads.conftest")  # the conftest.py of all tests imports torch
     session.run("python", "-m", "pytest", *plugins, *(session.posargs or TORCHLESS))
+
+
+@nox.session
+def cluster(session: nox.Session) -> None:
+    """Run the tests of jobs with Ray, which no other extra installs."""
+    session.install("-c", str(ROOT / "constraints.txt"), "-e", f"{ROOT}[test,cluster]")
+    session.run("python", "-m", "pytest", *(session.posargs or ("tests/jobs",)))
 
 
 @nox.session

@@ -102,7 +102,7 @@ def _tables(flags: TablesFlags) -> None:
         ConfigError: if a table cannot be read, or a row failed.
     """
     from benchmarks.table_text import listing, markdown
-    from benchmarks.tables import read_table, run_rows
+    from benchmarks.tables import kept, read_table, run_rows
 
     if not flags.seconds_scale > 0:
         raise FlagError(f"--seconds-scale is {flags.seconds_scale}; it must be more than 0")
@@ -112,7 +112,7 @@ def _tables(flags: TablesFlags) -> None:
         raise FlagError(f"--only {shown(flags.only)} is no regular expression: {error}") from error
     check_weights(flags.lpips_weights)
     tables = [
-        read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale, flags.lpips_weights)
+        read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale, flags.lpips_weights, flags.num_threads)
         for path in flags.tables
     ]
     files = [flags.output_dir / f"{table.name}.json" for table in tables]
@@ -126,10 +126,12 @@ def _tables(flags: TablesFlags) -> None:
         print("\n\n".join(listing(rows, file) for rows, file in zip(asked, files, strict=True) if rows))
         return
     failures: dict[str, str] = {}
-    for rows, file in zip(asked, files, strict=True):
+    for table, rows, file in zip(tables, asked, files, strict=True):
         make_room(file)
-        failures |= run_rows(rows, flags.data_root, file)
-    say(f"{count - len(failures)} of {count} rows are in {flags.output_dir}")
+        launcher = flags.chosen_launcher(flags.run_dir.resolve() / table.name)
+        failures |= run_rows(rows, flags.data_root, file, launcher)
+    present = sum(kept(row, file) is not None for rows, file in zip(asked, files, strict=True) for row in rows)
+    say(f"{present} of {count} rows are in {flags.output_dir}")
     if failures:
         raise ConfigError(f"{len(failures)} rows failed, first {next(iter(failures))}: {next(iter(failures.values()))}")
 

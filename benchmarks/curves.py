@@ -19,7 +19,8 @@ from nerfloom.benchmarks.methods import STANDARD
 from nerfloom.comparison import plots
 from nerfloom.comparison.measures import Row, measure, rows_of
 from nerfloom.comparison.plan import Conditions, Contender, Plan
-from nerfloom.comparison.runner import run_jobs
+from nerfloom.comparison.runner import run_all
+from nerfloom.jobs.processes import Processes
 from nerfloom.registry import registered
 
 
@@ -102,9 +103,9 @@ def run(plan: Plan) -> Budget:
     """
     plan.claim_folder()
     failures: dict[str, list[str]] = {}
-    for job, failure in run_jobs(plan).items():
-        failures.setdefault(job.contender.label, []).append(f"seed {job.seed}: {failure.reason}")
-    done = [measured for measured in (measure(job, plan.conditions) for job in plan.jobs()) if measured is not None]
+    for planned, failure in run_all(plan, Processes()).items():
+        failures.setdefault(planned.contender.label, []).append(f"seed {planned.seed}: {failure.reason}")
+    done = [found for found in (measure(planned, plan.conditions) for planned in plan.runs()) if found is not None]
     assert plan.conditions.max_seconds is not None
     return Budget(plan.conditions.max_seconds, tuple(rows_of([c.label for c in plan.contenders], done, failures)))
 

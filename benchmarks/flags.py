@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from nerfloom.cli.bench_results import PICTURES, RESULTS
+from nerfloom.cli.job_flags import JobFlags
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class ViewerBenchFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TablesFlags:
+class TablesFlags(JobFlags):
     """Train and judge the rows of tables of results, each in its own process, and keep them in a JSON file a table.
 
     Rows that are in the file are left out, and a row that was stopped goes on: the same command continues."""
@@ -200,6 +201,8 @@ class TablesFlags:
     """Factor of all budgets, such as 0.02 to try a table; then three held-out images of each row are judged."""
     lpips_weights: Path | None = None
     """File of weights of LPIPS with AlexNet (.npz), for the rows that are run."""
+    num_threads: int | None = None
+    """CPU threads of each row that is run; all cores if not given."""
     run_dir: Path = Path("outputs/tables")
     """Folder of the runs, with the last checkpoint and some pictures of each."""
     output_dir: Path = RESULTS

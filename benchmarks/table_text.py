@@ -111,7 +111,7 @@ def listing(rows: Sequence[Row], results: Path) -> str:
     lines = [
         f"{row.name:<{width}}  "
         + (f"{missing[row.name] / 60:6.1f} min" if result is None else f"{result['results']['psnr']:7.2f} dB")
-        + f"  {row.job.contender.label}"
+        + f"  {row.planned.contender.label}"
         for row, result in found
     ]
     hours = sum(missing.values()) / 3600

@@ -8,7 +8,6 @@ of many hours grows over days. A row that was stopped goes on where it was.
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -20,9 +19,11 @@ from nerfloom.base.config import from_plain, read_yaml
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, shown
 from nerfloom.benchmarks.results import add_row, read_rows
-from nerfloom.comparison import runner
 from nerfloom.comparison.measures import measure, read_json
-from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, Job, split_words
+from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, PlannedRun, split_words
+from nerfloom.comparison.runner import job_of
+from nerfloom.jobs.job import Job
+from nerfloom.jobs.launcher import Launcher
 from nerfloom.training.report import SUMMARY
 
 TRIED = 3
@@ -52,7 +53,7 @@ class Row:
 
     data: str
     method: str
-    job: Job
+    planned: PlannedRun
     """The run."""
     conditions: Conditions
     """Its data and budget."""
@@ -66,7 +67,7 @@ class Row:
     @property
     def name(self) -> str:
         """Name of the row, also in the results."""
-        seed = "" if self.job.seed == FIRST_SEED else f"-seed{self.job.seed}"
+        seed = "" if self.planned.seed == FIRST_SEED else f"-seed{self.planned.seed}"
         return f"{self.data}-{self.method}-{self.seconds:g}s{seed}"
 
 
@@ -85,7 +86,14 @@ class Table:
     images: Mapping[str, str]
 
 
-def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_weights: Path | None = None) -> Table:
+def read_table(
+    path: Path,
+    root: Path,
+    runs: Path,
+    scale: float = 1.0,
+    lpips_weights: Path | None = None,
+    num_threads: int | None = None,
+) -> Table:
     """Read a table.
 
     Args:
@@ -94,6 +102,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
         runs: folder for runs.
         scale: factor of all budgets; if not 1, the rows are trials.
         lpips_weights: LPIPS's weights file, for the rows that are run; None to use the lpips package.
+        num_threads: CPU threads of each row that is run; None for all cores.
 
     Raises:
         ConfigError: if the file is not a table, or names an unknown method.
@@ -106,7 +115,7 @@ def read_table(path: Path, root: Path, runs: Path, scale: float = 1.0, lpips_wei
     weights = None if lpips_weights is None else str(lpips_weights.resolve())
     for number, block in enumerate(blocks):
         for row in _rows(block, f"{path}: rows {number + 1}", root.resolve(), runs.resolve(), scale):
-            row = replace(row, conditions=replace(row.conditions, lpips_weights=weights))
+            row = replace(row, conditions=replace(row.conditions, lpips_weights=weights, num_threads=num_threads))
             if not re.fullmatch(r"[\w.-]+", row.name):
                 raise ConfigError(
                     f"{path}: {shown(row.name)} is no name of a row; take letters, digits and hyphens for names"
@@ -133,8 +142,8 @@ def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Itera
                     conditions = _conditions(place, root, seconds * scale, None if scale == 1 else TRIED)
                     # The label gives runs with other flags of the method or data another folder.
                     contender = replace(Contender.of(method), label=f"{method} on {place or 'the embedded scene'}")
-                    job = Job(contender, seed, runs / f"{seconds * scale:g}s")
-                    yield Row(data_name, method_name, job, conditions)
+                    planned = PlannedRun(contender, seed, runs / f"{seconds * scale:g}s")
+                    yield Row(data_name, method_name, planned, conditions)
 
 
 def _texts(value: Any, where: str) -> dict[str, str]:
@@ -164,42 +173,40 @@ def kept(row: Row, file: Path) -> Result | None:
     """
     if (found := read_rows(file).get(row.name)) is None:
         return None
-    made_by = found.get("run", {}).get("label", row.job.contender.label)
-    if made_by != row.job.contender.label:
+    made_by = found.get("run", {}).get("label", row.planned.contender.label)
+    if made_by != row.planned.contender.label:
         raise ConfigError(
-            f"{file}: {row.name} belongs to '{made_by}', not to '{row.job.contender.label}'; remove or rename it"
+            f"{file}: {row.name} belongs to '{made_by}', not to '{row.planned.contender.label}'; remove or rename it"
         )
     return found
 
 
-def run_rows(rows: Sequence[Row], root: Path, file: Path) -> dict[str, str]:
-    """Train and judge the rows that are missing, one after the other, and keep each when it is done.
+def run_rows(rows: Sequence[Row], root: Path, file: Path, launcher: Launcher) -> dict[str, str]:
+    """Train and judge the rows that are missing, and keep each when it is done.
 
     Args:
         rows: the rows.
         root: folder of the folders of all data, which is left out of the results.
         file: the table's results.
+        launcher: what runs them.
 
     Returns:
         Name of each failed row -> reason.
 
     Raises:
-        Stopped: on a signal, after the running row has saved.
+        ConfigError: if the launcher cannot run them.
+        Stopped: on a signal, after the running rows have saved.
     """
-    failures = {}
-    with runner.stoppable() as stopped:
-        for number, row in enumerate(rows, 1):
-            if stopped.is_set() or kept(row, file) is not None:
-                continue
-            say(f"[{number}/{len(rows)}] {row.name}: {row.conditions.budget()}, {time.strftime('%H:%M')}")
-            failure = None if runner.is_done(row.job) else runner.run_job(row.job, row.conditions, None, stopped)
-            if failure is None:
-                add_row(file, row.name, found := result_of(row, root))
-                say(f"  PSNR {found['results']['psnr']:.2f} dB, {found['run']['steps']:,} steps")
-            elif not stopped.is_set():
-                failures[row.name] = f"{failure.reason} (full output: {failure.log})"
-                say(f"  {row.name} failed: {failures[row.name]}")
-    return failures
+    missing = {
+        replace(job_of(row.planned, row.conditions), title=row.name): row for row in rows if kept(row, file) is None
+    }
+
+    def keep(job: Job) -> None:
+        add_row(file, missing[job].name, found := result_of(missing[job], root))
+        say(f"  {job.title}: PSNR {found['results']['psnr']:.2f} dB, {found['run']['steps']:,} steps")
+
+    failures = launcher.run(list(missing), keep)
+    return {job.title: f"{failure.reason} (full output: {failure.log})" for job, failure in failures.items()}
 
 
 def result_of(row: Row, root: Path) -> Result:
@@ -208,13 +215,13 @@ def result_of(row: Row, root: Path) -> Result:
     Args:
         root: folder of the folders of all data.
     """
-    measured, evaluation = measure(row.job, row.conditions), read_json(row.job.evaluation)
-    summary = read_json(row.job.folder / SUMMARY)
+    measured, evaluation = measure(row.planned, row.conditions), read_json(row.planned.evaluation)
+    summary = read_json(row.planned.folder / SUMMARY)
     assert measured is not None
     run = {
-        "label": row.job.contender.label,
+        "label": row.planned.contender.label,
         "command": measured.command.replace(f"{root.resolve()}/", ""),
-        "seed": row.job.seed,
+        "seed": row.planned.seed,
         "date": datetime.now(timezone.utc).date().isoformat(),
         **{name: value for name, value in summary.items() if name != "method"},
         "decisions": list(measured.decisions),

@@ -2,7 +2,8 @@
 
 NeRF-Synthetic (Mildenhall et al. 2020) states an angle of view, and its cameras look at the origin from 4.03 units
 away; box, near and far are those of its paper. Any other scene is placed in the same box, whatever its units and
-position (`nerfloom.dataparsers.region`).
+position (`nerfloom.dataparsers.region`). Normals beside images, as in Shiny Blender (Verbin et al. 2022), are true ones
+to judge a method's by.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement
+from nerfloom.data.normals import normals_beside
 from nerfloom.dataparsers.captured import placed_cameras
 from nerfloom.dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_region
 from nerfloom.dataparsers.renders import Renders, read_renders
@@ -87,6 +89,7 @@ class Blender(DataParser):
             scale=placement.scale,
             downscale_factor=self.downscale_factor,
             num_scales=self.multiscale,
+            normal_paths=normals_beside(images.paths),
             unbounded=region.unbounded,
         )
 

@@ -25,7 +25,7 @@ PartT = TypeVar("PartT")
 
 
 class Renderable(ABC):
-    """Something that can be rendered: a trained model, a file of Gaussians, or a combination of others."""
+    """Something that can be rendered: a trained model, a file of Gaussians, an octree, or a combination of others."""
 
     scene: Scene
     """The scene: its box, near and far distance, and whether it moves and images have alpha."""

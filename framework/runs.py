@@ -28,12 +28,12 @@ def list_methods() -> dict[str, str]:
 
 
 def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Loaded:
-    """Load a trained run or a file of Gaussians.
+    """Load a trained run, a file of Gaussians, or an octree.
 
     Args:
-        path: folder of the run, its config.yml, a folder above it (for its newest run), or a file of Gaussians (.ply,
-            .spz, .splat).
-        data: new location of the run's data, if it has moved; optional data for a file of Gaussians.
+        path: folder of the run, its config.yml, a folder above it (for its newest run), a file of Gaussians (.ply,
+            .spz, .splat), or an octree (.octree).
+        data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
 
     Raises:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, TypedDict, TypeVar
+from typing import ClassVar, Generic, Literal, TypedDict, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.device import HostValue
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.base import DensityFunction, Field
@@ -18,20 +20,36 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.losses.surfaces import Eikonal, Silhouette
-from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
+from nerfloom.losses.surfaces import (
+    Curvature,
+    DistanceBounds,
+    Eikonal,
+    Silhouette,
+    SurfaceColorError,
+    SurfacePoints,
+)
+from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
+from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
-from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
+from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground, foreground_sphere
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import decide_samples
+from nerfloom.samplers.choice import make_sampler as occupancy_sampler
+from nerfloom.samplers.first_crossing import FirstCrossing
+from nerfloom.samplers.inside import inside_foreground
+from nerfloom.samplers.occupancy import OccupancySampler
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
+SHARPER = 50.0
+"""Multiple of the first inverse width that its bound has reached when it ends."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
+LONGEST, EVERY = 4.0, 16
+"""Maximum length of a training step, in steps of `num_steps`, and the number of training steps between its changes."""
 
 
 @dataclass(frozen=True)
@@ -48,17 +66,26 @@ class SurfaceConfig(
     log2_table_size=17,
     eval_num_rays_per_chunk=8_192,
     thin_gradients=0.5,
+    sphere_around="object",
 ):
     """Settings of a method that learns a signed distance."""
 
+    samplers: ClassVar[tuple[str, ...]] = ("occupancy",)
+    """Samplers that suit the method."""
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
         "hidden_width": (1, 2**14),
         "eikonal_loss_mult": AT_LEAST_0,
         "silhouette_loss_mult": AT_LEAST_0,
+        "points_loss_mult": AT_LEAST_0,
+        "bounds_loss_mult": AT_LEAST_0,
+        "curvature_loss_mult": AT_LEAST_0,
+        "curvature_from": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
         "sharpness_learning_rate": AT_LEAST_0,
+        "sharpen_until": (0, 1),
+        "step_widths": AT_LEAST_0,
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
@@ -66,16 +93,35 @@ class SurfaceConfig(
     """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
+    color_loss: Auto[Literal["squared", "absolute"]] = AUTO
+    """Error of colours. absolute: as in NeuS and VolSDF; edges and highlights that are still wrong count less, so that
+    surfaces form where there is little texture. auto: absolute if there is a background, otherwise squared."""
     eikonal_loss_mult: float = 0.01
     """Weight of the term that keeps the distance's gradient at length 1."""
     silhouette_loss_mult: float = 0.01
     """Weight of the difference between opacity and the images' alpha."""
-    start_radius: float = 0.5
-    """Radius of the ball that training starts from, in halves of the box's shortest edge."""
+    points_loss_mult: float = 0.1
+    """Weight of the distance at points of a reconstruction, where it should be 0."""
+    bounds_loss_mult: float = 0.1
+    """Weight of distances before such points that are negative, or larger than the distance to the point."""
+    curvature_loss_mult: float = 0.01
+    """Weight of the change of normals along the surface."""
+    curvature_from: float = 0.5
+    """Fraction of the budget from which on that change has a weight: a surface has to find its place first."""
+    start_radius: Auto[float] = AUTO
+    """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
+    background, otherwise 0.25."""
     start_sharpness: float = 20.0
     """First inverse width of the surface, in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
+    step_widths: float = 2.0
+    """Length of a training step, in inverse widths of the surface; from one to four steps of --num-steps. 0: one."""
+    eval_rendering: Literal["volume", "surface"] = "volume"
+    """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
+    sharpen_until: float = 0.8
+    """Fraction of the budget over which the upper bound of the inverse width rises, exponentially, to 50 times the
+    first value."""
     open_levels_until: float = 0.3
     """Fraction of the budget during which levels of the hash grid open, from coarse to fine."""
 
@@ -88,13 +134,19 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     if config.background_model == "contraction":
         raise ConfigError("--background-model contraction: a signed distance is not contracted; take sphere or none")
     config, made = decide_background(config, scene, "sphere")
-    if config.sampler != "occupancy":
-        raise ConfigError(f"--sampler {config.sampler}: surfaces are sampled with --sampler occupancy")
+    if config.sampler not in config.samplers:
+        raise ConfigError(f"--sampler {config.sampler}: take --sampler {' or '.join(config.samplers)}")
     config, samples = decide_samples(config, SAMPLES)
+    error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
+    if config.background_model == "sphere":
+        error, start, reason = "absolute", 0.5, "a background could explain what has no texture"
+    color = Choice("color_loss", error, reason, "error of colours")
+    radius = Choice("start_radius", start, reason, "radius of the first ball")
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
-    config, light = fill(config, Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features"))
-    return config, made + samples + light
+    light = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
+    config, own = fill(config, color, radius, light)
+    return config, made + samples + own
 
 
 class FieldParts(TypedDict):
@@ -108,12 +160,13 @@ class FieldParts(TypedDict):
     appearance: Appearance | None
 
 
-def field_parts(config: SurfaceConfig, scene: Scene) -> FieldParts:
+def field_parts(config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] = Sharpness) -> FieldParts:
     """Return the arguments of a field's constructor.
 
     Args:
         config: the method's settings, decided.
         scene: properties of the whole scene.
+        sharpness: class of the learnt inverse width.
     """
     box, size, appearance = foreground(config, scene).box, config.appearance_embedding_dim, None
     if size:
@@ -122,7 +175,7 @@ def field_parts(config: SurfaceConfig, scene: Scene) -> FieldParts:
     return {
         "box": box,
         "encoding": HashGrid.of(config, config.open_levels_until),
-        "sharpness": Sharpness(config.start_sharpness / half, config.sharpness_learning_rate),
+        "sharpness": sharpness(config.start_sharpness / half, config.sharpness_learning_rate),
         "radius": config.start_radius,
         "width": config.hidden_width,
         "appearance": appearance,
@@ -136,11 +189,21 @@ class SurfaceRenderer(VolumeRenderer):
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().shade(rays, samples, field, background)
+        if self.training:  # no term of the objective asks for them
+            return rendered
         assert samples.features is not None
         assert rendered.weights is not None
         normals = safe_normalize(samples.features[:, :3].detach())
         facing = ray_sum(rendered.weights.detach()[:, None] * normals, samples)
         return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
+
+
+def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
+    """Return the sampler, whose pictures are traced if the settings say so."""
+    sampler = occupancy_sampler(config, foreground(config, scene))
+    assert isinstance(sampler, OccupancySampler)
+    traced = FirstCrossing(sampler, config.eval_rendering == "surface")
+    return inside_foreground(config, scene, traced)
 
 
 def make_background(config: SurfaceConfig, scene: Scene) -> InvertedField:
@@ -163,14 +226,39 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
 class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
     """A model that learns the distance to a surface, and its colour."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), Silhouette(), Eikonal(), *KNOWN_DISTANCES)
+    step_scale: Tensor
+    losses = (
+        SurfaceColorError(),
+        SamplerLoss(),
+        Silhouette(),
+        Eikonal(),
+        SurfacePoints(),
+        DistanceBounds(),
+        Curvature(),
+        *KNOWN_DISTANCES,
+    )
 
     def __init__(
         self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
-        super().__init__(config, scene, field, sampler, renderer)
+        # Meshes and crops cover what the field covers.
+        super().__init__(config, replace(scene, box=foreground(config, scene).box), field, sampler, renderer)
+        self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
         edges = self.surface.box[1] - self.surface.box[0]
         self.surface.cell = float((edges / config.grid_resolution).norm())
+        self.register_buffer("step_scale", torch.tensor(1.0))
+        self._step_scale = HostValue()
+
+    def before_step(self, step: int, progress: float) -> None:
+        super().before_step(step, progress)
+        self.surface.progress, until = progress, self.config.sharpen_until
+        self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
+        for sampler in parts(self, OccupancySampler):
+            if step % EVERY == 0:
+                width = self.config.step_widths / float(self.surface.sharpness().detach())
+                scale = min(max(width / sampler.step_size, 1.0), LONGEST)
+                self._step_scale.change(self.step_scale, round(scale * 64) / 64)
+            sampler.stride = self._step_scale.of(self.step_scale)
 
     @property
     def surface(self) -> SurfaceField:
@@ -185,9 +273,17 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
 
     @torch.no_grad()
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3)."""
+        """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3).
+
+        The distance is NaN outside the sphere, where the background shows the scene.
+        """
         shape = self.surface.shape(points.positions)
-        return shape.distances, shape.gradients
+        if self.sphere is None:
+            return shape.distances, shape.gradients
+        sphere = self.sphere.to(points.positions)
+        outside = (points.positions - sphere[:3]).norm(dim=-1) > sphere[3]
+        distances = torch.where(outside, torch.nan, shape.distances)
+        return distances, shape.gradients
 
     @property
     def grid_density(self) -> DensityFunction:

@@ -161,8 +161,10 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         content = CHANNELS["rgb" if known is None else "distance"]
         drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
         rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
-        if batch.kept is not None:  # masked pixels have no error
-            kept = reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
+        kept = None if batch.kept is None else reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
+        if self.robust is not None and not self.robust.waits(step):
+            kept = self.robust.image_pixels(rgb, target, kept)
+        if kept is not None:  # other pixels have no error
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
         if known is not None:

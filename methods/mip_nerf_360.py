@@ -100,7 +100,7 @@ class MipNeRF360Config(
     """Number of frequencies in the encoding of directions (integrated)."""
 
 
-class RobustColorError(ColorError):
+class SmoothColorError(ColorError):
     """Smooth absolute error of colours in unbounded scenes (section 5), otherwise the mean squared error.
 
     In a box, if most of the image is background, an empty scene minimises absolute errors. Training cannot leave that
@@ -110,13 +110,13 @@ class RobustColorError(ColorError):
     def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
         if not shown.model.scene.unbounded:
             return super().error(rgb, shown)
-        return charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
+        return charbonnier(rgb, shown.batch.rgb, shown.weights)
 
 
 class MipNeRF360(RefinedModel[MipNeRF360Config], plain=True):
-    """A model with a robust colour error and the distortion loss."""
+    """A model with a smooth absolute colour error and the distortion loss."""
 
-    losses = (RobustColorError(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(of_marched=False))
+    losses = (SmoothColorError(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(of_marched=False))
     steps_repeat = True
 
 

@@ -12,15 +12,15 @@ from typing import ClassVar
 
 from nerfloom import Method, Scene
 from nerfloom.base.config import Range
-from nerfloom.fields.surface import NeuSField
+from nerfloom.fields.surface import AnnealedSharpness, NeuSField
 from nerfloom.methods._surfaces import (
     SurfaceConfig,
     SurfaceModel,
     decide_surface,
     field_parts,
+    make_sampler,
     renderer,
 )
-from nerfloom.samplers.inside import make_foreground_sampler
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,19 @@ class NeuS(SurfaceModel[NeuSConfig], plain=True):
         super().before_step(step, progress)
         until = self.config.anneal_slope_until
         assert isinstance(self.field, NeuSField)
-        self.field.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
+        self.field.sharpness.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
 
 
 def make_field(config: NeuSConfig, scene: Scene) -> NeuSField:
     """Return a field that starts as a ball."""
-    return NeuSField(**field_parts(config, scene))
+    return NeuSField(**field_parts(config, scene, AnnealedSharpness))
 
 
 METHOD = Method(
     NeuSConfig(),
     paper="arXiv:2106.10689",
     field=make_field,
-    sampler=make_foreground_sampler,
+    sampler=make_sampler,
     renderer=renderer,
     model=NeuS,
     decide=decide_surface,

@@ -7,22 +7,40 @@ those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neurala
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
-from nerfloom import Method, Scene
+from nerfloom import ConfigError, Method, Sampler, Scene
+from nerfloom.base.config import AUTO, Auto, Range
 from nerfloom.fields.surface import VolSDFField
 from nerfloom.methods._surfaces import (
     SurfaceConfig,
     SurfaceModel,
     decide_surface,
     field_parts,
+    make_sampler,
     renderer,
 )
-from nerfloom.samplers.inside import make_foreground_sampler
+from nerfloom.samplers.background import foreground
+from nerfloom.samplers.error_bounded import EPSILON, ErrorBoundedSampler
+from nerfloom.samplers.inside import inside_foreground
 
 
 @dataclass(frozen=True)
-class VolSDFConfig(SurfaceConfig):
+class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Settings of volsdf."""
+
+    samplers: ClassVar[tuple[str, ...]] = ("occupancy", "error-bounded")
+    """Samplers that suit the method."""
+    RANGES: ClassVar[dict[str, Range]] = {"num_bound_steps": (4, 2**12), "opacity_error": (1e-4, 1)}
+    """Allowed range of each numeric setting."""
+    sampler: Auto[Literal["occupancy", "error-bounded"]] = AUTO  # type: ignore[assignment]
+    """occupancy: march through the occupied cells of the box. error-bounded: draw --num-nerf-samples samples per ray
+    from an opacity whose error is bounded, as in the paper. auto: occupancy."""
+    num_bound_steps: int = 64
+    """Distances that are looked up along a ray first, and how many each round adds until the bound holds
+    (error-bounded)."""
+    opacity_error: float = EPSILON
+    """Largest error of the opacity that samples are drawn from (error-bounded)."""
 
 
 class VolSDF(SurfaceModel[VolSDFConfig], plain=True):
@@ -34,11 +52,27 @@ def make_field(config: VolSDFConfig, scene: Scene) -> VolSDFField:
     return VolSDFField(**field_parts(config, scene))
 
 
+def sampler(config: VolSDFConfig, scene: Scene) -> Sampler:
+    """Return the configured sampler, inside the sphere if there is a background.
+
+    Raises:
+        ConfigError: for pictures by the surface without an occupancy grid, whose cells they are traced through.
+    """
+    if config.sampler != "error-bounded":
+        return make_sampler(config, scene)
+    if config.eval_rendering == "surface":
+        raise ConfigError("--eval-rendering surface traces occupied cells; take --sampler occupancy with it")
+    bounded = ErrorBoundedSampler(
+        foreground(config, scene).box, config.num_bound_steps, config.num_nerf_samples, config.opacity_error
+    )
+    return inside_foreground(config, scene, bounded)
+
+
 METHOD = Method(
     VolSDFConfig(),
     paper="arXiv:2106.12052",
     field=make_field,
-    sampler=make_foreground_sampler,
+    sampler=sampler,
     renderer=renderer,
     model=VolSDF,
     decide=decide_surface,

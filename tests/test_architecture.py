@@ -137,6 +137,7 @@ def _fields(file: Path, base: str):
 
 LAYERS = (
     ("base",),
+    ("jobs",),
     ("geometry",),
     ("kernels",),
     ("cameras",),
@@ -149,9 +150,9 @@ LAYERS = (
     ("renderable",),
     ("plug_and_play",),
     ("losses",),
-    ("splats",),
+    ("splats", "octrees"),
     ("model",),
-    ("ray_model", "gaussian_model"),
+    ("ray_model", "gaussian_model", "octree_model"),
     ("moving_model",),
     ("method",),
     ("registry",),

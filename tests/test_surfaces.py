@@ -1,6 +1,7 @@
 """Methods with a signed distance: how they start, what they learn of a ball, and its mesh."""
 
 import dataclasses
+import math
 from functools import partial
 from pathlib import Path
 
@@ -9,16 +10,33 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.data.pixels.batch import PixelBatch, draw_batch
 from nerfloom.export.lattice import lattice_of
 from nerfloom.export.meshing import Cleaning, distance_mesh
 from nerfloom.fields.surface import NeuSField, SurfaceField
 from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.surfaces.opacity import surface_opacity
+from nerfloom.losses.surfaces import (
+    EVERY,
+    Curvature,
+    DistanceBounds,
+    SurfacePoints,
+    beyond_bounds,
+    normal_change,
+    tangents,
+)
+from nerfloom.losses.term import RenderedBatch
 from nerfloom.method import Method
 from nerfloom.registry import load_method
+from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
+from nerfloom.samplers.background import foreground_sphere
+from nerfloom.samplers.first_crossing import FirstCrossing
+from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
+from nerfloom.training.skipping import skip_report
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import TINY, chosen, said_otherwise
 
@@ -39,11 +57,11 @@ def places(count: int = 500) -> Tensor:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_training_starts_as_a_ball(name: str) -> None:
-    """Of half the box's size, up to the noise of the first weights; its gradient has length 1."""
+    """Of a quarter of the box's size, up to the noise of the first weights; its gradient has length 1."""
     field = trainer_of(name).model.field
     assert isinstance(field, SurfaceField)
     shape = field.shape(places())
-    truth = places().norm(dim=-1) - 0.5
+    truth = places().norm(dim=-1) - 0.25
     assert (shape.distances - truth).abs().max() < 0.01
     assert (shape.gradients.norm(dim=-1) - 1).abs().max() < 0.05
     assert bool(field.shape(torch.zeros(1, 3)).gradients.isfinite().all())
@@ -74,7 +92,7 @@ def test_gradients_are_those_of_the_distance(opened: float) -> None:
 def test_opacity_is_that_of_the_distance_and_its_slope() -> None:
     field = trainer_of("neus").model.field
     assert isinstance(field, NeuSField)
-    field.anneal(1.0)
+    field.sharpness.anneal(1.0)
     where, lengths = places(), torch.full((500,), 0.02)
     directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
     opacity, _ = field.alpha(Points(where), directions, lengths)
@@ -92,6 +110,39 @@ def test_cells_that_hold_a_surface_are_occupied(name: str) -> None:
     around = field.density_around(Points(places()))[0]
     moved = places() + field.cell * torch.nn.functional.normalize(torch.randn(500, 3), dim=-1) * 0.99
     assert bool((field.density(Points(moved))[0] <= around * 1.1).all())
+
+
+def test_the_report_says_what_tracing_saves() -> None:
+    trainer = trainer_of("neus", max_num_iterations=5, eval_rendering="surface")
+    for _ in trainer.steps():
+        pass
+    rungs = {rung.name: rung for rung in skip_report(trainer)}
+    assert rungs["samples, traced"].switch == "--eval-rendering volume"
+    assert 0 <= rungs["samples, traced"].skipped < 1
+    assert "instead of" in rungs["samples, traced"].says
+    assert all(tracer.traces for tracer in parts(trainer.model, FirstCrossing))
+
+
+@pytest.mark.parametrize(("sharpness", "widths", "scale"), [(0.25, 2.0, 4.0), (0.25, 0.75, 3.0), (8.0, 2.0, 1.0)])
+def test_steps_are_as_long_as_the_surface_is_wide(sharpness: float, widths: float, scale: float) -> None:
+    """`sharpness` is in inverse steps; the length lies between one and four steps, and pictures keep theirs."""
+    trainer = trainer_of("neus", step_widths=widths)
+    (sampler,) = parts(trainer.model, OccupancySampler)
+    field = trainer.model.field
+    assert isinstance(field, SurfaceField)
+    field.sharpness.first = sharpness / sampler.step_size  # the least value
+    with torch.no_grad():
+        field.sharpness.exponent.fill_(math.log(sharpness / sampler.step_size) / field.sharpness.SPEED)
+    trainer.model.before_step(0, 1.0)
+    assert trainer.model.step_scale.item() == pytest.approx(scale, abs=0.02)
+    rays = Rays(torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]]))
+    lengths = []
+    for training in (True, False):
+        samples = sampler.train(training).sample(rays, field, jitter=False)
+        lengths.append(samples.deltas.median().item() / sampler.step_size)
+    assert lengths == pytest.approx([scale, 1.0], rel=0.02)
+    trainer.model.before_step(1, 1.0)  # the same until it is asked again, as after a checkpoint
+    assert trainer.model.step_scale.item() == pytest.approx(scale, abs=0.02)
 
 
 @pytest.mark.medium
@@ -121,8 +172,39 @@ def test_captures_get_a_background_on_a_sphere(name: str, shared_tiny: Path, tmp
     trainer = captured(tmp_path, {"unbounded": True, "has_alpha": False}, max_num_iterations=3)
     assert chosen(trainer)["background model"] == "sphere"
     assert isinstance(trainer.model.renderer, SphereRenderer)
+    assert chosen(trainer)["error of colours"] == "absolute"
     trainer.train()
     assert trainer.state.skipped == 0
+
+
+def test_distances_of_captures_are_known_inside_the_sphere(shared_tiny: Path, tmp_path: Path) -> None:
+    """Outside, the background shows the scene; meshes cover the sphere's cube, and the first ball is inside."""
+    trainer = said_otherwise(
+        "neus", shared_tiny, tmp_path, {"unbounded": True, "has_alpha": False}, max_num_iterations=3
+    )
+    model = trainer.model
+    sphere = foreground_sphere(model.config, trainer.train_set.scene)
+    directions = torch.nn.functional.normalize(torch.randn(100, 3), dim=-1)
+    for share, known in ((0.99, True), (1.01, False)):
+        distances, gradients = model.signed_distance(Points(sphere[:3] + share * sphere[3] * directions))
+        assert bool((distances.isfinite() == known).all())
+        assert bool(gradients.isfinite().all())
+    assert float(model.signed_distance(Points(sphere[None, :3]))[0]) < 0
+    low, high = model.scene.box
+    torch.testing.assert_close((low + high) / 2, sphere[:3])
+    torch.testing.assert_close((high - low) / 2, sphere[3].expand(3))
+
+
+def test_the_inverse_width_stays_between_bounds() -> None:
+    """At first it cannot leave its first value; halfway to the end of the bound it may be some 7 times as large."""
+    trainer = trainer_of("neus", sharpen_until=0.8)
+    sharpness = trainer.model.field.sharpness
+    for progress, upper in ((0.0, 20.0), (0.4, 20 * 50**0.5), (0.9, 1e4)):
+        for value in (1e4, 1.0):
+            with torch.no_grad():
+                sharpness.exponent.fill_(math.log(value) / 10)
+            trainer.model.before_step(1, progress)
+            assert float(sharpness()) == pytest.approx(min(max(value, 20.0), upper), rel=1e-3)
 
 
 def test_images_that_are_lit_differently_have_appearances(shared_tiny: Path, tmp_path: Path) -> None:
@@ -134,8 +216,83 @@ def test_images_that_are_lit_differently_have_appearances(shared_tiny: Path, tmp
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({"background_model": "contraction"}, "is not contracted"), ({"sampler": "proposal"}, "--sampler occupancy")],
+    [({"background_model": "contraction"}, "is not contracted"), ({"sampler": "proposal"}, "take --sampler occupancy")],
 )
 def test_what_surfaces_cannot_do_is_refused(settings: dict[str, str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         trainer_of("neus", **settings)
+
+
+def test_normals_of_a_ball_change_with_its_curvature() -> None:
+    """One step e along the tangent plane of a ball of radius r turns the normal by atan(e / r)."""
+    torch.manual_seed(0)
+    normals = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    along = tangents(normals)
+    assert (along * normals).sum(-1).abs().max() < 1e-6
+    assert (along.norm(dim=-1) - 1).abs().max() < 1e-6
+    for radius, step in ((0.5, 0.1), (2.0, 0.01)):
+        moved = torch.nn.functional.normalize(radius * normals + step * along, dim=-1)
+        truth = 2 - 2 / (1 + (step / radius) ** 2) ** 0.5
+        assert float(normal_change(normals, moved)) == pytest.approx(truth, rel=1e-3)
+
+
+def exact_ball() -> tuple[Trainer, SurfaceField]:
+    """A trainer whose field is a ball of radius 0.5 without noise."""
+    trainer = trainer_of("neus", start_radius=0.5)
+    field = trainer.model.field
+    assert isinstance(field, SurfaceField)
+    with torch.no_grad():
+        field.second[0] = 0
+    return trainer, field
+
+
+def shown_by(trainer: Trainer, batch: PixelBatch) -> RenderedBatch:
+    return RenderedBatch(batch, trainer.model.render(batch.rays, batch.background), trainer.model, 0)
+
+
+def test_the_curvature_term_is_that_of_level_sets() -> None:
+    """At samples of a field that is a ball, the mean over the samples that the term asks."""
+    trainer, field = exact_ball()
+    shown = shown_by(trainer, draw_batch(trainer.train_set, 64, "white"))
+    samples = shown.rendered.samples
+    assert samples is not None
+    radii = samples.positions(shown.batch.rays).norm(dim=-1)
+    truth = 2 - 2 / (1 + (samples.deltas / radii).square()).sqrt()
+    assert Curvature()(shown) is None  # in the first half of the budget
+    field.progress = 0.5
+    found = Curvature()(shown)
+    assert found is not None
+    nearest = min(abs(float(truth[first::EVERY].mean()) / float(found) - 1) for first in range(EVERY))
+    assert nearest < 0.02
+    found.backward()
+    assert float(field.second.grad.abs().max()) > 0  # type: ignore[union-attr]
+
+
+def points_on_axes(radius: float) -> PixelBatch:
+    """Pixels of six cameras on the axes, each of which shows a point at `radius` before the centre."""
+    towards = torch.cat([torch.eye(3), -torch.eye(3)])
+    known, colors = torch.full((6,), 2 - radius), torch.ones(6, 3)
+    rays = Rays(-2 * towards, towards)
+    return PixelBatch(torch.arange(6), rays, colors, colors, None, known, torch.zeros(6))
+
+
+def test_points_of_a_reconstruction_pull_the_surface() -> None:
+    """Terms of a ball of radius 0.5: 0 for points on it; for others, what can be computed by hand."""
+    trainer, field = exact_ball()
+    with torch.no_grad():
+        right = shown_by(trainer, points_on_axes(0.5))
+        assert float(SurfacePoints()(right)) < 1e-3  # type: ignore[arg-type]
+        assert float(DistanceBounds()(right)) < 1e-3  # type: ignore[arg-type]
+        wrong = shown_by(trainer, points_on_axes(0.3))
+        assert float(SurfacePoints()(wrong)) == pytest.approx(0.2 / field.size, rel=0.01)  # type: ignore[arg-type]
+        assert float(DistanceBounds()(wrong)) > 0.05  # type: ignore[arg-type]
+        sure = dataclasses.replace(wrong.batch, deviations=torch.full((6,), 0.25))
+        assert float(SurfacePoints()(shown_by(trainer, sure))) == 0  # type: ignore[arg-type]
+        outside = shown_by(trainer, points_on_axes(-3.0))
+        assert SurfacePoints()(outside) is None
+
+
+def test_a_distance_before_a_point_has_bounds() -> None:
+    left, deviations = torch.tensor([0.5, 0.5, 0.5, -0.1, -0.1, -0.1]), torch.full((6,), 0.01)
+    found = beyond_bounds(torch.tensor([0.4, 0.6, -0.2, -0.05, 0.2, -0.3]), left, deviations)
+    torch.testing.assert_close(found, torch.tensor([0.0, 0.09, 0.19, 0.0, 0.19, 0.19]))

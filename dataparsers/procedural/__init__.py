@@ -2,7 +2,8 @@
 
 It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, otherwise XDG_CACHE_HOME,
 otherwise ~/.cache), and read from there. `--num-scenes` renders many random scenes instead, for methods that learn from
-several scenes.
+several scenes. `--courtyard True` photographs a courtyard instead, through which people walk (`--distractors`) and
+where light changes.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from nerfloom.dataparsers.blender import Blender
 
 VERSION = 1
 """Version of the scene's appearance; increase it with every change, so that old caches are not used."""
+MAX_DISTRACTORS = 0.4
+"""Maximum share of pixels that distractors can cover on average."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,17 @@ class Procedural(DataParser):
     num_scenes: int = 1
     """Number of training scenes. With more than one, each is a random arrangement of balls and boxes, and the held-out
     images show further scenes."""
+    courtyard: bool = False
+    """Use a courtyard: the solids on paving between walls, so that every pixel shows a surface."""
+    distractors: float = 0.0
+    """Share of the pixels of training images of the courtyard that show people and things which are in no other image,
+    from 0 to 0.4. Test images are clean."""
+    changing_exposure: bool = False
+    """Whether training images of the courtyard differ in exposure, by up to a stop."""
+    changing_white_balance: bool = False
+    """Whether training images of the courtyard differ in white balance."""
+    changing_sun: bool = False
+    """Whether the sun stands elsewhere in each training image of the courtyard."""
     views_per_scene: int = 12
     """Images of each random scene. Of a held-out scene, every fourth is evaluated and the others are sources."""
 
@@ -53,7 +67,14 @@ class Procedural(DataParser):
             raise DataError("--num-scenes must be at least 1, and --views-per-scene at least 4")
         if self.num_scenes > 1 and self.moving:
             raise DataError("--moving is a variant of the embedded scene: leave out --num-scenes or --moving")
-        parsed = Blender().parse(self._rendered_folder(), split)
+        self._check_courtyard()
+        folder = self._rendered_folder()
+        if self.courtyard:
+            from nerfloom.dataparsers.procedural.courtyard import HALF
+
+            parsed = Blender(half_size=HALF).parse(folder, split)
+            return replace(parsed, appearance_varies=any(self._changing))
+        parsed = Blender().parse(folder, split)
         return parsed if self.num_scenes == 1 else _of_many(parsed, split)
 
     def signed_distance(self, points: Tensor) -> Tensor:
@@ -62,11 +83,26 @@ class Procedural(DataParser):
 
         return signed_distance(points)
 
+    @property
+    def _changing(self) -> tuple[bool, bool, bool]:
+        return self.changing_exposure, self.changing_white_balance, self.changing_sun
+
+    def _check_courtyard(self) -> None:
+        if not 0 <= self.distractors <= MAX_DISTRACTORS:
+            raise DataError(f"--distractors is {self.distractors}; it must be from 0 to {MAX_DISTRACTORS}")
+        if self.courtyard and (self.moving or self.num_scenes > 1):
+            raise DataError("--courtyard is a scene of its own: leave out --moving and --num-scenes")
+        if not self.courtyard and (self.distractors or any(self._changing)):
+            raise DataError("--distractors and --changing-* are of the courtyard: add --courtyard True")
+
     def _rendered_folder(self) -> Path:
         """Return the scene's folder; render the scene first if it is not in the cache."""
         kind, count = "moving" if self.moving else "static", str(self.num_train)
         if self.num_scenes > 1:
             kind, count = f"{self.num_scenes}-scenes", str(self.views_per_scene)
+        if self.courtyard:
+            differs = "".join(letter for letter, is_so in zip("ews", self._changing, strict=True) if is_so)
+            kind = f"courtyard{self.distractors:g}{differs}"
         folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{count}-seed{self.scene_seed}"
         if not folder.is_dir():
             say(f"rendering {'the embedded scene' if self.num_scenes == 1 else 'random scenes'} into {folder}")
@@ -87,9 +123,22 @@ class Procedural(DataParser):
                 folder, size=self.size, num_scenes=self.num_scenes, views=views, seed=self.scene_seed, progress=track
             )
             return
+        counts = {"train": self.num_train, "val": 8, "test": 16}
+        if self.courtyard:
+            from nerfloom.dataparsers.procedural.photographs import Changing, write_photographs
+
+            write_photographs(
+                folder,
+                size=self.size,
+                counts=counts,
+                distractors=self.distractors,
+                changing=Changing(*self._changing),
+                seed=self.scene_seed,
+                progress=track,
+            )
+            return
         from nerfloom.dataparsers.procedural.views import write_dataset
 
-        counts = {"train": self.num_train, "val": 8, "test": 16}
         write_dataset(folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed, progress=track)
 
 

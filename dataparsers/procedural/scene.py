@@ -152,11 +152,31 @@ PARTS: dict[str, Part] = {
 }
 """The solids of the embedded scene by name; the ball and the box can move."""
 _LIGHT_AZIMUTH, _LIGHT_HEIGHT = math.radians(-118.0), math.radians(54.0)
-LIGHT: Colour = (  # unit vector towards the sun
-    math.cos(_LIGHT_HEIGHT) * math.cos(_LIGHT_AZIMUTH),
-    math.cos(_LIGHT_HEIGHT) * math.sin(_LIGHT_AZIMUTH),
-    math.sin(_LIGHT_HEIGHT),
-)
+
+
+def sun_at(azimuth: float, height: float) -> Colour:
+    """Return the unit vector towards the sun at an `azimuth` and a `height` above the horizon, radians."""
+    return math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)
+
+
+LIGHT = sun_at(_LIGHT_AZIMUTH, _LIGHT_HEIGHT)
+"""Unit vector towards the sun."""
+
+
+class Light(NamedTuple):
+    """Light of one image: where the sun stands, and how the camera weighs light.
+
+    Args:
+        sun: unit vector towards the sun.
+        gains: factors of red, green and blue light before display colours are made of it: exposure and white balance.
+    """
+
+    sun: Colour = LIGHT
+    gains: Colour = (1.0, 1.0, 1.0)
+
+
+DAYLIGHT = Light()
+"""The light of the embedded scene."""
 _SUN, _SKY, _GROUND = (1.55, 1.42, 1.22), (0.46, 0.54, 0.66), (0.30, 0.24, 0.19)
 _LIGHT_SPREAD = 0.07  # half width of the penumbra per unit distance
 
@@ -242,10 +262,10 @@ def _distance(poses: list[_Pose], p: Tensor) -> Tensor:
     return functools.reduce(torch.minimum, distances)
 
 
-def _sunlight(poses: list[_Pose], p: Tensor) -> Tensor:
+def _sunlight(poses: list[_Pose], p: Tensor, sun: Colour) -> Tensor:
     """Return the visible fraction (R,) of the sun at points (3, R), from the distance of the ray to each part."""
     visible = torch.ones_like(p[0])
-    light = p.new_tensor(LIGHT)[:, None].expand_as(p)
+    light = p.new_tensor(sun)[:, None].expand_as(p)
     for pose in poses:
         part = pose.part
         if not part.shadow:
@@ -272,7 +292,9 @@ def _surroundings(d: Tensor) -> Tensor:
     return light + 2.2 * lamp
 
 
-def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_index: Tensor) -> Tensor:
+def _shade(
+    poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_index: Tensor, lit: Light = DAYLIGHT
+) -> Tensor:
     """Return display colours (3, R) of surface points (3, R) seen along unit `view` directions (3, R)."""
     albedo, gloss = torch.zeros_like(p), torch.zeros_like(p[0])
     for index, pose in enumerate(poses):
@@ -281,8 +303,8 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_ind
         albedo[:, selected] = pose.part.texture(local.to_local(p[:, selected] - local.centre))
         gloss[selected] = pose.part.gloss
     outside = p + 1e-3 * normal
-    sun = _sunlight(poses, outside)
-    facing = dot(normal, p.new_tensor(LIGHT)[:, None]).clamp(min=0.0)
+    sun = _sunlight(poses, outside, lit.sun)
+    facing = dot(normal, p.new_tensor(lit.sun)[:, None]).clamp(min=0.0)
     # Ambient occlusion: free distance along the normal, relative to that above a plane.
     rooms = [(_distance(poses, p + h * normal) / h).clamp(0.0, 1.0) for h in (0.06, 0.2)]
     room = rooms[0] + rooms[1]
@@ -293,15 +315,21 @@ def _shade(poses: list[_Pose], p: Tensor, normal: Tensor, view: Tensor, part_ind
     n, v, g = normal[:, shiny], view[:, shiny], gloss[shiny]
     slope = dot(n, v)
     fresnel = 0.05 + 0.95 * (1.0 + slope).clamp(0.0, 1.0) ** 5
-    halfway = p.new_tensor(LIGHT)[:, None] - v
+    halfway = p.new_tensor(lit.sun)[:, None] - v
     sparkle = (dot(n, halfway) / dot(halfway, halfway).sqrt()).clamp(min=0.0) ** 90 * sun[shiny]
     mirror = _surroundings(v - 2.0 * slope * n) * fresnel + 1.2 * sparkle
     light[:, shiny] += g * mirror * (0.3 + 0.35 * room[shiny])
+    light = light * p.new_tensor(lit.gains)[:, None]
     return (1.0 - (-1.35 * light).exp()).sqrt()  # compression of highlights, then display gamma
 
 
 def trace_rows(
-    origins: Tensor, directions: Tensor, time: float | Tensor, colour: bool = True, parts: Parts = PARTS
+    origins: Tensor,
+    directions: Tensor,
+    time: float | Tensor,
+    colour: bool = True,
+    parts: Parts = PARTS,
+    lit: Light = DAYLIGHT,
 ) -> Hit:
     """Compute `trace` with vectors stored as rows.
 
@@ -311,6 +339,7 @@ def trace_rows(
         time: in [0, 1], a number or (R,).
         colour: whether to compute colours; otherwise they are zero.
         parts: the solids of the scene.
+        lit: the light of the image.
 
     Returns:
         Same as `trace`, but normals and rgb are (3, R).
@@ -329,7 +358,7 @@ def trace_rows(
         n[:, selected] = local.to_world(pose.part.shape.normal(local.to_local(p[:, selected] - local.centre)))
     normals[:, rays] = n
     if colour:
-        rgb[:, rays] = _shade(poses, p, n, view, part)
+        rgb[:, rays] = _shade(poses, p, n, view, part, lit)
     return Hit(depth, normals, rgb, part_index >= 0, part_index)
 
 

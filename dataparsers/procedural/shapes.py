@@ -301,6 +301,55 @@ class Torus(Shape):
         return first, second
 
 
+@dataclass(frozen=True)
+class Union(Shape):
+    """Several solids as one.
+
+    Args:
+        members: each solid with the position of its origin.
+    """
+
+    members: tuple[tuple[Shape, tuple[float, float, float]], ...]
+
+    @property
+    def bound(self) -> float:
+        return max(math.hypot(*centre) + shape.bound for shape, centre in self.members)
+
+    def distance(self, p: Tensor) -> Tensor:
+        return self._distances(p).amin(0)
+
+    def normal(self, p: Tensor) -> Tensor:
+        nearest = self._distances(p).abs().argmin(0)
+        normals = torch.stack([shape.normal(p - _column(centre, p)) for shape, centre in self.members])
+        return normals.gather(0, nearest.expand(1, 3, -1))[0]
+
+    def enter(self, offset: Tensor, direction: Tensor, start: Tensor) -> Tensor:
+        entries = [
+            shape.enter(own, direction, start - shift) + shift for shape, own, shift in self._lines(offset, direction)
+        ]
+        return torch.stack(entries).amin(0)
+
+    def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:
+        lines = self._lines(offset, direction)
+        return tuple(t + shift for shape, own, shift in lines for t in shape.closest(own, direction))
+
+    def _distances(self, p: Tensor) -> Tensor:
+        return torch.stack([shape.distance(p - _column(centre, p)) for shape, centre in self.members])
+
+    def _lines(self, offset: Tensor, direction: Tensor) -> list[tuple[Shape, Tensor, Tensor]]:
+        """Return each solid, the lines' points closest to its origin relative to it, and their parameters."""
+        lines = []
+        for shape, centre in self.members:
+            relative = offset - _column(centre, offset)
+            shift = -dot(relative, direction)
+            lines.append((shape, relative + shift * direction, shift))
+        return lines
+
+
+def _column(vector: tuple[float, float, float], like: Tensor) -> Tensor:
+    return like.new_tensor(vector)[:, None]
+
+
 def _falling_root(p: Tensor, q: Tensor, r: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Return the root of t^4 + p t^2 + q t + r between `low` (positive) and `high` (negative), by guarded Newton."""
     t = 0.5 * (low + high)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from nerfloom.dataparsers.procedural.scene import PARTS, Parts, trace_rows
+from nerfloom.dataparsers.procedural.scene import DAYLIGHT, PARTS, Light, Parts, trace_rows
 from nerfloom.kernels.native import torch_on_one_thread
 
 CAMERA_ANGLE = 0.6911
@@ -73,6 +73,7 @@ def _render_rgba(
     time: float,
     supersample: int,
     parts: Parts,
+    lit: Light,
 ) -> npt.NDArray[np.uint8]:
     """Return straight colour and coverage (H, W, 4) from supersample^2 float32 rays on a grid in every pixel."""
     column, row = (c.float() for c in _pixel_grid(size))
@@ -81,7 +82,7 @@ def _render_rgba(
     dy, dx = (c.flatten() for c in torch.meshgrid(steps, steps, indexing="ij"))
     for pixels in torch.arange(column.numel()).split(max(1, _CHUNK_RAYS // supersample**2)):
         x, y = ((c[pixels, None] + d).flatten() for c, d in ((column, dx), (row, dy)))
-        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x, y), time, parts=parts)
+        hit = trace_rows(*_camera_rays(camera_to_world, camera_angle_x, size, x, y), time, parts=parts, lit=lit)
         samples = torch.cat([hit.rgb, hit.hit[None]]).reshape(4, -1, supersample**2)
         image[:, pixels] = samples.mean(2)
     image[:3] /= image[3].clamp(min=1e-6)
@@ -98,6 +99,7 @@ def render_view(
     supersample: int = SUPERSAMPLE,
     geometry: bool = True,
     parts: Parts = PARTS,
+    lit: Light = DAYLIGHT,
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32] | None, npt.NDArray[np.float32] | None]:
     """Render one view of the scene.
 
@@ -110,6 +112,7 @@ def render_view(
         supersample: rays along each side of a pixel.
         geometry: whether to compute depth and normals.
         parts: the solids of the scene.
+        lit: the light of the image.
 
     Returns:
         rgba (H, W, 4) uint8, straight colour and covered fraction of the pixel; depth (H, W) float32 along the rays
@@ -117,25 +120,43 @@ def render_view(
         None without `geometry`.
     """
     size = (width, height)
-    rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample, parts)
+    rgba = _render_rgba(camera_to_world, camera_angle_x, size, time, supersample, parts, lit)
     if not geometry:
         return rgba, None, None
     return rgba, *_render_geometry(camera_to_world, camera_angle_x, size, time, parts)
 
 
-def camera_pose(azimuth: float, elevation: float) -> npt.NDArray[np.float64]:
-    """Return the camera-to-world matrix (4, 4) of a camera that looks at the origin from distance `RADIUS`.
+def visible_parts(
+    camera_to_world: npt.ArrayLike, size: tuple[int, int], parts: Parts
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Return depth (H, W) and index of the part (H, W) at the pixel centres, inf and -1 for background, at time 0.
+
+    Args:
+        camera_to_world: (3, 4) or (4, 4), as for `render_view`; the angle is `CAMERA_ANGLE`.
+        size: width and height of the image, pixels.
+        parts: the solids of the scene.
+    """
+    column, row = _pixel_grid(size)
+    rays = _camera_rays(camera_to_world, CAMERA_ANGLE, size, column + 0.5, row + 0.5)
+    hit = trace_rows(*rays, 0.0, colour=False, parts=parts)
+    shape = size[::-1]
+    return hit.depth.reshape(shape).numpy(), hit.part.reshape(shape).numpy()
+
+
+def camera_pose(azimuth: float, elevation: float, radius: float = RADIUS) -> npt.NDArray[np.float64]:
+    """Return the camera-to-world matrix (4, 4) of a camera that looks at the origin.
 
     Args:
         azimuth: angle around z, radians.
         elevation: angle above the horizon, radians.
+        radius: distance from the origin, scene units.
     """
     back = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
     )
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(back, right), back, RADIUS * back], axis=1)
+    pose[:3] = np.stack([right, np.cross(back, right), back, radius * back], axis=1)
     return pose
 
 
@@ -213,7 +234,7 @@ def write_views(
         moving: whether each frame has a time; otherwise the scene is static, at time 0.
         progress: wrapper of the iteration over views, called with the iterable and the number of views.
     """
-    jobs = [job for split, of_split in poses.items() for job in _lay_out(folder, split, of_split, moving)]
+    jobs = [job for split, of_split in poses.items() for job in lay_out(folder, split, of_split, moving)]
     with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
         done = pool.map(lambda job: _write_view(*job, size=size, parts=parts), jobs)
         for _ in progress(done, len(jobs)):
@@ -243,10 +264,17 @@ def complete_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _lay_out(
+def lay_out(
     folder: Path, split: str, poses: Sequence[npt.NDArray[np.float64]], moving: bool
 ) -> list[tuple[Path, npt.NDArray[np.float64], float]]:
-    """Write the JSON file of a split, and return the file, pose and time of each view."""
+    """Write the JSON file of a split, and return the file, pose and time of each view.
+
+    Args:
+        folder: folder of the data set.
+        split: train, val or test.
+        poses: camera-to-world matrices (4, 4).
+        moving: whether each frame has a time.
+    """
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames, jobs = [], []
     for index, pose in enumerate(poses):

@@ -33,6 +33,7 @@ COMMANDS = {
     "nerfacto": "nerfacto {}",
     "neus": "neus {}",
     "volsdf": "volsdf {}",
+    "ref-nerf": "ref-nerf {}",
     "pixel-nerf": "pixel-nerf {} procedural --num-scenes 200 --size 32",
     "gaussian-splatting": "gaussian-splatting {}",
     "tensorf": "tensorf {}",

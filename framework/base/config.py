@@ -143,10 +143,11 @@ class TrainConfig:
 
     # Values of settings that a method lacks, so that shared code need not know the class of its settings. Without
     # annotation they are no fields, and so no flags.
-    sampler, bounded_sampler, time_slices = "", "occupancy", 1
+    sampler, bounded_sampler, time_slices, robust = "", "occupancy", 1, "off"
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
+    robust_quantile, robust_steps = 0.8, 1_000
 
     def __init_subclass__(cls, **defaults: Any) -> None:
         """Change defaults of inherited settings, as in `class MyConfig(RayConfig, learning_rate=1e-2)`.
@@ -184,7 +185,22 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class RayConfig(TrainConfig):
+class RobustConfig(TrainConfig):
+    """Settings of a method that can leave out pixels that other images contradict."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"robust_quantile": (0.05, 1), "robust_steps": (0, 1e6)}
+    """Allowed ranges."""
+    robust: Literal["off", "percentile"] = "off"
+    """Whether to learn from pixels that the other images contradict, such as people who walk through. percentile: leave
+    out regions with large errors (RobustNeRF, SpotLessSplats); off: learn from all pixels."""
+    robust_quantile: float = 0.8
+    """Share of pixels that agree with the other images for certain (percentile); fine texture and edges are added."""
+    robust_steps: int = 1_000
+    """Steps during which all pixels count, until there is a scene that images can contradict (percentile)."""
+
+
+@dataclass(frozen=True)
+class RayConfig(RobustConfig):
     """Settings of every method that casts rays."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -242,15 +258,20 @@ class SourceViewsConfig(RayConfig):
     """Number of images that a training step draws pixels from; each is rendered from other images of its scene."""
 
 
+HeldOutAppearance = Literal["mean", "half", "nearest"]
+"""What held-out images are evaluated with."""
+
+
 @dataclass(frozen=True)
 class AppearanceConfig(TrainConfig):
     """Settings of a method that learns an appearance for each image."""
 
     RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
     """Allowed ranges."""
-    eval_appearance: Literal["mean", "half"] = "mean"
+    eval_appearance: HeldOutAppearance = "mean"
     """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
-    image, with metrics of the right half (NeRF-W's protocol)."""
+    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
+    nearest."""
     mean_appearance_share: float = 0.25
     """Probability of training an image with the mean appearance, so that the model learns to render it."""
 

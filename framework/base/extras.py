@@ -11,6 +11,7 @@ EXTRAS: dict[str, dict[str, str]] = {
     "viewer": {"viser": "viser"},
     "export": {"skimage": "scikit-image", "trimesh": "trimesh", "fast_simplification": "fast-simplification"},
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
+    "cluster": {"ray": "ray"},
 }
 """Extra in pyproject.toml -> {imported module: name of its package for pip}."""
 

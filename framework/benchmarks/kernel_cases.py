@@ -34,6 +34,7 @@ from nerfloom.kernels.splats.blend import blend
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
 from nerfloom.kernels.surfaces.distance import distance_network
+from nerfloom.kernels.surfaces.samples import Ball, Intervals, surface_samples, unit_normals
 
 Inputs = dict[str, Tensor]
 KINDS = ("random", "extreme", "empty")
@@ -177,6 +178,7 @@ def _at_points() -> Iterator[Family]:
         for positions in (1.2 * torch.rand(130, 3) - 0.1, faces, torch.rand(0, 3))
     )  # fmt: skip
     yield "distance_network", with_gradient, "table first second", (usual, hard, none)
+    yield from _surfaces(unit)
     poles = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
     usual, hard, none = ({"directions": rows} for rows in (unit, poles, unit[:0]))
     yield "spherical_harmonics", lambda directions: (spherical_harmonics(directions, 4),), "", (usual, hard, none)
@@ -204,6 +206,35 @@ def _at_points() -> Iterator[Family]:
     hard["mean"], hard["square"] = torch.zeros(5, 2), torch.zeros(5, 2)
     hard["seen"] = torch.tensor([0.0, 0, 3, 1e6, 5e3])
     yield "sparse_adam", updated, "", (adam(300), hard, adam(0))
+
+
+def _surfaces(directions: Tensor) -> Iterator[Family]:
+    """Samples of a signed distance around a ball, and their normals."""
+
+    def ball(like: Tensor) -> Ball:
+        return Ball(like.new_tensor([0.1, -0.2, 0.3]), like.new_tensor([0.5, 0.4, 0.6]), 1.0, 0.9, 1e-3)
+
+    def both(
+        network: Tensor, sharpness: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
+    ) -> Sequence[Tensor]:
+        given = network, sharpness, positions, ball(network)
+        return *surface_samples(*given, Intervals(directions, lengths, 0.4)), surface_samples(*given)[0]
+
+    count = len(directions)
+    along = {"directions": directions.flip(0), "lengths": torch.rand(count)}
+    usual = {
+        "network": torch.randn(count, 8) / 4,
+        "sharpness": torch.tensor(12.0),
+        "positions": directions * 1.1,
+    } | along
+    hard = {"network": torch.zeros(count, 8), "sharpness": torch.tensor(1e4), "positions": directions * 1e4}
+    hard |= {"directions": -directions, "lengths": torch.zeros(count)}
+    none = {name: value[:0] if value.ndim else value for name, value in usual.items()}
+    yield "surface_samples", both, "network sharpness", (usual, hard, none)
+    rows = torch.randn(count, 7)
+    lengths = torch.tensor([1e-30, 1e-6, 1.0, 1e6, 1e15]).repeat_interleave(count // 5)[:, None]
+    usual, hard, none = ({"features": each} for each in (rows, rows[: len(lengths)] * lengths, rows[:0]))
+    yield "unit_normals", lambda features: (unit_normals(features),), "features", (usual, hard, none)
 
 
 def _grid(like: Tensor, full: bool = True) -> Occupancy:

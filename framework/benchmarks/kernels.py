@@ -30,6 +30,7 @@ from nerfloom.kernels import native
 from nerfloom.kernels.adam.adam import sparse_adam, sparse_adam_reference
 from nerfloom.kernels.compositing.density import composite, composite_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.encodings.integrated_directional import directional_encoding, directional_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
@@ -191,6 +192,13 @@ def on_any_device(count: int) -> Iterator[Kernel]:
         spherical_harmonics_reference,
         Work(bytes=4 * (3 + 16)),
         backward=False,
+    )
+    yield of_function(
+        "directional encoding, 5 bands",
+        [normalize(torch.randn(count, 3), dim=-1), torch.rand(count)],
+        directional_encoding,
+        directional_encoding_reference,
+        Work(bytes=4 * (4 + 67)),
     )
     for name, layout, features in layouts():
         yield _plane_lookup(name, layout, features, count)

@@ -27,7 +27,7 @@ MAX_NAME = 20
 
 @dataclass(frozen=True)
 class Scale:
-    """What the lengths of a run are in."""
+    """The unit of a run's lengths."""
 
     factor: float = 1.0
     """Lengths in `unit` per length of the input."""

@@ -25,6 +25,8 @@ class View:
     """Distance in pixels between rendered rows and columns; the first is at `stride // 2`."""
     scene: int | None = None
     """Index of the scene if the images show several; None for the only one or the first."""
+    image: int | None = None
+    """Index of the training image whose own content, which is in no other image, is shown; None for none."""
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:

@@ -14,9 +14,9 @@ import nerfloom
 from nerfloom.base.console import console, say
 from nerfloom.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
 from nerfloom.base.from_nerfstudio import KINDS
+from nerfloom.base.signals import exit_status, orderly_end
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
-from nerfloom.training.signals import exit_status, orderly_end
 
 if TYPE_CHECKING:
     from nerfloom.data.parsed_scene import DataParser

@@ -11,15 +11,17 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import check_weights, run_command
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
+from nerfloom.cli.job_flags import JobFlags
 from nerfloom.training.run_path import check_data, check_writable
 
 if TYPE_CHECKING:
     from nerfloom.comparison.measures import Row
     from nerfloom.comparison.plan import Plan
+    from nerfloom.jobs.launcher import Launcher
 
 
 @dataclass(frozen=True)
-class CompareFlags(GeometryFlags):
+class CompareFlags(JobFlags, GeometryFlags):
     """Compare methods on one data set: each is trained and evaluated under the same conditions, in its own process.
 
     Writes report.html, report.md, results.json and results.csv. If run again, it continues where it was stopped."""
@@ -51,8 +53,6 @@ class CompareFlags(GeometryFlags):
     """CPU threads of each run. Default: all cores."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on."""
-    jobs: int = 1
-    """Number of simultaneous runs, each on its own CUDA device."""
 
 
 def main() -> None:
@@ -72,7 +72,7 @@ def _command(arguments: list[str]) -> None:
     plan = plan_of(flags)
     from nerfloom.base.console import say
 
-    rows = compare(plan, flags.jobs)
+    rows = compare(plan, flags.chosen_launcher(plan.folder))
     failed = [row.label for row in rows if row.failures]
     say(f"report: {plan.folder / 'report.html'} (also report.md, results.json, results.csv)")
     if failed:
@@ -120,12 +120,12 @@ def plan_of(flags: CompareFlags) -> Plan:
     return Plan(tuple(Contender.of(text) for text in flags.methods), conditions, flags.repeats, folder.resolve())
 
 
-def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
+def compare(plan: Plan, launcher: Launcher | None = None) -> list[Row]:
     """Run the missing runs of a comparison, write its report and print its table.
 
     Args:
         plan: the methods, conditions and folder.
-        jobs_at_once: number of simultaneous runs.
+        launcher: what runs them; None for processes on this machine, one after the other.
 
     Returns:
         A row of the table for each method.
@@ -134,17 +134,21 @@ def compare(plan: Plan, jobs_at_once: int = 1) -> list[Row]:
     from nerfloom.comparison import plots
     from nerfloom.comparison.measures import measure, rows_of
     from nerfloom.comparison.report import console_table, write_report
-    from nerfloom.comparison.runner import run_jobs
+    from nerfloom.comparison.runner import run_all
+    from nerfloom.jobs.processes import Processes
 
     if not plots.available():
         say(f"the report will be {plots.MISSING}")
+    launcher = Processes() if launcher is None else launcher
     plan.claim_folder()
     failures: dict[str, list[str]] = {}
-    for job, failure in run_jobs(plan, jobs_at_once).items():
-        failures.setdefault(job.contender.label, []).append(f"seed {job.seed}: {failure.reason} ({failure.log})")
-    runs = [run for run in (measure(job, plan.conditions) for job in plan.jobs()) if run is not None]
+    for planned, failure in run_all(plan, launcher).items():
+        failures.setdefault(planned.contender.label, []).append(
+            f"seed {planned.seed}: {failure.reason} ({failure.log})"
+        )
+    runs = [run for run in (measure(planned, plan.conditions) for planned in plan.runs()) if run is not None]
     rows = rows_of([contender.label for contender in plan.contenders], runs, failures)
-    write_report(plan, rows)
+    write_report(plan, rows, launcher.sharing)
     console.print(console_table(rows))
     return rows
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerfloom.base.errors import FlagError
+from nerfloom.base.signals import Stopped, signal_of
 from nerfloom.cli.common import chosen_kind, run_command
 from nerfloom.cli.flags import read_flags
 from nerfloom.downloads.catalogue import DATASETS
-from nerfloom.training.signals import Stopped, signal_of
 
 USAGE = """\
 usage: ns-download-data NAME [--scenes SCENE ...] [--save-dir DIR] [flags]

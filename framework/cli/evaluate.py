@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from nerfloom.base.config import RaysPerPixel
+from nerfloom.base.config import HeldOutAppearance, RaysPerPixel
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
 from nerfloom.cli.common import make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
@@ -33,9 +33,10 @@ class EvalFlags(GeometryFlags, RunFlags):
     """Maximum number of evaluated images, evenly spaced. Default: all."""
     rays_per_pixel: RaysPerPixel | None = None
     """Rays averaged per pixel. Default: the run's setting."""
-    eval_appearance: Literal["mean", "half"] | None = None
+    eval_appearance: HeldOutAppearance | None = None
     """Appearance of held-out images. mean: the mean of the training images'; half: fitted to the left half of each
-    image, with metrics of the right half (NeRF-W's protocol). Default: the run's setting."""
+    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
+    nearest. Default: the run's setting."""
     lpips_weights: Path | None = None
     """File of LPIPS weights with AlexNet (.npz). Default: the run's setting."""
     max_error: str | None = None
@@ -97,8 +98,9 @@ def _command(arguments: list[str]) -> None:
     if bound is not None:
         worst, faster = measured_error(model, dataset, bound)
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
-    if flags.eval_appearance == "half" and evaluation.eval_appearance is None:
-        say("--eval-appearance half: this run has no appearance vectors; whole images were evaluated")
+    if flags.eval_appearance in ("half", "nearest") and evaluation.eval_appearance is None:
+        asked = flags.eval_appearance
+        say(f"--eval-appearance {asked}: this run has no appearance vectors; whole images were evaluated")
     say(f"LPIPS: {evaluation.lpips_note}")
     if evaluation.masks_note is not None:
         say(f"masks: {evaluation.masks_note}")

@@ -11,10 +11,10 @@ from typing import Any, get_type_hints
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError, FlagError
+from nerfloom.base.signals import Stopped, signal_of
 from nerfloom.cli.common import chosen_kind, run_command
 from nerfloom.cli.flags import read_flags
 from nerfloom.processing.settings import ColmapFlags, OutputFlags
-from nerfloom.training.signals import Stopped, signal_of
 
 USAGE = """\
 usage: ns-process-data KIND --data IN --output-dir OUT [flags]
@@ -41,6 +41,8 @@ class ImagesFlags(ColmapFlags):
         super().check()
         if self.masks_dir is not None and self.undistort:
             raise ConfigError("--masks-dir with --undistort: masks are not undistorted; leave one of them out")
+        if self.masks_dir is not None and self.mask_moving:
+            raise ConfigError("--masks-dir with --mask-moving: an image has one mask; leave one of them out")
         if self.masks_dir is not None and not self.masks_dir.is_dir():
             raise ConfigError(f"--masks-dir {self.masks_dir}: there is no such folder")
 
@@ -169,34 +171,34 @@ def _is_finished(flags: ColmapFlags) -> bool:
 
 
 def _process_images(flags: ImagesFlags) -> None:
-    from nerfloom.processing.job import Job
     from nerfloom.processing.listing import find_images
     from nerfloom.processing.output import begin
     from nerfloom.processing.pipeline import process
+    from nerfloom.processing.reconstruction import Reconstruction
     from nerfloom.processing.sequence import is_sequence
 
     if _is_finished(flags):
         return
     sources = find_images(flags.data, [flags.output_dir, *([] if flags.masks_dir is None else [flags.masks_dir])])
     begin(flags, sources)
-    process(Job(flags, ordered=is_sequence(sources)), flags.data, sources, flags.masks_dir)
+    process(Reconstruction(flags, ordered=is_sequence(sources)), flags.data, sources, flags.masks_dir)
 
 
 def _process_video(flags: VideoFlags) -> None:
     from nerfloom.processing.ffmpeg import frame_count
-    from nerfloom.processing.job import Job
     from nerfloom.processing.output import begin
     from nerfloom.processing.pipeline import process
+    from nerfloom.processing.reconstruction import Reconstruction
     from nerfloom.processing.unfinished import frames_of
 
     if _is_finished(flags):
         return
     frame_count(flags.data)  # before anything is removed, check that the video can be read
     begin(flags, [Path(flags.data.name)])
-    job = Job(flags, ordered=True)
-    with job.timed("reading the video"):
+    state = Reconstruction(flags, ordered=True)
+    with state.timed("reading the video"):
         folder, sources = frames_of(flags.output_dir, flags.data, flags.num_frames_target)
-    process(job, folder, sources, None)
+    process(state, folder, sources, None)
 
 
 def _convert_polycam(flags: PolycamFlags) -> None:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from nerfloom.cli.render_paths import Views
     from nerfloom.evaluation.frames import Frames
     from nerfloom.rendering.outputs import Output
+    from nerfloom.training.file_data import DataFormat
     from nerfloom.training.loaded import Loaded
-    from nerfloom.training.splat_files import DataFormat
 
 NUMBERS = ("distance", "scalar")
 """Kinds of outputs shown with a colour map."""

@@ -1,4 +1,4 @@
-"""Flags of every command that opens a trained run or a file of Gaussians."""
+"""Flags of every command that opens a trained run, a file of Gaussians, or an octree."""
 
 from __future__ import annotations
 
@@ -17,19 +17,22 @@ OPENS = "RUN_FOLDER or FILE"
 
 @dataclass(frozen=True, kw_only=True)
 class RunFlags:
-    """The trained run, or the file of Gaussians."""
+    """The trained run, the file of Gaussians, or the octree."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), or a file of Gaussians (.ply, .spz, .splat). The
-    flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
+    octree (.octree). The flag's name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None
-    """Folder of the data, if it has moved since training; optional data for a file of Gaussians."""
+    """Folder of the data, if it has moved since training; optional data for a file."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
+    eval_rendering: Literal["volume", "surface"] | None = None
+    """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
+    the surface. Default: the run's setting."""
 
     def check(self) -> Path:
         """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
@@ -51,4 +54,5 @@ class RunFlags:
         """
         from nerfloom.training.load import load
 
-        return load(found, self.load_checkpoint, self.device_type, self.data, up=self.up, **others)
+        given = self.load_checkpoint, self.device_type, self.data
+        return load(found, *given, eval_rendering=self.eval_rendering, up=self.up, **others)

@@ -15,6 +15,7 @@ from nerfloom.base.device import choose_device, peak_memory
 from nerfloom.base.errors import ConfigError, LostProcessError
 from nerfloom.base.extras import install_command
 from nerfloom.base.processes import from_first, joined_processes, processes
+from nerfloom.base.signals import Stopped, handled, signal_of
 from nerfloom.cli.common import check_weights
 from nerfloom.cli.next_steps import after_training
 from nerfloom.data.dataset import Dataset
@@ -31,12 +32,13 @@ from nerfloom.training.machine import kernels
 from nerfloom.training.outcome import Outcome
 from nerfloom.training.report import SUMMARY, write_evaluation, write_summary
 from nerfloom.training.run import Run, create_folder, write_report, write_transforms
-from nerfloom.training.signals import Stopped, handled, signal_of
 from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 
 MAX_PICTURES = 4
 """Maximum number of held-out views whose pictures are written at the end."""
+MAX_TRAINING = 3
+"""Maximum number of training images whose pictures are written, if the method shows what they have alone."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
 
@@ -197,6 +199,10 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     if evaluation.warning is not None:
         say(f"warning: {evaluation.warning}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
+    if any(output.of_training for output in trainer.model.outputs):
+        folder = run.folder / "pictures" / "training"
+        evaluate(trainer.model, trainer.train_set, max_images=MAX_TRAINING, pictures=folder, title="Training images")
+        say(f"what training images have alone: {folder}")
 
 
 def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:

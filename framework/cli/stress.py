@@ -29,6 +29,7 @@ registered method. Each is trained for a short time, on a ball rendered in memor
 first without a condition (plain) and then under each of
 
   images                      all-white all-black all-transparent one-image one-pixel-images duplicate-cameras
+                              distractors
   cameras                     field-of-view-4 field-of-view-170 inside
   units and origin            scale-1e-6 scale-1e6 shift-1e4, and as for captures: placed scale-1e-6-placed
                               scale-1e6-placed shift-1e4-placed

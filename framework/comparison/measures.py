@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from nerfloom.comparison.plan import Conditions, Job
+from nerfloom.comparison.plan import Conditions, PlannedRun
 
 TIME_TOLERANCE = 0.01
 """Relative difference below which times count as equal: a run ends with the step that uses up its time."""
@@ -31,6 +31,7 @@ class Measured:
         ms_ssim: mean SSIM at five scales; None for small images.
         lpips: mean LPIPS over all evaluated views; None if it was not computed.
         floaters: mean percentage of sparse points with matter in front of them; None without sparse points.
+        normal_mae: mean angle between rendered and true normals, degrees; None without either.
         steps: number of training steps.
         parameters: number of parameters.
         skipped_steps: number of steps dropped because of non-finite values.
@@ -52,6 +53,7 @@ class Measured:
     ms_ssim: float | None
     lpips: float | None
     floaters: float | None
+    normal_mae: float | None
     views: int
     """Number of evaluated views."""
     steps: int
@@ -106,36 +108,38 @@ class Measured:
         return {**asdict(self), "seconds_to": {str(level): s for level, s in self.seconds_to.items()}}
 
 
-def measure(job: Job, conditions: Conditions) -> Measured | None:
-    """Return the measurements of a job; None if it is not finished or its images are not finite.
+def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
+    """Return the measurements of a planned run; None if it is not finished or its images are not finite.
 
     Args:
+        planned: the run.
         conditions: the conditions of the comparison.
     """
-    summary, evaluation = read_json(job.folder / "summary.json"), read_json(job.evaluation)
+    summary, evaluation = read_json(planned.folder / "summary.json"), read_json(planned.evaluation)
     if not isinstance(summary, dict) or not isinstance(evaluation, dict):
         return None
     results = evaluation["results"]
     if results["psnr"] is None:
         return None
-    points = read_json(job.folder / "learning_curve.json") or []
+    points = read_json(planned.folder / "learning_curve.json") or []
     full = [
         p for p in points if p.get("full", True) and p["psnr"] is not None
     ]  # evaluations of other numbers of images are not comparable
     curve = tuple((float(p["seconds"]), float(p["psnr"])) for p in full)
     profile, skips = (
-        read_json(job.folder / "scene_profile.json") or {},
-        read_json(job.folder / "skip_report.json") or [],
+        read_json(planned.folder / "scene_profile.json") or {},
+        read_json(planned.folder / "skip_report.json") or [],
     )
     return Measured(
-        label=job.contender.label,
-        method=job.contender.method,
-        seed=job.seed,
+        label=planned.contender.label,
+        method=planned.contender.method,
+        seed=planned.seed,
         psnr=results["psnr"],
         ssim=results["ssim"],
         ms_ssim=results.get("ms_ssim"),
         lpips=results["lpips"],
         floaters=results.get("floaters"),
+        normal_mae=results.get("normal_mae"),
         views=results["num_images"],
         steps=summary["steps"],
         seconds=summary["seconds"],
@@ -149,17 +153,17 @@ def measure(job: Job, conditions: Conditions) -> Measured | None:
         decisions=tuple(f"{d['option']}: {d['choice']}, as {d['reason']}" for d in profile.get("decisions", [])),
         skipped=tuple(f"{skip['skipped']:.1%} of {skip['name']}" for skip in skips),
         machine=summary["machine"],
-        command=shlex.join(["ns-train", job.contender.method, *_user_flags(job, conditions)]),
-        folder=str(job.folder),
+        command=shlex.join(["ns-train", planned.contender.method, *_user_flags(planned, conditions)]),
+        folder=str(planned.folder),
         lpips_note=evaluation["lpips"],
         masks_note=evaluation.get("masks"),
         geometry=evaluation.get("geometry"),
     )
 
 
-def _user_flags(job: Job, conditions: Conditions) -> list[str]:
+def _user_flags(planned: PlannedRun, conditions: Conditions) -> list[str]:
     """Return the flags for the same training by a user, without those that name the comparison's folders."""
-    flags = [*job.contender.flags, *conditions.data_flags, "--machine.seed", str(job.seed)]
+    flags = [*planned.contender.flags, *conditions.data_flags, "--machine.seed", str(planned.seed)]
     for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
         value = getattr(conditions, name)
         flags += [] if value is None else ["--" + name.replace("_", "-"), str(value)]

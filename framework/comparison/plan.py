@@ -143,7 +143,7 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Job:
+class PlannedRun:
     """One contender with one seed.
 
     Args:
@@ -178,14 +178,12 @@ class Job:
 
     @property
     def title(self) -> str:
-        """Description of the job for messages."""
+        """Description of the run for messages."""
         return f"{self.contender.label}, seed {self.seed}"
 
     def train_command(self, conditions: Conditions) -> list[str]:
-        """Return the command that trains under `conditions`, or resumes a training that has started."""
+        """Return the command that trains under `conditions`."""
         start = python_command("nerfloom.cli.train")
-        if (self.folder / "config.yml").exists():
-            return [*start, "--resume", str(self.folder)]
         c, flags = conditions, ["--vis", "none", "--eval", "all", "--max-eval-images", str(conditions.curve_images)]
         for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
             if getattr(c, name) is not None:
@@ -201,6 +199,10 @@ class Job:
         flags += ["--timestamp", self.folder.name]
         # A contender's own flags come last and so take precedence.
         return [*start, self.contender.method, *flags, *self.contender.flags, *c.data_flags]
+
+    def resume_command(self) -> list[str]:
+        """Return the command that resumes a training that has started."""
+        return python_command("nerfloom.cli.train", "--resume", self.folder)
 
     def eval_command(self, conditions: Conditions) -> list[str]:
         """Return the command that evaluates the trained model under `conditions`."""
@@ -240,10 +242,10 @@ class Plan:
         if self.repeats < 1:
             raise FlagError(f"--repeats is {self.repeats}; it must be at least 1")
 
-    def jobs(self) -> list[Job]:
+    def runs(self) -> list[PlannedRun]:
         """Return all runs, seed by seed, so that every contender has an early result."""
         seeds = range(FIRST_SEED, FIRST_SEED + self.repeats)
-        return [Job(contender, seed, self.folder / "runs") for seed in seeds for contender in self.contenders]
+        return [PlannedRun(contender, seed, self.folder / "runs") for seed in seeds for contender in self.contenders]
 
     def claim_folder(self) -> None:
         """Write the conditions, so that a later call continues under the same conditions.

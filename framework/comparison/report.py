@@ -49,6 +49,7 @@ COLUMNS = (
     Column("MS-SSIM", "ms_ssim", "{:.4f}".format, max),
     Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
+    Column("normals of views, °", "normal_mae", "{:.2f}".format, min),
     Column("Chamfer, % of side", "chamfer", "{:.3f}".format, min),
     Column("F-score, %", "f_score", "{:.1f}".format, max),
     Column("normals, °", "normal_error", "{:.2f}".format, min),
@@ -76,15 +77,17 @@ class Cell:
     best: bool = False
 
 
-def write_report(plan: Plan, rows: Sequence[Row]) -> Path:
+def write_report(plan: Plan, rows: Sequence[Row], sharing: str | None = None) -> Path:
     """Write all four files, and return the path of report.html.
 
     Args:
         plan: the comparison.
         rows: results of the contenders.
+        sharing: what machines did besides a run, as a sentence; None if each run was alone.
     """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)
+    content["conditions"] += [] if sharing is None else [f"{sharing} Times are longer where runs share a machine."]
     template = files("nerfloom.comparison").joinpath("report.html.jinja").read_text(encoding="utf-8")
     import jinja2  # a dependency of PyTorch
 
@@ -194,6 +197,8 @@ def measured(rows: Sequence[Row]) -> list[Column]:
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the rows of the table of results: label, colour, Pareto flag, and a cell for each column.
 
+    A row without results has no cells, and a word instead.
+
     Args:
         rows: results of the contenders.
     """
@@ -204,7 +209,13 @@ def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for index, row in enumerate(rows):
         cells = [_cell(column, row, finished) for column in measured(rows)] if row.runs else []
         result.append(
-            {"label": row.label, "color": plots.color_of(index), "front": row.label in on_front, "cells": cells}
+            {
+                "label": row.label,
+                "color": plots.color_of(index),
+                "front": row.label in on_front,
+                "cells": cells,
+                "instead": "failed" if row.failures else "not run",
+            }
         )
     return result
 
@@ -217,7 +228,7 @@ def console_table(rows: Sequence[Row]) -> Table:
     """
     result = Table("", *(row.label for row in rows))
     columns = measured(rows)
-    cells = [row["cells"] or [Cell("failed")] * len(columns) for row in table(rows)]
+    cells = [row["cells"] or [Cell(row["instead"])] * len(columns) for row in table(rows)]
     for column, figures in zip(columns, zip(*cells, strict=True), strict=True):
         result.add_row(column.title, *(cell.text for cell in figures))
     return result
@@ -310,11 +321,11 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     for row in rows:
         name = row["label"].replace("|", "\\|") + ("*" if row.get("front") else "")
         cells = [f"**{cell.text}**" if cell.best else cell.text for cell in row["cells"]]
-        lines.append("| " + " | ".join([name, *(cells or ["failed"] + [""] * (len(head) - 2))]) + " |")
+        lines.append("| " + " | ".join([name, *(cells or [row["instead"]] + [""] * (len(head) - 2))]) + " |")
     return lines
 
 
-QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "chamfer", "f_score", "normal_error", "faces")
+QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "normal_mae", "chamfer", "f_score", "normal_error", "faces")
 """Measures of the rendered views and of the surface."""
 CSV_FIGURES = ("label", "method", "seed", *QUALITY, "views", "steps", "seconds", "rays_per_second")
 """First columns of results.csv."""

@@ -25,6 +25,7 @@ from nerfloom.data.depths import read_depths
 from nerfloom.data.light_spread import APPEARANCE_STOPS, light_spread
 from nerfloom.data.motion_bound import MotionBound
 from nerfloom.data.names_on_disk import nearest_on_disk
+from nerfloom.data.normals import read_normals
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.pixels.memory_mapped import MappedPixels
@@ -77,6 +78,10 @@ class Dataset:
     """(M,) int64 on the CPU, index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
     """(M,) bool on the CPU, source images, for rendering others; they are not evaluated. None without."""
+    training: bool = False
+    """Whether these are training images, in the order of a model's vectors for them."""
+    normal_paths: tuple[Path | None, ...] | None = None
+    """M files of true normals, read when asked for; None if there are none."""
     motion_bound: MotionBound | None = None
     """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 
@@ -144,7 +149,7 @@ class Dataset:
             index: index of the image.
             stride: distance between the rows and columns in use.
         """
-        view = View.of(self.cameras, index, self.times, stride)
+        view = replace(View.of(self.cameras, index, self.times, stride), image=index if self.training else None)
         return view if self.scene_indices is None else replace(view, scene=int(self.scene_indices[index]))
 
     def kept_of(self, index: int) -> Tensor | None:
@@ -153,6 +158,19 @@ class Dataset:
             return None
         start, end = self.cameras.offsets[index : index + 2].tolist()
         return self.kept.mask(start, end).view(int(self.cameras.heights[index]), -1)
+
+    def normals_of(self, index: int) -> Tensor | None:
+        """Return the true normals of image `index`, (H, W, 3) unit vectors in scene coordinates; None if unknown.
+
+        Raises:
+            DataError: if the file is invalid.
+        """
+        path = None if self.normal_paths is None else self.normal_paths[index]
+        if path is None:
+            return None
+        height, width = self.cameras.sizes[index]
+        turn = self.transform[:, :3].to(self.device, torch.float32)
+        return read_normals(path, width, height).to(self.device) @ turn.T
 
     def drawing(self, pixels: PixelSet) -> Dataset:
         """Return the data set with `drawn` restricted to some pixels; unchanged if that would leave none.
@@ -312,6 +330,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         sparse_depth=sparse,
         scene_indices=parsed.scene_indices,
         source_images=parsed.source_images,
+        training=split == "train",
+        normal_paths=parsed.normal_paths,
     )
 
 

@@ -57,6 +57,8 @@ class ParsedScene:
     """M files of depth along the camera's axis, 0 where unknown; None for an image without depth."""
     depth_unit: float = 0.001
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
+    normal_paths: tuple[Path | None, ...] | None = None
+    """M files of true normals in the input's axes, for evaluation; None for an image without normals."""
     object_distances: tuple[float, float] | None = None
     """Near and far for an object that lies in `box` and that masks cut out, so that masked-out pixels are background;
     None if masks only hide pixels."""
@@ -80,6 +82,7 @@ class ParsedScene:
             times=None if self.times is None else self.times[index],
             mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
             depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
+            normal_paths=None if self.normal_paths is None else tuple(self.normal_paths[i] for i in chosen),
             sightings=None if self.sightings is None else self.sightings.of_images(index),
             scene_indices=None if self.scene_indices is None else self.scene_indices[index],
             source_images=None if self.source_images is None else self.source_images[index],

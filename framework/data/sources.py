@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.processes import processes
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.view import View
@@ -107,6 +108,7 @@ class PixelSource(BatchSource):
         keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
         clear: (M,) distances from cameras that images show to be empty; None if they are not used.
         num_images: number of images that the pixels of a step come from; None for all.
+        patches_from: step from which on pixels come in square patches; None for single pixels.
     """
 
     def __init__(
@@ -118,8 +120,9 @@ class PixelSource(BatchSource):
         keypoints: float = 0.0,
         clear: Tensor | None = None,
         num_images: int | None = None,
+        patches_from: int | None = None,
     ) -> None:
-        self.clear, self.num_images = clear, num_images
+        self.clear, self.num_images, self.patches_from = clear, num_images, patches_from
         self.dataset, self.background, self.seed = dataset, background, seed
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
@@ -133,22 +136,39 @@ class PixelSource(BatchSource):
         look_up, count = self._look_up(request.step), request.num_pixels
         keypoints = round(self.keypoints * count) if request.points else 0
         batch = draw_batch(
-            self.dataset, count, self.background, self.errors, offsets, look_up, keypoints, self.num_images
+            self.dataset,
+            count,
+            self.background,
+            self.errors,
+            offsets,
+            look_up,
+            keypoints,
+            self.num_images,
+            self._in_patches(request.step),
         )
         if self.clear is None or batch.rays.camera_indices is None:
             return batch
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
 
+    def _in_patches(self, step: int) -> bool:
+        return self.patches_from is not None and step >= self.patches_from
+
     def _look_up(self, step: int) -> LookUp | None:
-        """Return the function that looks up a step's colours read ahead from a file; None for memory or few images."""
-        if self.dataset.mapped is None or self.num_images is not None:
+        """Return the function that looks up a step's colours read ahead from a file; None if none are."""
+        if self.dataset.mapped is None or self.num_images is not None or self._in_patches(step):
             return None
         self.stream = self.stream or PixelStream(self.dataset, self.seed)
         return partial(self.stream.look_up, step)
 
     def drawing_from(self, dataset: Dataset) -> PixelSource:
         source = PixelSource(
-            dataset, self.background, self.seed, keypoints=self.keypoints, clear=self.clear, num_images=self.num_images
+            dataset,
+            self.background,
+            self.seed,
+            keypoints=self.keypoints,
+            clear=self.clear,
+            num_images=self.num_images,
+            patches_from=self.patches_from,
         )
         source.errors = self.errors
         return source
@@ -237,6 +257,9 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
         kind: kind of the batches: `Model.batches`.
         dataset: the training images, on the device.
         config: the settings of the run.
+
+    Raises:
+        ConfigError: if settings contradict each other.
     """
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
@@ -246,4 +269,7 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
-    return PixelSource(dataset, background, config.machine.seed, config.draw_by_error, keypoints, clear, num_images)
+    by_error, patches_from = config.draw_by_error, None if config.robust == "off" else config.robust_steps
+    if patches_from is not None and by_error:
+        raise ConfigError("--draw-by-error prefers large errors, and --robust leaves them out: choose one of them")
+    return PixelSource(dataset, background, config.machine.seed, by_error, keypoints, clear, num_images, patches_from)

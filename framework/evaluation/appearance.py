@@ -13,12 +13,16 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import gather_batch
+from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.renderable import HasAppearance, Renderable, RendersRays
+from nerfloom.samplers.proposal import half_edge
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
 """Steps of Adam, pixels per step, and learning rate for fitting an appearance vector."""
@@ -45,6 +49,28 @@ def right_half(image: Tensor) -> Tensor:
 
 
 @contextmanager
+def held_out_appearance(model: Renderable, dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
+    """Render an image with the appearance that the model's settings name, within a `with` block.
+
+    Args:
+        model: a model; without appearance vectors, nothing is changed.
+        dataset: the held-out images.
+        index: index of the image.
+        background: (3,) colour behind transparent pixels.
+    """
+    appearance = appearance_of(model)
+    if appearance is None or appearance.held_out == "mean":
+        yield
+    elif appearance.held_out == "half":
+        with fitted_appearance(model, dataset, index, background):
+            yield
+    else:
+        nearest = nearest_camera(model.scene, dataset.view(index))
+        with appearance.shown(appearance.vectors[nearest].detach()):
+            yield
+
+
+@contextmanager
 def fitted_appearance(model: Renderable, dataset: Dataset, index: int, background: Tensor) -> Iterator[None]:
     """Render with the appearance fitted to the left half of an image, within a `with` block.
 
@@ -56,6 +82,30 @@ def fitted_appearance(model: Renderable, dataset: Dataset, index: int, backgroun
     """
     with shown_appearance(model, fit_appearance(model, dataset, _left_pixels(dataset, index), background)):
         yield
+
+
+def nearest_camera(scene: Scene, view: View) -> int:
+    """Return the training image whose camera is nearest to that of a view.
+
+    Compared are the cameras' positions and the points half the box's edge in front of them, so that directions count
+    too.
+
+    Args:
+        scene: the scene, with the poses of the training cameras.
+        view: the view.
+
+    Raises:
+        ConfigError: if the scene does not know the training cameras.
+    """
+    if scene.camera_to_worlds is None:
+        raise ConfigError("--eval-appearance nearest: the training cameras' poses are not known; use mean or half")
+
+    def ends(poses: Tensor) -> Tensor:
+        ahead = poses[:, :, 3] - half_edge(scene.box) * poses[:, :, 2]
+        return torch.cat([poses[:, :, 3], ahead], -1)
+
+    known, own = ends(scene.camera_to_worlds.cpu()), ends(view.camera.camera_to_worlds.cpu())
+    return int((known - own).square().sum(-1).argmin())
 
 
 @contextmanager

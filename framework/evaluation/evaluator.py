@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
+from nerfloom.base.config import HeldOutAppearance
 from nerfloom.base.console import say, track
 from nerfloom.base.device import runs_ahead, wait_for
 from nerfloom.base.errors import DataError
@@ -22,9 +22,10 @@ from nerfloom.base.meter import time_text
 from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.appearance import appearance_of, fitted_appearance, right_half
+from nerfloom.evaluation.appearance import appearance_of, held_out_appearance, right_half
 from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, NETWORK, Lpips, load_lpips
 from nerfloom.evaluation.metrics import MIN_SIDE_OF_SCALES, ms_ssim, psnr, quick_ssim
+from nerfloom.evaluation.normals import normal_mae
 from nerfloom.evaluation.statistics import statistics
 from nerfloom.evaluation.view_files import Judged, ViewFiles
 from nerfloom.kernels.images.ssim import WINDOW
@@ -140,14 +141,14 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, ms_ssim, lpips, floaters and rendering seconds of each image; the numbers of counted and of
-    masked pixels; and the image's reduction if images have several sizes."""
+    """Name, psnr, ssim, ms_ssim, lpips, normal_mae, floaters and rendering seconds of each image; the numbers of its
+    counted and masked pixels; and the image's reduction if images have several sizes."""
     results: dict[str, Any]
     """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images in each mean; the
     numbers of counted and of masked pixels; by_size, the statistics of images of each size."""
     lpips_note: str
     """Network of LPIPS and source of its weights, or the reason for its absence."""
-    eval_appearance: Literal["mean", "half"] | None = None
+    eval_appearance: HeldOutAppearance | None = None
     """Source of the held-out images' appearance; None if the method has none."""
     pictures_note: str | None = None
     """Reason why rendered images could not be written; None if there was no problem."""
@@ -190,11 +191,12 @@ class Evaluation:
         ssim, scales, lpips = (self._mean(name) for name in ("ssim", "ms_ssim", "lpips"))
         scales = "" if r["ms_ssim"] is None and not r["num_ignored_pixels"] else f"  MS-SSIM {scales}"
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
+        normals = "" if r["normal_mae"] is None else f"  normals off by {r['normal_mae']:.2f}°"
         rays = r["num_rays_per_sec"]
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
-        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS ({NETWORK}) {lpips}{before}"
+        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS ({NETWORK}) {lpips}{before}{normals}"
         count, of = r["num_images"], r["num_images_in_split"]
         kept, ignored = r["num_pixels"], r["num_ignored_pixels"]
         masks = f", {kept:,} pixels; masks ignore {ignored / (kept + ignored):.0%}" if ignored else ""
@@ -309,8 +311,10 @@ def _judge(
 ) -> tuple[dict[str, Any], Judged]:
     """Return the report on a view, and its images."""
     target = composite(dataset.image(index).float() / 255, background)
-    with fitted_appearance(model, dataset, index, background) if half else nullcontext():
-        picture, spent = timed_view(model, dataset.view(index), background)
+    with held_out_appearance(model, dataset, index, background):
+        picture, spent = timed_view(model, view := dataset.view(index), background)
+    if view.image is None:
+        picture = replace(picture, outputs=tuple(output for output in picture.outputs if not output.of_training))
     rgb = picture.rgb.clamp(0, 1)
     if round_to_uint8:
         rgb = (rgb * 255).round() / 255
@@ -321,6 +325,7 @@ def _judge(
     row["lpips"] = None if lpips is None or smallest < MIN_SIDE_OF_LPIPS else lpips(*pair, kept)
     row["pixels"] = pair[0][..., 0].numel() if kept is None else int(kept.sum())
     row["ignored_pixels"] = pair[0][..., 0].numel() - row["pixels"]
+    row["normal_mae"] = normal_mae(picture, dataset, index, half)
     return row | {"floaters": floaters(picture, dataset, index)}, Judged(rgb, target, picture)
 
 

@@ -109,14 +109,14 @@ class LatticeDensity:
         """Return the density (N,) at `positions` (N, 3) in scene coordinates, on the CPU."""
         if self.grid is None:
             return self._evaluated(positions)
-        kept = self._kept(positions).nonzero()[:, 0]
+        kept = self.kept(positions).nonzero()[:, 0]
         sigma = torch.full((len(positions),), self._skipped)
         if len(kept):
             sigma[kept] = self._evaluated(positions[kept])
         return sigma
 
-    def _kept(self, positions: Tensor) -> Tensor:
-        """Return whether the renderer samples at positions (N, 3), (N,) bool."""
+    def kept(self, positions: Tensor) -> Tensor:
+        """Return whether the renderer, which must skip cells, samples at `positions` (N, 3), (N,) bool."""
         cells = self._occupancy()
         # The far faces of the box belong to its last cells.
         low, high = cells.outer

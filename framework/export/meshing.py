@@ -132,7 +132,7 @@ def _onto(model: Renderable, lattice: Lattice, vertices: Tensor) -> tuple[Tensor
                 normals[part] = safe_normalize(gradients).float()
                 break
             by = -distances[:, None] * gradients / gradients.square().sum(-1, keepdim=True).clamp(min=LEAST_SLOPE**2)
-            moved[part] += by.clamp(-lattice.spacing, lattice.spacing)
+            moved[part] += by.clamp(-lattice.spacing, lattice.spacing).nan_to_num()  # unknown: it stays
     near = (moved - vertices).norm(dim=-1) <= lattice.spacing  # a step that went astray is not taken
     return torch.where(near[:, None], moved, vertices), normals
 

@@ -92,7 +92,7 @@ def export_page(
     else:
         cameras, names = pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
     near = smallest_depth(model.scene)
-    found, look = _gaussians(loaded, splatting, dataset, cameras, fit_seconds, moment)
+    found, look = _gaussians(loaded, dataset, cameras, fit_seconds, moment, splatting)
     good = _finite(found)
     turn = upright(cameras)
     order = in_order(names)  # data formats sort 10.jpg before 2.jpg
@@ -127,22 +127,17 @@ def export_page(
 
 
 def _gaussians(
-    loaded: Loaded,
-    splatting: Method,
-    dataset: Dataset | None,
-    cameras: Cameras,
-    fit_seconds: float,
-    moment: float | None,
+    loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None, splatting: Method
 ) -> tuple[Gaussians, Look]:
-    """Return the Gaussians of a model, or those fitted to pictures of its field, and how they are drawn."""
+    """Return the Gaussians of a run or file, or some that are fitted to its field, and how they are drawn."""
     model = loaded.model
     if isinstance(model, HasGaussians):
         return model.gaussians(moment), model.look()
     if not isinstance(model, RendersRays) or dataset is None:
         raise ConfigError(f"ns-export web: {loaded.method} has neither Gaussians nor rays, so it cannot be shown")
-    if not fit_seconds > 0:
-        raise FlagError(f"--fit-seconds is {fit_seconds:g}; it must be positive")
-    return fit_gaussians(model, splatting, dataset, cameras, fit_seconds, loaded.run.config.machine), OURS
+    if not seconds > 0:
+        raise FlagError(f"--fit-seconds is {seconds:g}; it must be positive")
+    return fit_gaussians(model, splatting, dataset, cameras, seconds, loaded.run.config.machine), OURS
 
 
 def _finite(found: Gaussians) -> Gaussians:

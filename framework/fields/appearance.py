@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nerfloom.base.config import HeldOutAppearance
 from nerfloom.base.optimised import Optimised
 
 AFFINE = 12
@@ -30,8 +30,8 @@ class Appearance(nn.Module):
         count: number of images.
         optimised: settings of the optimiser; those of the containing module if None.
         mean_share: probability that an image has the mean vector in a training step.
-        held_out: what held-out images are evaluated with: the mean vector, or one that is fitted to the left half of
-            each, and judged on its right half.
+        held_out: what held-out images are evaluated with: the mean vector, one that is fitted to the left half of each,
+            and judged on its right half, or that of the nearest training image.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Appearance(nn.Module):
         count: int,
         optimised: Optimised | None = None,
         mean_share: float = 0.0,
-        held_out: Literal["mean", "half"] = "mean",
+        held_out: HeldOutAppearance = "mean",
     ) -> None:
         super().__init__()
         self.size, self.optimised, self.mean_share, self.held_out = size, optimised, mean_share, held_out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from nerfloom.encodings.coarse_to_fine import OpenLevels
+from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.contraction import contract_to_unit
@@ -31,6 +32,8 @@ class NeRFField(Field):
             the training budget; 0: all are open.
         dims: number of coordinates of a position: 3, or 4 for points of the inverted sphere (NeRF++, Zhang et al.
             2020).
+        appearance: the images' appearance vectors, an input of the colour layer: NeRF-W (Martin-Brualla et al. 2021),
+            equation 7; None without.
     """
 
     contracted: Tensor | None
@@ -47,6 +50,7 @@ class NeRFField(Field):
         contracted: Tensor | None = None,
         opening: float = 0.0,
         dims: int = 3,
+        appearance: Appearance | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
@@ -60,7 +64,9 @@ class NeRFField(Field):
         self.after_skip = MLP(width + encoded, *[width] * (depth - skip), activation="relu")
         self.sigma_head = MLP(width, 1, activation="relu")
         self.feature_head = MLP(width, width)
-        self.color_head = MLP(width + 3 + 6 * direction_frequencies, width // 2, 3, activation="sigmoid")
+        self.appearance = appearance
+        seen = 3 + 6 * direction_frequencies + (0 if appearance is None else appearance.size)
+        self.color_head = MLP(width + seen, width // 2, 3, activation="sigmoid")
         self._initialise()
 
     def _initialise(self) -> None:
@@ -88,7 +94,10 @@ class NeRFField(Field):
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         encoded = opened_frequencies(directions, self.direction_frequencies, self.direction_opening)
-        return self.color_head(self.feature_head(features), encoded).float()
+        inputs = [self.feature_head(features), encoded]
+        if self.appearance is not None:
+            inputs.append(self.appearance(camera_indices, len(features)).to(encoded.dtype))
+        return self.color_head(*inputs).float()
 
 
 def opened_frequencies(x: Tensor, num_frequencies: int, opening: OpenLevels | None) -> Tensor:

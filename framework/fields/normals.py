@@ -68,7 +68,7 @@ def normal_penalties(
 ) -> dict[str, Tensor]:
     """Return the penalties of predicted normals per ray: Ref-NeRF, equations 10 and 11.
 
-    Unlike in the paper, the penalties do not train the density, because the kernels have first derivatives only.
+    The density is trained by them too if `normals` has a gradient, as in the paper.
 
     Args:
         predicted: (N, 3) predicted unit normals.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -19,9 +20,9 @@ from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP
-from nerfloom.kernels.math import safe_normalize
 from nerfloom.kernels.surfaces.distance import distance_network
-from nerfloom.kernels.surfaces.opacity import laplace_density, surface_opacity
+from nerfloom.kernels.surfaces.opacity import laplace_density
+from nerfloom.kernels.surfaces.samples import PLACED, Ball, Intervals, ball_distance, surface_samples, unit_normals
 
 ROUNDING = 1e-3
 """Radius within which the first ball is rounded off at its centre, in radii; a distance has no gradient there."""
@@ -29,8 +30,6 @@ FIRST_WEIGHTS = 1e-2
 """Size of the first weights of the distance's output; the field starts as a ball with a little noise."""
 DIRECTION_LEVELS = 4
 """Bands of the spherical harmonics of viewing directions."""
-PLACED = 6
-"""Number of features before the network's: gradient of the distance, and position in units of the box."""
 
 
 class Shape(NamedTuple):
@@ -56,12 +55,51 @@ class Sharpness(nn.Module):
 
     def __init__(self, first: float, rate: float) -> None:
         super().__init__()
+        self.first = first
         self.exponent = nn.Parameter(torch.tensor(math.log(first) / self.SPEED))
         self.optimised = Optimised("sharpness", rate)
 
     def forward(self) -> Tensor:
         """Return the inverse width (), 1/length."""
         return torch.exp(self.SPEED * self.exponent)
+
+    @torch.no_grad()
+    def limit(self, factor: float) -> None:
+        """Keep the inverse width between the first value and a multiple of it.
+
+        Args:
+            factor: the multiple; infinity for no upper bound.
+        """
+        least = math.log(self.first)
+        self.exponent.clamp_(least / self.SPEED, (least + math.log(factor)) / self.SPEED)
+
+
+class AnnealedSharpness(Sharpness):
+    """The inverse width of a surface, and how far the annealing of its slope has come (`surface_opacity`).
+
+    Args:
+        first, rate: as in `Sharpness`.
+    """
+
+    annealing: Tensor
+
+    def __init__(self, first: float, rate: float) -> None:
+        super().__init__(first, rate)
+        self.register_buffer("annealing", torch.tensor(0.0))
+        self._share = HostValue()
+
+    @property
+    def share(self) -> float:
+        """Fraction of the annealing that is done, from 0 to 1."""
+        return self._share.of(self.annealing)
+
+    def anneal(self, share: float) -> None:
+        """Set the fraction of the annealing that is done.
+
+        Args:
+            share: fraction from 0 to 1 that float32 represents exactly.
+        """
+        self._share.change(self.annealing, share)
 
 
 class SurfaceField(BoxField):
@@ -108,6 +146,8 @@ class SurfaceField(BoxField):
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
         self.cell = 0.0
         """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
+        self.progress = 0.0
+        """Fraction of the training budget that is spent."""
 
     @property
     def grid(self) -> HashGrid:
@@ -115,8 +155,13 @@ class SurfaceField(BoxField):
         assert isinstance(self.encoding, HashGrid)
         return self.encoding
 
-    def shape(self, positions: Tensor) -> Shape:
-        """Return distance, gradient and features at positions.
+    @property
+    def ball(self) -> Ball:
+        """The distance that the network's output is added to."""
+        return Ball(self.centre, self.scale, self.size, self.radius, ROUNDING * self.radius)
+
+    def network(self, positions: Tensor) -> Tensor:
+        """Return the network's outputs, and the gradient of the first by the position in the box (`distance_network`).
 
         Args:
             positions: (N, 3) scene coordinates.
@@ -132,25 +177,36 @@ class SurfaceField(BoxField):
             table, first = table[: layout.num_entries], (first * factors)[:, :open_features]
         if grid.deferred is not None:
             grid.deferred.layout = layout
-        out = distance_network(found, table, first, self.second, layout, grid.deferred)
-        values, slopes = out[:, :-3], out[:, -3:]
-        offsets = positions - self.centre
-        lengths = (offsets.square().sum(-1) + (ROUNDING * self.radius) ** 2).sqrt()
-        distances = lengths - self.radius + self.size * values[:, 0]
-        gradients = offsets / lengths[:, None] + self.size * self.scale * slopes
-        return Shape(distances, gradients, values[:, 1:])
+        return distance_network(found, table, first, self.second, layout, grid.deferred)
+
+    def shape(self, positions: Tensor) -> Shape:
+        """Return distance, gradient and features at positions.
+
+        Args:
+            positions: (N, 3) scene coordinates.
+        """
+        network = self.network(positions)
+        return Shape(*ball_distance(network, positions, self.ball), network[:, 1:-3])
+
+    def reach(self, safety: float) -> Callable[[Tensor], Tensor]:
+        """Return the function from positions (N, 3) to how far rays may step from them (N,), negative inside.
+
+        Args:
+            safety: factor by which the distance may be steeper on the way than at the position.
+        """
+
+        def bound(positions: Tensor) -> Tensor:
+            shape = self.shape(positions)
+            return shape.distances / (safety * shape.gradients.norm(dim=-1).clamp(min=1))
+
+        return bound
 
     def signed_distance(self, points: Points) -> Tensor:
         """Return the distances (N,) from `points` to the nearest surface, scene units, negative inside."""
         return self.shape(points.positions).distances
 
-    def _features(self, positions: Tensor, shape: Shape) -> Tensor:
-        """Return the features for `color`: gradient, position and the network's."""
-        placed = (positions - self.centre) / self.size
-        return torch.cat([shape.gradients, placed, shape.features], dim=-1)
-
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        inputs = [safe_normalize(features[:, :3]), features[:, 3:], spherical_harmonics(directions, DIRECTION_LEVELS)]
+        inputs = [unit_normals(features), spherical_harmonics(directions, DIRECTION_LEVELS)]
         if self.appearance is not None:
             inputs.append(self.appearance(camera_indices, len(features)))
         return self.color_head(*inputs).float()
@@ -165,10 +221,11 @@ class SurfaceField(BoxField):
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         shape = self.shape(points.positions)
-        return self.density_at(shape.distances), self._features(points.positions, shape)
+        placed = (points.positions - self.centre) / self.size
+        return self.density_at(shape.distances), torch.cat([shape.gradients, placed, shape.features], dim=-1)
 
     def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return a bound of the density (N,) within `cell` of each point, and features.
+        """Return a bound of the density (N,) within `cell` of each point, and the network's features.
 
         The inside counts as occupied: a surface that retreats during training must find its cells.
 
@@ -176,39 +233,13 @@ class SurfaceField(BoxField):
             points: N points.
         """
         shape = self.shape(points.positions)
-        return self.density_at(shape.distances - self.cell), self._features(points.positions, shape)
+        return self.density_at(shape.distances - self.cell), shape.features
 
 
 class NeuSField(SurfaceField):
-    """A field whose intervals have the opacity of NeuS, equation 13.
+    """A field whose intervals have the opacity of NeuS, equation 13; its sharpness is an `AnnealedSharpness`."""
 
-    Args:
-        box, encoding, sharpness, radius, width, num_features, appearance: as in `SurfaceField`.
-    """
-
-    annealing: Tensor
-
-    def __init__(
-        self,
-        box: Tensor,
-        encoding: HashGrid,
-        sharpness: Sharpness,
-        radius: float = 0.5,
-        width: int = 64,
-        num_features: int = 15,
-        appearance: Appearance | None = None,
-    ) -> None:
-        super().__init__(box, encoding, sharpness, radius, width, num_features, appearance)
-        self.register_buffer("annealing", torch.tensor(0.0))
-        self._annealing = HostValue()
-
-    def anneal(self, share: float) -> None:
-        """Set how far the slope's annealing has come (`surface_opacity`).
-
-        Args:
-            share: fraction from 0 to 1 that float32 represents exactly.
-        """
-        self._annealing.change(self.annealing, share)
+    sharpness: AnnealedSharpness
 
     def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
         """Return the opacity of intervals around points, and features.
@@ -218,11 +249,8 @@ class NeuSField(SurfaceField):
             directions: (N, 3) unit directions of their rays.
             deltas: (N,) lengths of the intervals, scene units.
         """
-        shape = self.shape(points.positions)
-        cosines = (shape.gradients * directions).sum(-1)
-        share = self._annealing.of(self.annealing)
-        opacity = surface_opacity(shape.distances, cosines, deltas, self.sharpness(), share)
-        return opacity, self._features(points.positions, shape)
+        positions, intervals = points.positions, Intervals(directions, deltas, self.sharpness.share)
+        return surface_samples(self.network(positions), self.sharpness(), positions, self.ball, intervals)
 
     def density_at(self, distances: Tensor) -> Tensor:
         """Return the density of a ray that meets the surface head-on: NeuS, equation 10."""
@@ -232,6 +260,9 @@ class NeuSField(SurfaceField):
 
 class VolSDFField(SurfaceField):
     """A field with the density of VolSDF, equation 2; the inverse width is 1 / beta."""
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return surface_samples(self.network(points.positions), self.sharpness(), points.positions, self.ball)
 
     def density_at(self, distances: Tensor) -> Tensor:
         return laplace_density(distances, 1 / self.sharpness())

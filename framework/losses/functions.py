@@ -51,6 +51,26 @@ def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = Non
     return errors.mean() if weights is None else (errors * weights[:, None]).mean()
 
 
+def doubted_error(rgb: Tensor, true: Tensor, doubt: Tensor, least: float, weights: Tensor | None = None) -> Tensor:
+    """Return the error () of colours in units of their uncertainty, which must not be large: NeRF-W, equation 13.
+
+    It is the negative logarithm of a normal distribution, mean(e^2 / (2 doubt^2) + log(doubt / least)), times
+    2 least^2, so that it is the mean squared error where the uncertainty is least.
+
+    Args:
+        rgb: (P, 3) rendered colours.
+        true: (P, 3) true colours.
+        doubt: (P,) standard deviation of each pixel's colour.
+        least: the least standard deviation.
+        weights: (P,) factor of each pixel; None for 1.
+    """
+    if not len(rgb):
+        return rgb.sum()
+    ratio = doubt / least
+    each = (rgb - true).square().mean(-1) / ratio.square() + 2 * least**2 * ratio.log()
+    return (each if weights is None else each * weights).mean()
+
+
 def opacity_of_transparent(accumulation: Tensor, alpha: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the mean () over pixels of the rendered opacity where it should be 0; 0 for no pixels.
 

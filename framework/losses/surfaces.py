@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.fields.surface import SurfaceField
-from nerfloom.losses.functions import mean_squared_error
+from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.losses.functions import charbonnier, mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import ColorError
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
@@ -18,6 +22,21 @@ if TYPE_CHECKING:
 EVERY, ANYWHERE = 4, 8
 """The length of the gradient is asked at one in this many samples, so that others may be without a gradient and are
 skipped; and for one in this many samples at a random place in the box."""
+
+BEHIND = 0.03
+"""Thickness of what is taken for solid behind points of a reconstruction, in halves of the box's shortest edge."""
+ABSOLUTE = 0.1
+"""Factor of the absolute error of colours, which is some ten times the squared error, so that the weights of the other
+terms suit both."""
+
+
+class SurfaceColorError(ColorError):
+    """Squared or absolute error of colours: the setting `color_loss`."""
+
+    def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
+        if shown.model.config.color_loss == "squared":
+            return super().error(rgb, shown)
+        return ABSOLUTE * charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
 
 
 class Eikonal(LossTerm):
@@ -55,3 +74,138 @@ class Silhouette(LossTerm):
         batch = shown.batch
         assert batch.alpha is not None
         return mean_squared_error(shown.pixels.accumulation, batch.alpha, batch.weights)
+
+
+class Curvature(LossTerm):
+    """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
+
+    Each of some samples is compared with a place one sample's length away, in a random direction along its level set.
+    The term is the mean squared difference of their unit normals. It applies from the fraction `curvature_from` of the
+    training budget on.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("curvature", "curvature_loss_mult")
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        samples, field = shown.rendered.samples, shown.model.field
+        assert isinstance(field, SurfaceField)
+        early = field.progress < shown.model.config.curvature_from
+        if early or samples is None or samples.features is None or not len(samples):
+            return None
+        first = int(torch.randint(EVERY, ()))
+        normals = safe_normalize(samples.features[first::EVERY, :3])
+        positions, lengths = samples.positions(shown.batch.rays)[first::EVERY], samples.deltas[first::EVERY]
+        moved = positions + lengths[:, None] * tangents(normals.detach())
+        return normal_change(normals, safe_normalize(field.shape(moved).gradients))
+
+
+def tangents(normals: Tensor) -> Tensor:
+    """Return random unit directions (N, 3) perpendicular to unit vectors.
+
+    Args:
+        normals: (N, 3).
+    """
+    return safe_normalize(torch.linalg.cross(normals, torch.randn_like(normals)))
+
+
+def normal_change(normals: Tensor, others: Tensor) -> Tensor:
+    """Return the mean squared difference () of unit normals; with the angle a between them it is 2 - 2 cos a.
+
+    Args:
+        normals, others: (N, 3).
+    """
+    return (normals - others).square().sum(-1).mean()
+
+
+class KnownPoints(NamedTuple):
+    """Points of a reconstruction inside the box of a field, as seen in K pixels."""
+
+    rays: Rays
+    """The rays of the pixels."""
+    entries: Tensor
+    """(K,) distance where they enter the box."""
+    distances: Tensor
+    """(K,) distance to the point."""
+    deviations: Tensor
+    """(K,) its standard deviation."""
+
+    def places(self, t: Tensor) -> Tensor:
+        """Return the positions (..., K, 3) at distances `t` (..., K) along the rays."""
+        return torch.addcmul(self.rays.origins, self.rays.directions, t[..., None])
+
+
+def known_points(batch: PixelBatch, box: Tensor) -> KnownPoints:
+    """Return the points that a batch's pixels show inside a box.
+
+    Args:
+        batch: pixels, with distances and their deviations.
+        box: (2, 3) corners.
+    """
+    assert batch.distances is not None
+    assert batch.deviations is not None
+    rays = batch.rays[:: batch.rays_per_pixel]
+    enter, leave = intersect_box(rays.origins, rays.directions, box)
+    inside = (batch.distances > enter) & (batch.distances < leave)
+    return KnownPoints(rays[inside], enter[inside], batch.distances[inside], batch.deviations[inside])
+
+
+class SurfacePoints(LossTerm):
+    """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022).
+
+    It is the mean of how far |f| exceeds the point's standard deviation, in halves of the box's shortest edge.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("points", "points_loss_mult")
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.deviations is not None
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        field = shown.model.field
+        assert isinstance(field, SurfaceField)
+        known = known_points(shown.batch, field.box)
+        if not len(known.distances):
+            return None
+        found = field.shape(known.places(known.distances)).distances
+        return torch.relu(found.abs() - known.deviations).mean() / field.size
+
+
+class DistanceBounds(LossTerm):
+    """Bounds of the distance at random places before and behind points of a reconstruction, on the rays that see them.
+
+    An image that shows a point shows that space before it is empty: the distance there is positive, and at most that to
+    the point. Space just behind the point is taken for solid: the distance is negative there, and its magnitude is at
+    most that to the point. The term is the mean of what is beyond these bounds, in halves of the box's shortest edge.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("bounds", "bounds_loss_mult")
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.deviations is not None
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        field = shown.model.field
+        assert isinstance(field, SurfaceField)
+        known = known_points(shown.batch, field.box)
+        if not len(known.distances):
+            return None
+        before = (known.distances - known.entries) * torch.rand_like(known.distances)
+        behind = -BEHIND * field.size * torch.rand_like(known.distances)
+        left = torch.stack([before, behind])
+        found = field.shape(known.places(known.distances - left).flatten(0, 1)).distances.view_as(left)
+        return beyond_bounds(found, left, known.deviations).mean() / field.size
+
+
+def beyond_bounds(distances: Tensor, left: Tensor, deviations: Tensor) -> Tensor:
+    """Return how far distances are outside the interval from 0 to the way that is left to a point.
+
+    Args:
+        distances: signed distances of any shape, scene units.
+        left: lengths of the way to a point on a surface, of the same shape; negative behind the point.
+        deviations: standard deviations of these lengths, broadcast to that shape; so much is allowed.
+    """
+    low, high = left.clamp(max=0) - deviations, left.clamp(min=0) + deviations
+    return torch.relu(distances - high) + torch.relu(low - distances)

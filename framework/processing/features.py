@@ -8,7 +8,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.processing import colmap, database
 from nerfloom.processing.images import PreparedImage
-from nerfloom.processing.job import Job
+from nerfloom.processing.reconstruction import Reconstruction
 
 
 def camera_groups(prepared: list[PreparedImage], sharing: str) -> list[list[str]]:
@@ -34,32 +34,32 @@ def camera_groups(prepared: list[PreparedImage], sharing: str) -> list[list[str]
     return list(groups.values())
 
 
-def extract(job: Job, prepared: list[PreparedImage], images: Path, masks: Path | None) -> None:
+def extract(state: Reconstruction, prepared: list[PreparedImage], images: Path, masks: Path | None) -> None:
     """Extract features.
 
     Args:
-        job: the reconstruction.
+        state: the reconstruction.
         prepared: the prepared images.
         images: folder of the images for feature extraction.
         masks: folder of masks, or None.
     """
-    groups = camera_groups(prepared, job.flags.camera_sharing)
-    known = database.features(job.database)
-    cameras = [database.camera_of(job.database, group) for group in groups]
+    groups = camera_groups(prepared, state.flags.camera_sharing)
+    known = database.features(state.database)
+    cameras = [database.camera_of(state.database, group) for group in groups]
     missing = [
         ([name for name in group if name not in known], camera) for group, camera in zip(groups, cameras, strict=True)
     ]
     count = sum(len(names) for names, _ in missing)
     if count:
-        with job.timed("features"):
-            arguments = (job.database, images, [entry for entry in missing if entry[0]], masks, job.flags)
-            extracted = lambda: database.rows(job.database, "descriptors") - len(known)  # noqa: E731
-            job.run(colmap.extract, arguments, "Finding features", count, extracted, "images")
-    found = database.features(job.database)
+        with state.timed("features"):
+            arguments = (state.database, images, [entry for entry in missing if entry[0]], masks, state.flags)
+            extracted = lambda: database.rows(state.database, "descriptors") - len(known)  # noqa: E731
+            state.run(colmap.extract, arguments, "Finding features", count, extracted, "images")
+    found = database.features(state.database)
     mean = sum(found.values()) / max(len(found), 1)
     by = "1 camera" if len(groups) == 1 else f"{len(groups)} cameras"
     kept = f", {len(known)} reused" if known else ""
     say(
         f"features: {mean:.0f} per image, {len(prepared)} images by {by}{kept}, "
-        f"in {job.seconds.get('features', 0.0):.1f} s"
+        f"in {state.seconds.get('features', 0.0):.1f} s"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nerfloom.base.console import say
 from nerfloom.processing import colmap, database, retrieval
-from nerfloom.processing.job import Job
+from nerfloom.processing.reconstruction import Reconstruction
 
 ADJACENT = 3
 """Number of following images that retrieval matches with each image, besides similar ones."""
@@ -34,19 +34,19 @@ def choose_matching(method: str, count: int, exhaustive_limit: int, ordered: boo
     return "exhaustive" if count <= exhaustive_limit else "retrieval"
 
 
-def choose_pairs(matching: str, names: list[str], job: Job) -> list[tuple[str, str]]:
+def choose_pairs(matching: str, names: list[str], state: Reconstruction) -> list[tuple[str, str]]:
     """Return the pairs of names of images to match.
 
     Args:
         matching: exhaustive, sequential or retrieval.
         names: names of the images.
-        job: the reconstruction, with features.
+        state: the reconstruction, with features.
     """
-    count, flags = len(names), job.flags
+    count, flags = len(names), state.flags
     if matching == "exhaustive":
         chosen = retrieval.all_pairs(count)
     else:
-        descriptors = retrieval.global_descriptors(retrieval.read_descriptors(job.database, names))
+        descriptors = retrieval.global_descriptors(retrieval.read_descriptors(state.database, names))
         if matching == "sequential":
             near = retrieval.sequential_pairs(count, flags.sequential_overlap)
             alike = retrieval.similar_pairs(descriptors, LOOPS, apart=flags.sequential_overlap)
@@ -57,41 +57,41 @@ def choose_pairs(matching: str, names: list[str], job: Job) -> list[tuple[str, s
     return [(names[i], names[j]) for i, j in chosen]
 
 
-def pairs_of(left: list[str], names: list[str], job: Job) -> list[tuple[str, str]]:
+def pairs_of(left: list[str], names: list[str], state: Reconstruction) -> list[tuple[str, str]]:
     """Return more pairs for unregistered images: with all images, or with similar ones if there are many images.
 
     Args:
         left: names of the unregistered images.
         names: names of all images.
-        job: the reconstruction, with features.
+        state: the reconstruction, with features.
     """
     chosen = set(left)
-    if len(names) <= job.flags.exhaustive_limit:
+    if len(names) <= state.flags.exhaustive_limit:
         every = retrieval.all_pairs(len(names))
     else:
-        descriptors = retrieval.global_descriptors(retrieval.read_descriptors(job.database, names))
-        every = retrieval.similar_pairs(descriptors, job.flags.num_neighbors)
+        descriptors = retrieval.global_descriptors(retrieval.read_descriptors(state.database, names))
+        every = retrieval.similar_pairs(descriptors, state.flags.num_neighbors)
     return [(names[i], names[j]) for i, j in every if names[i] in chosen or names[j] in chosen]
 
 
-def match(job: Job, pairs: list[tuple[str, str]], count: int, rule: str) -> None:
+def match(state: Reconstruction, pairs: list[tuple[str, str]], count: int, rule: str) -> None:
     """Match pairs of images.
 
     Args:
-        job: the reconstruction, with features.
+        state: the reconstruction, with features.
         pairs: pairs of names; pairs in the database are not matched again.
         count: number of images.
         rule: description of the pairs for messages.
     """
-    known = database.pairs(job.database)
+    known = database.pairs(state.database)
     missing = [pair for pair in pairs if pair not in known]
     kept = f", {len(pairs) - len(missing)} of them reused" if len(missing) < len(pairs) else ""
     say(f"matching: {len(pairs):,} of {count * (count - 1) // 2:,} pairs{kept}: {rule}")
-    before = job.seconds.get("matching", 0.0)
-    with job.timed("matching"):
+    before = state.seconds.get("matching", 0.0)
+    with state.timed("matching"):
         if missing:
             everything = len(missing) == count * (count - 1) // 2
-            arguments = (job.database, missing, job.database.with_name("pairs.txt"), everything, job.flags)
-            job.run(colmap.match_pairs, arguments, "Matching", len(missing), unit="pairs")
-    done, connected = database.rows(job.database, "two_view_geometries"), database.connected(job.database)
-    say(f"matching: {connected:,} of {done:,} pairs are connected, in {job.seconds['matching'] - before:.1f} s")
+            arguments = (state.database, missing, state.database.with_name("pairs.txt"), everything, state.flags)
+            state.run(colmap.match_pairs, arguments, "Matching", len(missing), unit="pairs")
+    done, connected = database.rows(state.database, "two_view_geometries"), database.connected(state.database)
+    say(f"matching: {connected:,} of {done:,} pairs are connected, in {state.seconds['matching'] - before:.1f} s")

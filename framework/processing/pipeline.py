@@ -10,21 +10,21 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.processing import colmap, contrast, database, features, mapping, matching, transforms
 from nerfloom.processing.images import PreparedImage, prepare_all, write_masks
-from nerfloom.processing.job import Job
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.parallax import MAX_PAIRS, NO_PARALLAX, WITHOUT, share_that_turned
 from nerfloom.processing.pyramid import write_pyramid
+from nerfloom.processing.reconstruction import Reconstruction
 from nerfloom.processing.summary import Summary, lines
 
 MIN_IMAGES = 3
 """Minimum number of images for a reconstruction."""
 
 
-def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> None:
+def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Path | None) -> None:
     """Estimate the poses of images and write the data folder, after `output.claim` and `unfinished.mark`.
 
     Args:
-        job: the reconstruction.
+        state: the reconstruction.
         folder: folder of the images.
         sources: paths of the images in it, from `find_images`.
         masks: folder of masks, or None.
@@ -32,33 +32,33 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
     Raises:
         DataError: if nothing can be reconstructed; the folder then has no transforms.json.
     """
-    flags, output, work = job.flags, job.flags.output_dir, job.work
-    with job.timed("preparing"):
-        prepared, unreadable = prepare_all(folder, sources, job.images)
-        clear = contrast.for_features(folder, prepared, job.images, job.stretched)
+    flags, output, work = state.flags, state.flags.output_dir, state.work
+    with state.timed("preparing"):
+        prepared, unreadable = prepare_all(folder, sources, state.images)
+        clear = contrast.for_features(folder, prepared, state.images, state.stretched)
         if len(prepared) < MIN_IMAGES:
             raise DataError(f"--data {flags.data}: {len(prepared)} usable images; at least {MIN_IMAGES} are needed")
         mask_of = write_masks(masks, prepared, output / "masks") if masks is not None else {}
     names = [image.name for image in prepared]
-    features.extract(job, prepared, clear, output / "masks" if mask_of else None)
-    rule = matching.choose_matching(flags.matching_method, len(names), flags.exhaustive_limit, job.ordered)
-    with job.timed("matching"):
-        pairs = matching.choose_pairs(rule, names, job)
-    matching.match(job, pairs, len(names), matching.RULES[rule])
-    turned = share_that_turned(database.matches(job.database, MAX_PAIRS))
+    features.extract(state, prepared, clear, output / "masks" if mask_of else None)
+    rule = matching.choose_matching(flags.matching_method, len(names), flags.exhaustive_limit, state.ordered)
+    with state.timed("matching"):
+        pairs = matching.choose_pairs(rule, names, state)
+    matching.match(state, pairs, len(names), matching.RULES[rule])
+    turned = share_that_turned(database.matches(state.database, MAX_PAIRS))
     if turned >= WITHOUT:
         say(f"warning: {NO_PARALLAX}")
-    sizes = mapping.reconstruct(job, names, rule, turned)
-    with job.timed("unfolding"):
-        sizes = mapping.unfold(job) or sizes
+    sizes = mapping.reconstruct(state, names, rule, turned)
+    with state.timed("unfolding"):
+        sizes = mapping.unfold(state) or sizes
 
     final = work / "sparse" / "0"
-    with job.timed("writing"):
+    with state.timed("writing"):
         if flags.undistort:
-            job.run(colmap.undistort, (final, job.images, work / "flat"), "Undistorting")
+            state.run(colmap.undistort, (final, state.images, work / "flat"), "Undistorting")
             shutil.move(work / "flat" / "images", output / "images")
             final = work / "flat" / "sparse"
-        model: colmap.Model = job.run(colmap.read_model, (final,), "Reading the model")
+        model: colmap.Model = state.run(colmap.read_model, (final,), "Reading the model")
         frames = _frames(model, prepared, mask_of)
         kept = [frame.name for frame in frames] if flags.undistort else names
         write_pyramid(output / "images", kept, flags.num_downscales)
@@ -73,16 +73,25 @@ def process(job: Job, folder: Path, sources: list[Path], masks: Path | None) -> 
         points=len(points),
         reprojection_error=round(model.error, 4),
         matching=rule,
-        pairs=database.rows(job.database, "two_view_geometries"),
+        pairs=database.rows(state.database, "two_view_geometries"),
         turned=turned,
-        seconds=job.seconds,
+        seconds=state.seconds,
     )
     _keep(work, output / "colmap", final)
     (output / "colmap" / "summary.json").write_text(json.dumps(summary.as_json(), indent=2))
     transforms.write(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
+    if flags.mask_moving:
+        _mask_moving(state)
     for line in lines(summary):
         say(line)
     say(ready(output))
+
+
+def _mask_moving(state: Reconstruction) -> None:
+    from nerfloom.processing.moving_masks import mask_moving  # imports all that trains
+
+    with state.timed("masks"):
+        mask_moving(state.flags.output_dir, state.flags.num_downscales, max_seconds=state.flags.mask_seconds)
 
 
 def _frames(model: colmap.Model, prepared: list[PreparedImage], masks: dict[str, str]) -> list[transforms.Frame]:

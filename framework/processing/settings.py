@@ -65,6 +65,10 @@ class ColmapFlags(OutputFlags):
     only for captures that determine that point well: its shift is hard to distinguish from a camera rotation."""
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), for registered images only."""
+    mask_moving: bool = False
+    """Train on the images for a short time with the robust loss, and write masks that leave out what moves."""
+    mask_seconds: float = 120.0
+    """Seconds of this training."""
     device_type: Literal["cpu", "cuda"] = "cpu"
     """Device for feature extraction and matching; cuda needs a pycolmap built with CUDA."""
     num_threads: int = -1
@@ -87,5 +91,7 @@ class ColmapFlags(OutputFlags):
             if getattr(self, name) < minimum:
                 flag = "--" + name.replace("_", "-")
                 raise ConfigError(f"{flag} is {getattr(self, name)}; it must be at least {minimum}")
+        if not self.mask_seconds > 0:
+            raise FlagError(f"--mask-seconds is {self.mask_seconds}; it must be more than 0")
         if self.num_threads < 1 and self.num_threads != -1:
             raise FlagError(f"--num-threads is {self.num_threads}; it must be at least 1, or -1 for all")

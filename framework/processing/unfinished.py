@@ -19,7 +19,7 @@ FRAMES = "frames"
 """Folder of a video's frames."""
 FREE = (
     "output_dir", "overwrite", "resume", "num_downscales", "matching_method", "exhaustive_limit", "num_neighbors",
-    "sequential_overlap", "refine_intrinsics", "device_type", "num_threads", "verbose",
+    "sequential_overlap", "refine_intrinsics", "mask_moving", "mask_seconds", "device_type", "num_threads", "verbose",
 )  # fmt: skip
 """Flags that may differ from the stopped run's, because features and matches do not depend on them."""
 

@@ -134,7 +134,7 @@ def background_renderer(
         coarse = make_field(config, scene)
         sampler = HierarchicalSampler(coarse, config.num_coarse_samples, config.num_fine_samples)
     field = make_field(config, scene)
-    return SphereRenderer(renderer, foreground_sphere(scene), field, sampler, endless=not scene.has_alpha)
+    return SphereRenderer(renderer, foreground_sphere(config, scene), field, sampler, endless=not scene.has_alpha)
 
 
 def _ending_at(samples: Samples, ends: Tensor) -> Samples:

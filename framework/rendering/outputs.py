@@ -25,6 +25,8 @@ class Output:
     its rays, as colours are; directions are normalised afterwards."""
     label: str = ""
     """Caption of its picture; the name if empty."""
+    of_training: bool = False
+    """Whether it tells something of training images alone (`View.image`), as what is in one of them only."""
 
     @property
     def shape(self) -> tuple[int, ...]:

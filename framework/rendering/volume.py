@@ -58,11 +58,26 @@ class VolumeRenderer(Renderer):
         Raises:
             ValueError: if the samples have no density or no features.
         """
+        return volume_render(
+            rays, samples, *self.values(rays, samples, field), background, is_alpha=samples.alpha is not None
+        )
+
+    def values(self, rays: Rays, samples: Samples, field: Field) -> tuple[Tensor, Tensor]:
+        """Return the density or alpha (N,) of samples, and their colours (N, 3); in training with changed gradients.
+
+        Args:
+            rays: R rays.
+            samples: N samples along the rays, with density or alpha, and features, attached.
+            field: the field that was sampled.
+
+        Raises:
+            ValueError: if the samples have no density or no features.
+        """
         factors = None
         if self.training and self.unit_length is not None:
             factors = (samples.t / self.unit_length).square().clamp(max=1)
         thin = self.thin if self.training and rays.origins.device.type == "cpu" else 0.0
-        return shade(rays, samples, field, background, factors, thin)
+        return sample_values(rays, samples, field, factors, thin)
 
 
 def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
@@ -93,21 +108,15 @@ def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
     return samples.evaluated(*field.density(points))
 
 
-def shade(
-    rays: Rays,
-    samples: Samples,
-    field: Field,
-    background: Tensor,
-    gradient_factors: Tensor | None = None,
-    thin: float = 0.0,
-) -> Rendered:
-    """Compute the colours of samples and composite them.
+def sample_values(
+    rays: Rays, samples: Samples, field: Field, gradient_factors: Tensor | None = None, thin: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Return the density or alpha (N,) of samples, and their colours (N, 3).
 
     Args:
         rays: R rays.
         samples: N samples along the rays, with density or alpha, and features, attached.
         field: the field, which computes colours from features and directions.
-        background: (R, 3) or (3,) colour in [0, 1] of the background.
         gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
         thin: samples are thinned below this fraction of the mean gradient; 0 for none.
 
@@ -116,7 +125,7 @@ def shade(
     """
     stopping = samples.sigma if samples.alpha is None else samples.alpha
     if stopping is None or samples.features is None:
-        raise ValueError("shade() needs samples whose density and features are attached")
+        raise ValueError("rendering needs samples whose density and features are attached")
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
     rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
@@ -124,7 +133,7 @@ def shade(
         stopping, rgb = thinned(stopping, rgb, thin)
     if gradient_factors is not None:
         stopping, rgb = scale_gradient(stopping, gradient_factors), scale_gradient(rgb, gradient_factors)
-    return volume_render(rays, samples, stopping, rgb, background, is_alpha=samples.alpha is not None)
+    return stopping, rgb
 
 
 def volume_render(

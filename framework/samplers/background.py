@@ -14,6 +14,7 @@ from torch import Tensor
 from nerfloom.base.config import AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, Decision, fill
 from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.poses import looked_at
 from nerfloom.data.scene import Scene
 from nerfloom.samplers.choice import SamplingConfig, sampler_choice
 
@@ -31,8 +32,11 @@ class BackgroundConfig(SamplingConfig):
     """Allowed ranges."""
     background_model: Auto[Literal["none", "sphere", "contraction"]] = AUTO
     """Model of the outside of the scene's box. none: nothing. sphere: a second field in inverse distance (NeRF++),
-    outside a sphere around the box's centre and all cameras. contraction: the same field, contracted; not with
-    --sampler hierarchical. auto: the method's default if the scene may extend beyond the box, otherwise none."""
+    outside a sphere (--sphere-around). contraction: the same field, contracted; not with --sampler hierarchical. auto:
+    the method's default if the scene may extend beyond the box, otherwise none."""
+    sphere_around: Literal["cameras", "object"] = "cameras"
+    """Sphere between inside and outside. cameras: around the box's centre and all cameras. object: around the point
+    that the cameras look at, as far as the nearest camera; what is between a camera and the sphere is not shown."""
     num_background_samples: int = 32
     """Samples per ray outside the sphere, uniform in inverse distance (sphere). With --sampler hierarchical, the
     outside gets the same numbers of samples as the inside."""
@@ -85,20 +89,31 @@ def foreground(config: BackgroundConfig, scene: Scene) -> Scene:
     With a sphere, the box is the cube around the sphere.
     """
     if config.background_model == "sphere":
-        sphere = foreground_sphere(scene)
+        sphere = foreground_sphere(config, scene)
         box = torch.stack([sphere[:3] - sphere[3], sphere[:3] + sphere[3]])
         return replace(scene, box=box, unbounded=False)
     return replace(scene, unbounded=config.background_model == "contraction")
 
 
-def foreground_sphere(scene: Scene) -> Tensor:
+def foreground_sphere(config: BackgroundConfig, scene: Scene) -> Tensor:
     """Return the sphere (4,), centre and radius, that separates inside and outside.
 
-    It is centred on the box. It contains the box's inscribed ellipsoid and, with a margin, all training cameras, as in
-    NeRF++: cameras look out of the sphere and never into it. Without cameras it contains the box.
+    Around the cameras, it is centred on the box. It contains the box's inscribed ellipsoid and, with a margin, all
+    training cameras, as in NeRF++: cameras look out of the sphere and never into it. Without cameras it contains the
+    box. Around the object, its centre is the point nearest to all cameras' axes, and its radius the distance of the
+    nearest camera. If the cameras look at no common point, it is the sphere around the cameras.
+
+    Args:
+        config: the method's settings.
+        scene: properties of the whole scene.
     """
     centre, half = scene.box.mean(0), (scene.box[1] - scene.box[0]) / 2
     if scene.camera_to_worlds is None:
         return torch.cat([centre, half.norm()[None]])
-    farthest = (scene.camera_to_worlds[:, :, 3].to(centre) - centre).norm(dim=-1).amax()
+    cameras = scene.camera_to_worlds[:, :, 3].to(centre)
+    object_centre = looked_at(scene.camera_to_worlds) if config.sphere_around == "object" else None
+    if object_centre is not None:
+        centre = object_centre.to(centre)
+        return torch.cat([centre, (cameras - centre).norm(dim=-1).amin()[None]])
+    farthest = (cameras - centre).norm(dim=-1).amax()
     return torch.cat([centre, torch.maximum(MARGIN * farthest, half.amax())[None]])

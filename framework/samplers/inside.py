@@ -67,8 +67,19 @@ def make_foreground_sampler(
         scene: properties of the whole scene, not of its foreground.
         make_coarse: creates the coarse field of `--sampler hierarchical`, as in `make_sampler`.
     """
-    sampler = make_sampler(config, foreground(config, scene), make_coarse)
-    return InsideSphere(sampler, foreground_sphere(scene)) if config.background_model == "sphere" else sampler
+    return inside_foreground(config, scene, make_sampler(config, foreground(config, scene), make_coarse))
+
+
+def inside_foreground(config: BackgroundConfig, scene: Scene, sampler: Sampler) -> Sampler:
+    """Return a sampler of the scene's foreground, clipped to the sphere if the settings have one.
+
+    Args:
+        scene: properties of the whole scene, not of its foreground.
+        sampler: chooses samples in the box of the foreground.
+    """
+    if config.background_model != "sphere":
+        return sampler
+    return InsideSphere(sampler, foreground_sphere(config, scene))
 
 
 def clipped(samples: Samples, nears: Tensor, fars: Tensor) -> Samples:

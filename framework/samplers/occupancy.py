@@ -133,7 +133,7 @@ class OccupancySampler(Sampler):
         self.alpha_threshold = alpha_threshold
         self.cone = cone
         self.moving = moving
-        self._stride, self._eval_stride = 1.0, eval_step_scale
+        self.stride, self._eval_stride = 1.0, eval_step_scale
         self._times_per_visit = max(TIMES_PER_VISIT // slices, 1)
         self.register_buffer("box", box.clone())
         self.register_buffer("occupied", own_cells(levels, resolution).repeat(slices).to(box.device))
@@ -217,7 +217,7 @@ class OccupancySampler(Sampler):
             return surface.alpha(points, rays.directions.index_select(0, wave.owners), wave.t_ends - wave.t_starts)
 
         if self.is_fixed(rays):
-            steps = Steps(self.occupancy, self.step_size, self.num_steps, self._shift(rays, jitter))
+            steps = Steps(self.occupancy, self.stride * self.step_size, self.num_steps, self._shift(rays, jitter))
             return sample_into_slots(rays, steps, self.capacity, evaluate, surface, stop, self.samples_per_step)
         marched = self.begin(rays, jitter, stop)
         if isinstance(field, HasGridDensity) and not self.endless:
@@ -275,7 +275,7 @@ class OccupancySampler(Sampler):
         Raises:
             ValueError: if the rays require a gradient, because marched samples have none.
         """
-        stride, shift = self._stride if self.training else self._eval_stride, self._shift(rays, jitter)
+        stride, shift = self.stride if self.training else self._eval_stride, self._shift(rays, jitter)
         return march(rays, self.occupancy, stride * self.step_size, stride * self.cone, shift, early_stop)
 
     def _shift(self, rays: Rays, jitter: bool) -> Tensor | None:
@@ -323,7 +323,7 @@ class OccupancySampler(Sampler):
         """
         warming_up = step < WARM_UP_STEPS
         if self.levels > 1:
-            self._stride = next((longer for until, longer in COARSE_STEPS if step < until), 1.0)
+            self.stride = next((longer for until, longer in COARSE_STEPS if step < until), 1.0)
         if step == 0:
             self.kept()  # waits for the device once, before the first step
         if step == 0 or step % (8 if warming_up else 16):

@@ -17,7 +17,7 @@ from nerfloom.base.errors import FlagError, nearest
 from nerfloom.data.dataset import Dataset
 from nerfloom.stress.faults import Spoil, spoiled_pixel, spoiled_pose
 from nerfloom.stress.scenes import Views, ball_views
-from nerfloom.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice
+from nerfloom.stress.variants import first_image, moved, one_pixel, plain_colored, transparent, twice, with_distractors
 from nerfloom.testing.ball import RADIUS
 
 MAX_LOSS = 2.0
@@ -29,6 +29,8 @@ If test views are easier than the plain ones (all white, black or transparent), 
 degrees), the maximum is `MAX_LOSS`.
 """
 
+DISTRACTED, ROBUST_STEPS = 0.1, 100
+"""Share of pixels that distractors cover, and `robust_steps` of such a short run."""
 A_THIRD = "a third of the steps teach nothing, as they should"
 
 Change = Callable[[Views], Views]
@@ -117,6 +119,14 @@ CONDITIONS = (
         reason="there are only a dozen pixels, each the mean of an image whose centre its ray sees",
     ),
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
+    Condition(
+        "distractors",
+        "discs at other places in each training photograph, 10 % of its pixels, and the robust loss",
+        _train(lambda d: with_distractors(d, DISTRACTED)),
+        _fixed(robust="percentile", robust_steps=ROBUST_STEPS),
+        reason="a dozen small photographs: what a disc hides is seen in few others",
+        may_refuse=True,
+    ),
     # -- cameras
     Condition(
         "field-of-view-4",

@@ -16,6 +16,7 @@ from torch import Tensor
 from nerfloom.base.config import TrainConfig, from_plain
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import NerfloomError
+from nerfloom.base.signals import Stopped
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.data.scene import Scene
@@ -29,7 +30,6 @@ from nerfloom.registry import load_method
 from nerfloom.stress.conditions import Condition
 from nerfloom.stress.scenes import Views
 from nerfloom.training.run import Run
-from nerfloom.training.signals import Stopped
 from nerfloom.training.trainer import Trainer
 
 MAX_RAYS, MAX_SAMPLES = 512, 2**14

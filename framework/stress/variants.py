@@ -52,6 +52,30 @@ def mean_color(image: Tensor) -> Tensor:
     return torch.cat([mean, alpha.mean(0)]).round().to(torch.uint8)
 
 
+def with_distractors(dataset: Dataset, share: float, seed: int = 0) -> Dataset:
+    """Return `dataset` with opaque discs of one colour in its images, each at another place and of another colour.
+
+    Args:
+        dataset: the images.
+        share: share of each image's pixels that discs cover, at least.
+        seed: seed of places, sizes and colours.
+    """
+    generator, images = torch.Generator().manual_seed(seed), []
+    for index in range(len(dataset)):
+        image = dataset.image(index).clone()
+        height, width = image.shape[:2]
+        rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        covered = torch.zeros(height, width, dtype=torch.bool)
+        while covered.float().mean() < share:
+            row, column, size, *color = torch.rand(6, generator=generator).tolist()
+            radius = (0.1 + 0.15 * size) * min(height, width)
+            disc = (rows - row * height).square() + (columns - column * width).square() < radius**2
+            image[disc] = torch.tensor([*(round(255 * c) for c in color), 255][: image.shape[-1]], dtype=torch.uint8)
+            covered |= disc
+        images.append(image.flatten(0, 1))
+    return with_photographs(dataset, torch.cat(images), kept=dataset.kept)
+
+
 # -- selection of images ------------------------------------------------------------------------------------------
 
 

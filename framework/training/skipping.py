@@ -18,6 +18,7 @@ from nerfloom.model import evaluating
 from nerfloom.ray_model import RayModel
 from nerfloom.renderable import parts
 from nerfloom.samplers.base import SkipsCells
+from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.resolution import ImageSizes
@@ -92,11 +93,13 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
     carved = sum(int((s.carved & mask).sum()) for s, mask in zip(samplers, own, strict=True)) / cells
     empty = 1 - sum(int(s.occupied.sum()) for s in samplers) / cells
     rays = draw_batch(trainer.train_set, PROBE_RAYS, "black").rays
-    usual, count = _probe(model, rays)
-    with _changed(samplers, early_stop=0.0):
-        unhidden, visible_count = _probe(model, rays)
-        with _changed(samplers, occupied=True):
-            everywhere, all_count = _probe(model, rays)
+    tracers = parts(model, FirstCrossing)
+    with _tracing(tracers, False):
+        usual, count = _probe(model, rays)
+        with _changed(samplers, early_stop=0.0):
+            unhidden, visible_count = _probe(model, rays)
+            with _changed(samplers, occupied=True):
+                everywhere, all_count = _probe(model, rays)
     nested = any(s.levels > 1 for s in samplers)
     where = "all cells" if nested else "the box"
     rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of {where} is never sampled")]
@@ -120,6 +123,12 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
             _along_rays("behind opaque surfaces", visible_count, count, unhidden / usual),
         ),
     ]
+    if tracers:
+        with _tracing(tracers, True):
+            seconds, evaluated = _probe(model, rays)[0], sum(tracer.evaluations for tracer in tracers)
+        says = _along_rays("if pictures are traced (--eval-rendering surface)", count, evaluated, usual / seconds)
+        share = max(1 - evaluated / max(count, 1), 0.0)
+        rungs.append(Rung("samples, traced", share, usual / seconds, "--eval-rendering volume", says))
     if drawn is not None and (kept is None or len(drawn) < len(kept)):  # otherwise masks alone choose the drawn pixels
         share = 1 - len(drawn) / len(trainer.train_set.pixels if kept is None else kept)
         says = f"pixels that show only background: {share:.0%} of all are never drawn"
@@ -167,6 +176,19 @@ def _changed(samplers: list[SkipsCells], early_stop: float | None = None, occupi
             sampler.early_stop = stop
             sampler.occupied.copy_(cells)
             sampler.forget()
+
+
+@contextmanager
+def _tracing(tracers: list[FirstCrossing], traces: bool) -> Iterator[None]:
+    """Trace pictures, or do not, within a `with` block."""
+    before = [tracer.traces for tracer in tracers]
+    try:
+        for tracer in tracers:
+            tracer.traces = traces
+        yield
+    finally:
+        for tracer, own in zip(tracers, before, strict=True):
+            tracer.traces = own
 
 
 def as_plain(rungs: list[Rung]) -> list[dict[str, Any]]:

@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.cameras.scale import read_scale
-from nerfloom.data.dataset import load_dataset
 from nerfloom.data.offsets import offset_file, read_offset
-from nerfloom.data.parsed_scene import DataParser, ParsedScene
-from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.data.scene import Scene
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.geometry.local_origin import local_origin, rounding
-from nerfloom.registry import load_dataparser
 from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.placement import Axis, placed_gaussians
 from nerfloom.splats.transform import transformed
-from nerfloom.training.data_folder import find_data
+from nerfloom.training.file_data import DataFormat, scene_of, source_of
 from nerfloom.training.loaded import Loaded
-from nerfloom.training.run import Run
 
 METHOD = "gaussian-splatting"
 """Method of such files, whichever program wrote them."""
-LOOKED_AT = 4
-"""Number of images to decode for the images' size and alpha."""
-DataFormat = tuple[str, DataParser]
-"""Name of a data format, and its flags."""
 
 
 def load_splats(
@@ -67,9 +56,9 @@ def load_splats(
     elif up is not None:
         raise ConfigError("--up has no effect with --data, which determines the up direction; leave it out")
     else:
-        source = _source(file, data, data_format, machine)
+        source = source_of(METHOD, file, data, data_format, machine)
         parsed = source.parse("train")
-        scene, placement = _scene(parsed, source.config), scale.placed(parsed.placement)
+        scene, placement = scene_of(parsed, source.config), scale.placed(parsed.placement)
         if scene.warped:
             raise ConfigError(
                 f"{file}: normalised device coordinates (--ndc) have no place for Gaussians; leave out --ndc"
@@ -79,13 +68,6 @@ def load_splats(
     device = choose_device(machine)
     model = DrawnGaussians(placed.map(lambda values: values.to(device)), look, scene.to(device))
     return Loaded(model, placement, METHOD, file, file, source=source, scale=scale)
-
-
-def _source(file: Path, data: Path | None, data_format: DataFormat | None, machine: MachineConfig) -> Run:
-    """Return a placeholder run that holds the data."""
-    data, name = find_data(data, None if data_format is None else data_format[0])
-    parser = load_dataparser(name)() if data_format is None else data_format[1]
-    return Run(METHOD, TrainConfig(data=data, machine=machine, vis="none"), name, parser, file.parent)
 
 
 def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: ParsedScene) -> None:
@@ -113,11 +95,3 @@ def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: Parsed
             f"{file}: so far from the origin, float32 has rounded its centres by up to {rounding(given.means):.2g}; "
             f"write it about a local origin, with the offset in {beside}"
         )
-
-
-def _scene(parsed: ParsedScene, config: TrainConfig) -> Scene:
-    """Return the description of a scene, after decoding a few images."""
-    few = parsed[torch.arange(min(LOOKED_AT, len(parsed.image_paths)))]
-    scene = load_dataset(few, "train", PixelMemory.of(config.cache_limit, config.cache_dir), config.masks).scene
-    poses = parsed.cameras.camera_to_worlds
-    return dataclasses.replace(scene, num_cameras=len(poses), camera_to_worlds=poses)

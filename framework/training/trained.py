@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RaysPerPixel, TrainConfig
+from nerfloom.base.config import HeldOutAppearance, RaysPerPixel, TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
 from nerfloom.cameras.poses import Placement
@@ -32,7 +32,8 @@ def load_trained(
     device_type: Any = "auto",
     data: Path | None = None,
     rays_per_pixel: RaysPerPixel | None = None,
-    eval_appearance: Literal["mean", "half"] | None = None,
+    eval_appearance: HeldOutAppearance | None = None,
+    eval_rendering: Literal["volume", "surface"] | None = None,
 ) -> Loaded:
     """Load a run with its trained model.
 
@@ -43,6 +44,7 @@ def load_trained(
         data: folder of the data, if it has moved; None for the run's.
         rays_per_pixel: rays per rendered pixel; None for the run's setting.
         eval_appearance: appearance of held-out images; None for the run's setting.
+        eval_rendering: rendering of a signed distance; None for the run's setting.
 
     Raises:
         ConfigError: if the run's settings are missing or do not fit.
@@ -56,7 +58,13 @@ def load_trained(
         machine=machine,
         data=run.config.data if data is None else find_data(data, run.dataparser)[0],
     )
-    config = _changed(config, run.method, rays_per_pixel=rays_per_pixel, eval_appearance=eval_appearance)
+    config = _changed(
+        config,
+        run.method,
+        rays_per_pixel=rays_per_pixel,
+        eval_appearance=eval_appearance,
+        eval_rendering=eval_rendering,
+    )
     run = dataclasses.replace(run, config=config)
     device = choose_device(machine)
     if checkpoint is None:

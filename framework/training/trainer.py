@@ -20,6 +20,7 @@ from nerfloom.base.device import BEFORE_STEP, seed_step
 from nerfloom.base.errors import CheckpointError, DivergenceError
 from nerfloom.base.pace import Pace
 from nerfloom.base.processes import alone, from_first, processes
+from nerfloom.base.signals import stop_signals
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
 from nerfloom.kernels.native import torch_on_one_thread
@@ -37,7 +38,6 @@ from nerfloom.training.outcome import Outcome
 from nerfloom.training.preparation import decided, profile_of, show_images, skip_empty
 from nerfloom.training.progress import ProgressBar, Rate, StepReport, TensorBoard
 from nerfloom.training.run import Run
-from nerfloom.training.signals import stop_signals
 from nerfloom.training.state import State, agree
 from nerfloom.training.step import StepResult, learn, schedule, train_step
 from nerfloom.training.trained import restore_model

@@ -32,7 +32,10 @@ def reloaded(loaded: Loaded, checkpoint: Path) -> Loaded | str:
         checkpoint: file of the newer parameters.
     """
     config = loaded.run.config
+    rendering = getattr(config, "eval_rendering", None)
     try:
-        return load_trained(loaded.folder, checkpoint, config.machine.device_type, config.data)
+        return load_trained(
+            loaded.folder, checkpoint, config.machine.device_type, config.data, eval_rendering=rendering
+        )
     except (NerfloomError, OSError) as error:
         return f"{checkpoint.name} cannot be shown: {error}"

@@ -3,26 +3,24 @@
 import json
 from pathlib import Path
 from statistics import fmean, stdev
-from threading import Event
 
 import pytest
 
 from benchmarks import curves
 from benchmarks.__main__ import main
 from nerfloom.base.errors import ConfigError
-from nerfloom.comparison import runner
-from nerfloom.comparison.plan import Conditions, Contender, Job
-from nerfloom.comparison.runner import Failure
+from nerfloom.comparison.plan import Contender, PlannedRun
+from nerfloom.jobs.processes import Processes
 from nerfloom.registry import registered
-from tests.comparison.runs import finish
+from tests.comparison.runs import at_once, finish
 from tests.conftest import Refused
 
 METHODS = ("instant-ngp", "kplanes --num-scales 2")
 
 
-def psnr_of(job: Job, seconds: float) -> float:
+def psnr_of(planned: PlannedRun, seconds: float) -> float:
     """A PSNR that differs between methods, budgets and seeds."""
-    return 20 + len(job.contender.label) / 10 + seconds / 100 + (job.seed - 42) ** 2 / 4
+    return 20 + len(planned.contender.label) / 10 + seconds / 100 + (planned.seed - 42) ** 2 / 4
 
 
 @pytest.fixture
@@ -30,15 +28,14 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
     """Runs that were asked for: label, seconds and seed of each; they end at once, with the PSNR of `psnr_of`."""
     asked: list[tuple[str, float, int]] = []
 
-    def run_job(job: Job, conditions: Conditions, device: str | None, stopped: Event) -> Failure | None:
-        assert conditions.max_seconds is not None
-        asked.append((job.contender.label, conditions.max_seconds, job.seed))
-        if "nerfacto" in job.contender.label:
-            return Failure("its GPU is on fire", job.log)
-        finish(job, psnr_of(job, conditions.max_seconds), conditions.max_seconds + 0.5)
+    def outcome(planned: PlannedRun, seconds: float) -> str | None:
+        asked.append((planned.contender.label, seconds, planned.seed))
+        if "nerfacto" in planned.contender.label:
+            return "its GPU is on fire"
+        finish(planned, psnr_of(planned, seconds), seconds + 0.5)
         return None
 
-    monkeypatch.setattr(runner, "run_job", run_job)
+    monkeypatch.setattr(Processes, "run", at_once(outcome))
     return asked
 
 
@@ -51,12 +48,12 @@ def test_each_budget_is_a_run_of_its_own_without_curve_images(tmp_path: Path) ->
     first, second = curves.plans(METHODS, tmp_path, (45.0, 10.0, 45.0), 2, 30, tmp_path / "runs")
     assert [first.conditions.max_seconds, second.conditions.max_seconds] == [10.0, 45.0]
     assert first.folder != second.folder
-    job = first.jobs()[0]
-    words = job.train_command(first.conditions)
+    planned = first.runs()[0]
+    words = planned.train_command(first.conditions)
     assert words[words.index("--max-seconds") + 1] == "10.0"
     assert words[words.index("--max-eval-images") + 1] == "0"  # which would only take time
     assert "--seconds-per-eval-all-images" not in words
-    assert job.eval_command(first.conditions)[-2:] == ["--max-images", "30"]
+    assert planned.eval_command(first.conditions)[-2:] == ["--max-images", "30"]
     with pytest.raises(ConfigError, match="--budgets is empty"):
         curves.plans(METHODS, None, (), 1, 50, tmp_path)
 
@@ -68,7 +65,7 @@ def test_means_and_spreads_over_the_seeds(ran: list[tuple[str, float, int]], tmp
     assert [method["method"] for method in content["methods"]] == list(METHODS)
     for label, method in zip(METHODS, content["methods"], strict=True):
         for seconds, point in zip((10.0, 45.0), method["points"], strict=True):
-            psnrs = [psnr_of(Job(Contender.of(label), seed, tmp_path), seconds) for seed in (42, 43, 44)]
+            psnrs = [psnr_of(PlannedRun(Contender.of(label), seed, tmp_path), seconds) for seed in (42, 43, 44)]
             assert point["budget, s"] == seconds
             assert point["training, s"] == seconds + 0.5
             assert point["PSNR, dB"] == pytest.approx(fmean(psnrs), abs=1e-3)

@@ -7,7 +7,6 @@ import sys
 import time
 from pathlib import Path
 from statistics import fmean, stdev
-from threading import Event
 from typing import Any
 
 import pytest
@@ -18,10 +17,9 @@ from benchmarks.tables import Row, read_table
 from nerfloom.base.errors import ConfigError
 from nerfloom.benchmarks.results import add_row
 from nerfloom.cli.train import run_of
-from nerfloom.comparison import runner
-from nerfloom.comparison.plan import Conditions, Job
-from nerfloom.comparison.runner import Failure
-from tests.comparison.runs import finish
+from nerfloom.comparison.plan import PlannedRun
+from nerfloom.jobs.processes import Processes
+from tests.comparison.runs import at_once, finish
 from tests.conftest import Refused
 from tests.site.commands import found
 
@@ -42,9 +40,9 @@ def write(folder: Path, text: str = ROWS) -> Path:
     return path
 
 
-def psnr_of(job: Job, seconds: float) -> float:
+def psnr_of(planned: PlannedRun, seconds: float) -> float:
     """A PSNR that differs between rows."""
-    return 20 + len(job.contender.label) / 10 + seconds / 100 + (job.seed - 42) / 4
+    return 20 + len(planned.contender.label) / 10 + seconds / 100 + (planned.seed - 42) / 4
 
 
 @pytest.fixture
@@ -52,15 +50,14 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float, int]]:
     """Label, seconds and seed of each run; they end at once, with the PSNR of `psnr_of`; kplanes fails after 45 s."""
     asked: list[tuple[str, float, int]] = []
 
-    def run_job(job: Job, conditions: Conditions, device: str | None, stopped: Event) -> Failure | None:
-        assert conditions.max_seconds is not None
-        asked.append((job.contender.label, conditions.max_seconds, job.seed))
-        if job.contender.method == "kplanes" and conditions.max_seconds == 45:
-            return Failure("its planes have crashed", job.log)
-        finish(job, psnr_of(job, conditions.max_seconds), conditions.max_seconds + 0.5)
+    def outcome(planned: PlannedRun, seconds: float) -> str | None:
+        asked.append((planned.contender.label, seconds, planned.seed))
+        if planned.contender.method == "kplanes" and seconds == 45:
+            return "its planes have crashed"
+        finish(planned, psnr_of(planned, seconds), seconds + 0.5)
         return None
 
-    monkeypatch.setattr(runner, "run_job", run_job)
+    monkeypatch.setattr(Processes, "run", at_once(outcome))
     return asked
 
 
@@ -79,17 +76,17 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
     assert names[:5] == ["ball-ngp-1s", "ball-planes-1s", "ball-ngp-4.5s", "ball-planes-4.5s", "embedded-ngp-1s"]
     assert names[8] == "ball-ngp-1s-seed43"
     planes, embedded = table.rows[1], table.rows[4]
-    words = planes.job.train_command(planes.conditions)
+    words = planes.planned.train_command(planes.conditions)
     assert words[words.index("--data") + 1] == str(tmp_path / "data" / "shapes" / "ball")
     assert words[words.index("--max-seconds") + 1] == "1.0"
     assert words[words.index("--machine.seed") + 1] == "42"
     assert words[-4:] == ["--num-scales", "2", "--downscale-factor", "2"]
-    assert planes.job.eval_command(planes.conditions)[-2:] == ["--max-images", "3"]
+    assert planes.planned.eval_command(planes.conditions)[-2:] == ["--max-images", "3"]
     whole = read_table(tmp_path / "table.yml", tmp_path, tmp_path).rows[0]
     assert whole.name == "ball-ngp-10s"
-    assert "--max-images" not in whole.job.eval_command(whole.conditions)
-    assert "--data" not in embedded.job.train_command(embedded.conditions)
-    assert len({row.job.folder for row in table.rows}) == 16
+    assert "--max-images" not in whole.planned.eval_command(whole.conditions)
+    assert "--data" not in embedded.planned.train_command(embedded.conditions)
+    assert len({row.planned.folder for row in table.rows}) == 16
 
 
 @pytest.mark.parametrize(
@@ -122,13 +119,13 @@ def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr("nerfloom.training.data_folder.find_data", here)
     rows = read_table(path, Path("data"), Path("runs")).rows
-    understood: dict[str, Row] = {row.job.contender.label: row for row in rows}
+    understood: dict[str, Row] = {row.planned.contender.label: row for row in rows}
     for row in understood.values():
-        words = row.job.train_command(row.conditions)
+        words = row.planned.train_command(row.conditions)
         method, *flags = words[words.index("nerfloom.cli.train") + 1 :]
         run = run_of(method, flags)
         assert run.config.max_seconds == row.seconds
-        assert run.config.machine.seed == row.job.seed
+        assert run.config.machine.seed == row.planned.seed
     assert rows
 
 
@@ -204,7 +201,7 @@ def test_means_and_spreads_over_seeds(
         f"ball, {method}, {seconds} s" for seconds in (10, 45) for method in ("ngp", "planes")
     ]
     (row,) = [row for row in read_table(path, tmp_path, tmp_path).rows if row.name == "ball-ngp-45s"]
-    psnrs = [psnr_of(Job(row.job.contender, seed, tmp_path), 45.0) for seed in (42, 43)]
+    psnrs = [psnr_of(PlannedRun(row.planned.contender, seed, tmp_path), 45.0) for seed in (42, 43)]
     spread = f"{stdev(psnrs):.2f} dB"
     assert cells[3][1] == f"{fmean(psnrs):.2f} ± {spread}"
     assert cells[3][2:6] == ["0.900", "29.00 ± 0.00 dB", "30.00 ± 0.00 dB", f"{fmean(psnrs) - 1:.2f} ± {spread}"]

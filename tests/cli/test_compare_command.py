@@ -70,4 +70,4 @@ def test_the_standard_comparisons_are_readable(recipe: Path) -> None:
     from nerfloom.cli.compare import CompareFlags, plan_of
 
     plan = plan_of(from_plain(CompareFlags(), read_yaml(recipe), str(recipe)))
-    assert len(plan.jobs()) >= 3
+    assert len(plan.runs()) >= 3

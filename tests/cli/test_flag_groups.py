@@ -20,8 +20,8 @@ from nerfloom.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerfacto", "neus",
-    "pixel-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
+    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
+    "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
 )  # fmt: skip
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
 """Methods with settings for few images."""
@@ -78,7 +78,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert list(found) == [
         "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
         *["background options"] * (method in WITH_BACKGROUND), "ray options",
-        *["appearance options"] * (method in ("nerfacto", "neus", "volsdf", "zip-nerf")),
+        *["appearance options"] * (method in ("nerf-w", "nerfacto", "neus", "volsdf", "zip-nerf")), "robust options",
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
         "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",

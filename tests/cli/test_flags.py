@@ -12,6 +12,7 @@ from nerfloom.cli.viewer import ViewerFlags
 from tests.cli.helpers import called
 
 COMMANDS = {
+    "ns-bake": [],
     "ns-bench": ["kernels"],
     "ns-compare": [],
     "ns-download-data": ["blender"],

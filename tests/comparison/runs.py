@@ -1,13 +1,17 @@
 """Finished runs, made up."""
 
 import json
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerfloom.comparison.plan import Conditions, Contender, Job, Plan
+from nerfloom.comparison.plan import Conditions, Contender, Plan, PlannedRun
 from nerfloom.evaluation.images import write_image
+from nerfloom.jobs.job import Failure, Job
+from nerfloom.jobs.launcher import Ledger, nothing
 
 CONDITIONS = Conditions(None, (), 60.0, None, None, None, "cpu", 4, None)
 MACHINE = {"processor": "abacus", "threads": 2, "kernels": "avx2", "commit": None}
@@ -18,11 +22,11 @@ def plan(folder: Path, *labels: str, repeats: int = 1) -> Plan:
     return Plan(tuple(Contender.of(label) for label in labels), CONDITIONS, repeats, folder)
 
 
-def finish(job: Job, psnr: float, seconds: float = 60.0, **changes: Any) -> None:
+def finish(planned: PlannedRun, psnr: float, seconds: float = 60.0, **changes: Any) -> None:
     """Write what a finished run leaves."""
-    job.folder.mkdir(parents=True)
+    planned.folder.mkdir(parents=True)
     summary = {
-        "method": job.contender.method,
+        "method": planned.contender.method,
         "stopped": "60 s of training spent",
         "interrupted": False,
         "steps": 1000,
@@ -48,10 +52,28 @@ def finish(job: Job, psnr: float, seconds: float = 60.0, **changes: Any) -> None
         ("scene_profile.json", {"decisions": decisions}),
         ("skip_report.json", [{"name": "cells", "skipped": 0.5, "rendering_saved": None, "switch": "--x"}]),
     ):
-        (job.folder / name).write_text(json.dumps(content))
+        (planned.folder / name).write_text(json.dumps(content))
 
 
-def draw(job: Job, seed: int, names: tuple[str, ...] = ("0000_r_0", "0001_r_1"), size: int = 64) -> None:
+def at_once(outcome: Callable[[PlannedRun, float], str | None]) -> Callable[..., dict[Job, Failure]]:
+    """A launcher's `run` whose jobs end at once.
+
+    Args:
+        outcome: makes the files of a run, given its seconds of training; returns why it failed, if so.
+    """
+
+    def run(_: object, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
+        ledger = Ledger(jobs, on_finished)
+        for job in ledger.unfinished():
+            words = job.steps[0].command
+            assert isinstance(job.finished, partial)
+            ledger.ended(job, outcome(job.finished.args[0], float(words[words.index("--max-seconds") + 1])))
+        return ledger.failures
+
+    return run
+
+
+def draw(planned: PlannedRun, seed: int, names: tuple[str, ...] = ("0000_r_0", "0001_r_1"), size: int = 64) -> None:
     """Write renders whose upper left quarter is worst, and their photographs."""
     import torch
 
@@ -59,5 +81,5 @@ def draw(job: Job, seed: int, names: tuple[str, ...] = ("0000_r_0", "0001_r_1"),
     wrong = torch.from_numpy(np.random.default_rng(seed).random((size, size, 3))).float() * 0.05
     wrong[: size // 2, : size // 2] *= 10
     for name in names:
-        write_image(job.pictures / f"{name}.png", (noise + wrong).clamp(0, 1))
-        write_image(job.pictures / f"{name}_photograph.png", noise)
+        write_image(planned.pictures / f"{name}.png", (noise + wrong).clamp(0, 1))
+        write_image(planned.pictures / f"{name}_photograph.png", noise)

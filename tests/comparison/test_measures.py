@@ -21,10 +21,10 @@ def test_levels_are_met_on_straight_lines_between_evaluations() -> None:
 
 
 def test_figures_come_from_the_runs_files(tmp_path: Path) -> None:
-    job = plan(tmp_path, "kplanes --num-scales 2").jobs()[0]
-    assert measure(job, CONDITIONS) is None
-    finish(job, 30.0)
-    found = measure(job, CONDITIONS)
+    planned = plan(tmp_path, "kplanes --num-scales 2").runs()[0]
+    assert measure(planned, CONDITIONS) is None
+    finish(planned, 30.0)
+    found = measure(planned, CONDITIONS)
     assert found is not None
     assert (found.psnr, found.ssim, found.lpips, found.views) == (30.0, 0.9, None, 16)
     assert found.render_seconds == 0.25
@@ -32,12 +32,12 @@ def test_figures_come_from_the_runs_files(tmp_path: Path) -> None:
     assert found.seconds_to == {27: 15.0, 28: 30.0, 29: 45.0, 30: 60.0}
     assert found.command == "ns-train kplanes --num-scales 2 --machine.seed 42 --max-seconds 60.0"
     assert found.decisions == ("background: random, as there is <alpha>",)
-    (job.folder / "summary.json").write_text("{")
-    assert measure(job, CONDITIONS) is None
+    (planned.folder / "summary.json").write_text("{")
+    assert measure(planned, CONDITIONS) is None
 
 
 def test_surfaces_have_figures_where_there_was_a_reference(tmp_path: Path) -> None:
-    judged, other = plan(tmp_path, "kplanes", "tensorf").jobs()
+    judged, other = plan(tmp_path, "kplanes", "tensorf").runs()
     finish(judged, 30.0)
     finish(other, 30.0)
     evaluation = json.loads(judged.evaluation.read_text())
@@ -57,7 +57,7 @@ def test_surfaces_have_figures_where_there_was_a_reference(tmp_path: Path) -> No
 
 
 def test_a_run_is_done_once_it_was_judged_and_is_finite(tmp_path: Path) -> None:
-    whole, stopped, blown_up = plan(tmp_path, "tensorf", "kplanes", "nerfacto").jobs()
+    whole, stopped, blown_up = plan(tmp_path, "tensorf", "kplanes", "nerfacto").runs()
     assert not is_done(whole)
     finish(whole, 30.0)
     finish(stopped, 30.0, interrupted=True)
@@ -65,18 +65,18 @@ def test_a_run_is_done_once_it_was_judged_and_is_finite(tmp_path: Path) -> None:
     evaluation = json.loads(blown_up.evaluation.read_text())
     evaluation["results"]["psnr"] = None
     blown_up.evaluation.write_text(json.dumps(evaluation))
-    assert [is_done(job) for job in (whole, stopped, blown_up)] == [True, False, False]
+    assert [is_done(planned) for planned in (whole, stopped, blown_up)] == [True, False, False]
     assert measure(blown_up, CONDITIONS) is None
 
 
 def test_seeds_are_put_together(tmp_path: Path) -> None:
     comparison = plan(tmp_path, "kplanes", "tensorf", repeats=3)
     values = {"kplanes": (30.0, 31.0, 32.5), "tensorf": (28.0,)}
-    for job in comparison.jobs():
-        number = job.seed - 42
-        if number < len(values[job.contender.label]):
-            finish(job, values[job.contender.label][number])
-    runs = [run for run in (measure(job, CONDITIONS) for job in comparison.jobs()) if run is not None]
+    for planned in comparison.runs():
+        number = planned.seed - 42
+        if number < len(values[planned.contender.label]):
+            finish(planned, values[planned.contender.label][number])
+    runs = [run for run in (measure(planned, CONDITIONS) for planned in comparison.runs()) if run is not None]
     first, second, third = rows_of(["kplanes", "tensorf", "lost"], runs, {"tensorf": ["out of memory"]})
     assert first.mean("psnr") == pytest.approx(sum(values["kplanes"]) / 3)
     assert first.deviation("psnr") == pytest.approx(stdev(values["kplanes"]))

@@ -10,7 +10,9 @@ import pytest
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.comparison.crops import MAX_VIEWS
-from nerfloom.comparison.plan import Conditions, Contender, Job, Plan, split_words, views_for
+from nerfloom.comparison.plan import Conditions, Contender, Plan, PlannedRun, split_words, views_for
+from nerfloom.comparison.runner import job_of
+from nerfloom.jobs.job import Resources
 
 CONDITIONS = Conditions("/data/lego", ("--downscale-factor", "2"), 120.0, None, None, 2, "cpu", 4, None)
 
@@ -67,8 +69,8 @@ def test_conditions_must_end_somewhere() -> None:
 
 
 def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(tmp_path: Path) -> None:
-    job = Job(Contender.of("vanilla-nerf --machine.seed 7"), 43, tmp_path / "runs")
-    words = job.train_command(CONDITIONS)
+    planned = PlannedRun(Contender.of("vanilla-nerf --machine.seed 7"), 43, tmp_path / "runs")
+    words = planned.train_command(CONDITIONS)
     words = words[words.index("nerfloom.cli.train") + 1 :]
     assert words[0] == "vanilla-nerf"
     assert words[-4:] == ["--machine.seed", "7", "--downscale-factor", "2"]
@@ -79,19 +81,23 @@ def test_commands_say_all_that_is_the_same_and_the_contenders_flags_count_last(t
     assert float(given["--seconds-per-eval-all-images"]) == 15
     assert "--max-num-iterations" not in given
     folder = Path(given["--output-dir"]) / given["--experiment-name"] / "vanilla-nerf" / given["--timestamp"]
-    assert folder == job.folder
-    job.folder.mkdir(parents=True)
-    (job.folder / "config.yml").write_text("")
-    assert job.train_command(CONDITIONS)[-2:] == ["--resume", str(job.folder)]
+    assert folder == planned.folder
+    train, judge = job_of(planned, CONDITIONS).steps
+    assert list(train.command) == planned.train_command(CONDITIONS)
+    assert train.started == planned.folder / "config.yml"
+    assert train.resume[-2:] == ("--resume", str(planned.folder))
+    assert list(judge.command) == planned.eval_command(CONDITIONS)
+    assert job_of(planned, CONDITIONS).resources == Resources(cores=2, gpus=0)
+    assert job_of(planned, replace(CONDITIONS, device_type="cuda", num_threads=None)).resources == Resources(None, 1)
     steps = replace(CONDITIONS, max_seconds=None, max_num_iterations=100)
-    command = Job(Contender.of("kplanes"), 43, tmp_path / "runs").train_command(steps)
+    command = PlannedRun(Contender.of("kplanes"), 43, tmp_path / "runs").train_command(steps)
     assert command[command.index("--steps-per-eval-all-images") + 1] == "12"
-    assert job.eval_command(replace(CONDITIONS, max_eval_images=5))[-2:] == ["--max-images", "5"]
+    assert planned.eval_command(replace(CONDITIONS, max_eval_images=5))[-2:] == ["--max-images", "5"]
 
 
-def test_jobs_go_seed_by_seed(tmp_path: Path) -> None:
+def test_runs_go_seed_by_seed(tmp_path: Path) -> None:
     plan = Plan((Contender.of("kplanes"), Contender.of("tensorf")), CONDITIONS, 2, tmp_path)
-    assert [(job.contender.label, job.seed) for job in plan.jobs()] == [
+    assert [(planned.contender.label, planned.seed) for planned in plan.runs()] == [
         ("kplanes", 42),
         ("tensorf", 42),
         ("kplanes", 43),
@@ -132,7 +138,7 @@ def test_the_final_evaluation_is_over_a_view_a_second_unless_the_user_says_how_m
 
 def test_without_curve_images_nothing_is_evaluated_during_training(tmp_path: Path) -> None:
     for conditions in (CONDITIONS, replace(CONDITIONS, max_seconds=None, max_num_iterations=100)):
-        words = Job(Contender.of("kplanes"), 42, tmp_path).train_command(replace(conditions, curve_images=0))
+        words = PlannedRun(Contender.of("kplanes"), 42, tmp_path).train_command(replace(conditions, curve_images=0))
         assert words[words.index("--max-eval-images") + 1] == "0"
         assert not [word for word in words if "per-eval-all-images" in word]
     with pytest.raises(ConfigError, match="--curve-images must be at least 0"):
@@ -140,7 +146,7 @@ def test_without_curve_images_nothing_is_evaluated_during_training(tmp_path: Pat
 
 
 def test_only_the_pictures_that_a_report_shows_are_written(tmp_path: Path) -> None:
-    command = Job(Contender.of("kplanes"), 42, tmp_path).eval_command(CONDITIONS)
+    command = PlannedRun(Contender.of("kplanes"), 42, tmp_path).eval_command(CONDITIONS)
     assert command[command.index("--max-pictures") + 1] == str(MAX_VIEWS)
 
 
@@ -152,7 +158,7 @@ def test_surfaces_are_judged_by_the_same_reference(tmp_path: Path) -> None:
     plan = plan_of(flags)
     words = ["--reference-mesh", str(file), "--f-score-at", "0.1", "0.2", "--crop", "0.1"]
     assert list(plan.conditions.geometry) == words
-    assert plan.jobs()[0].eval_command(plan.conditions)[-len(words) :] == words
+    assert plan.runs()[0].eval_command(plan.conditions)[-len(words) :] == words
     assert plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=60, crop=0.1)).conditions.geometry == ()
     with pytest.raises(ConfigError, match=r"gone.ply is no file"):
         plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=60, reference_points=tmp_path / "gone.ply"))

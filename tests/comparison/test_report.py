@@ -26,10 +26,10 @@ LABELS = ("instant-ngp", "kplanes --num-scales 2", "tensorf")
 def compared(tmp_path: Path) -> Plan:
     """Two methods that worked, one that failed."""
     comparison = plan(tmp_path, *LABELS)
-    for number, job in enumerate(comparison.jobs()[:2]):
-        finish(job, 30.0 + number, 60.0 + number)
-        draw(job, number)
-    runs = [run for run in (measure(job, CONDITIONS) for job in comparison.jobs()) if run is not None]
+    for number, planned in enumerate(comparison.runs()[:2]):
+        finish(planned, 30.0 + number, 60.0 + number)
+        draw(planned, number)
+    runs = [run for run in (measure(planned, CONDITIONS) for planned in comparison.runs()) if run is not None]
     write_report(comparison, rows_of(LABELS, runs, {"tensorf": ["seed 42: <out> of memory (x.log)"]}))
     return comparison
 
@@ -46,6 +46,17 @@ def test_the_page_holds_everything_and_needs_nothing(compared: Plan) -> None:
     if plots.available():
         assert "<svg" in page
     assert "{{" not in page
+
+
+def test_what_has_not_run_yet_has_not_failed_and_machines_that_were_shared_are_named(compared: Plan) -> None:
+    runs = [run for run in (measure(planned, CONDITIONS) for planned in compared.runs()) if run is not None]
+    write_report(compared, rows_of(LABELS, runs, {}), "2 runs at a time on one machine.")
+    text = (compared.folder / "report.md").read_text()
+    assert "| tensorf | not run |" in text
+    assert "- 2 runs at a time on one machine. " in text
+    page = (compared.folder / "report.html").read_text()
+    assert "2 runs at a time on one machine. " in page
+    assert ">not run</td>" in page
 
 
 def test_tables_in_markdown_and_csv_and_json(compared: Plan) -> None:
@@ -87,15 +98,15 @@ def test_what_nobody_has_measured_has_no_column(compared: Plan) -> None:
 
 def test_surfaces_have_columns_and_say_how_they_were_compared(tmp_path: Path) -> None:
     comparison = plan(tmp_path / "out", "kplanes", "tensorf")
-    for job, chamfer in zip(comparison.jobs(), (0.25, 0.5), strict=True):
-        finish(job, 30.0)
-        evaluation = json.loads(job.evaluation.read_text())
+    for planned, chamfer in zip(comparison.runs(), (0.25, 0.5), strict=True):
+        finish(planned, 30.0)
+        evaluation = json.loads(planned.evaluation.read_text())
         evaluation["geometry"] = {
             "reference": "/data/solids/reference.ply", "side": 2.0, "chamfer_percent": chamfer, "faces": 1234,
             "f_scores": [{"distance": 0.005, "f_score": 0.4}], "normals": {"degrees": 6.0, "cosine": 0.99},
         }  # fmt: skip
-        job.evaluation.write_text(json.dumps(evaluation))
-    runs = [run for run in (measure(job, CONDITIONS) for job in comparison.jobs()) if run is not None]
+        planned.evaluation.write_text(json.dumps(evaluation))
+    runs = [run for run in (measure(planned, CONDITIONS) for planned in comparison.runs()) if run is not None]
     write_report(comparison, rows_of(["kplanes", "tensorf"], runs, {}))
     text = (comparison.folder / "report.md").read_text()
     head = next(line for line in text.splitlines() if line.startswith("| method")).split(" | ")
@@ -123,10 +134,10 @@ def test_crops_are_where_the_methods_are_wrong(tmp_path: Path) -> None:
     assert edge == 32
     assert wrong[top : top + edge, left : left + edge].sum() == wrong.sum()
     assert worst_square(np.ones((5, 7))) == (0, 0, 5)
-    jobs = plan(tmp_path, "kplanes", "tensorf").jobs()
-    draw(jobs[0], 0, ("a", "b", "c"))
-    draw(jobs[1], 1, ("b", "c", "d"))
-    found = views([(job.contender.label, job.pictures) for job in jobs])
+    all_planned = plan(tmp_path, "kplanes", "tensorf").runs()
+    draw(all_planned[0], 0, ("a", "b", "c"))
+    draw(all_planned[1], 1, ("b", "c", "d"))
+    found = views([(planned.contender.label, planned.pictures) for planned in all_planned])
     assert [view.name for view in found] == ["b", "c"]
     assert views([("x", tmp_path / "nowhere")]) == []
     image = np.random.default_rng(0).integers(0, 256, (3, 4, 3), dtype=np.uint8)

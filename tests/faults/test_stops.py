@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.signals import Stopped, exit_status
 from nerfloom.cli.session import resume, start
 from nerfloom.training.checkpoint import FOLDER
 from nerfloom.training.lock import LOCK
 from nerfloom.training.progress import StepReport
 from nerfloom.training.run import create_folder, read_run
-from nerfloom.training.signals import Stopped, exit_status
 from nerfloom.training.trainer import Trainer
 from tests.faults import runs
 from tests.training.helpers import differences, tiny_run, tiny_trainer

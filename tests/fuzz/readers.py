@@ -23,6 +23,7 @@ from nerfloom.cameras.scale import Scale, read_scale, write_scale
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
+from nerfloom.data.normals import read_normals
 from nerfloom.data.pixels.cache import PixelMemory, pack, unpack
 from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.ply import read_points
@@ -43,6 +44,9 @@ from nerfloom.evaluation.surface_files import read_points as read_surface_points
 from nerfloom.evaluation.surfaces import drawn
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.octree.packed import trace_packed
+from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import polycam, record3d
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
@@ -67,6 +71,7 @@ from tests.exr_files import NONE, RLE, ZIP, ZIPS, write_exr
 from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
+from tests.octrees.balls import ball
 from tests.splats.foreign_files import write_compressed, write_splat
 from tests.training.helpers import tiny_run
 
@@ -201,6 +206,24 @@ def read_splats(folder: Path, scratch: Path) -> None:
         require(bool(gaussians.finite().all()), "Gaussians that are nowhere")
         require(bool(gaussians.log_scales.exp().isfinite().all()), "Gaussians without end")
         require(bool((gaussians.rotations.norm(dim=-1) > 0).all()), "Gaussians without axes")
+
+
+def write_octrees(folder: Path) -> None:
+    for degree in (0, 1):
+        write_octree(folder / f"{degree}.octree", ball(degree))
+
+
+def read_octrees(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.octree")):
+        octree = read_octree(file)
+        require(octree.layout.num_leaves == len(octree.leaves.codes), "leaves without values")
+        require(bool(octree.leaves.coefficients().isfinite().all()), "colours that are not finite")
+        require(bool(octree.scene.box.isfinite().all()), "a box that is nowhere")
+        count = 50
+        directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+        rays = Rays(torch.randn(count, 3), directions, fars=torch.full((count,), 100.0))
+        light = trace_packed(octree.layout, octree.leaves, rays, torch.ones(3))
+        require(bool(light.opacity.isfinite().all()), "light that is not finite")
 
 
 def write_path(folder: Path) -> None:
@@ -380,6 +403,18 @@ def read_exr_depths(folder: Path, scratch: Path) -> None:
         require(read_depth(file, 20, 15).shape == (15, 20), "another shape")
 
 
+def write_normals(folder: Path) -> None:
+    for index, channels in enumerate((3, 4)):
+        iio.imwrite(folder / f"{index}_normal.png", noise(20, 15, index, channels))
+
+
+def read_images_of_normals(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.png")):
+        normals = read_normals(file, 20, 15)
+        require(normals.shape == (15, 20, 3), "another shape")
+        require(bool(((normals.norm(dim=-1) - 1).abs() < 1e-3).all()), "other lengths than 1")
+
+
 def write_archive(folder: Path) -> None:
     """Text, an image, and an entry that is stored as it is."""
     with zipfile.ZipFile(folder / "scenes.zip", "w") as archive:
@@ -434,6 +469,7 @@ READERS: dict[str, Reader] = {
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
     "surfaces": Reader(write_surfaces, read_surfaces, ("mesh.*",)),
     "splats": Reader(write_splats, read_splats, ("splat.*",)),
+    "octree": Reader(write_octrees, read_octrees, ("*.octree",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
     "scale": Reader(
         lambda folder: write_scale(folder, Scale(0.25, "m", 0.01)), read_run_scale, ("scale.json",), ("factor", "unit")
@@ -443,6 +479,7 @@ READERS: dict[str, Reader] = {
     "masks": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("masks/*.png",)),
     "depths": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("depths/*",)),
     "depths-exr": Reader(write_exr_depths, read_exr_depths, ("*.exr",)),
+    "normals": Reader(write_normals, read_images_of_normals, ("*.png",)),
     "photographs": Reader(write_photographs, read_photographs, ("*",)),
     "polycam-raw": Reader(write_polycam, convert_polycam, ("keyframes/cameras/*.json",), ("blur_score", "fx", "width")),
     "record3d-raw": Reader(

@@ -21,6 +21,7 @@ from nerfloom.kernels.compositing.density import COMPOSITE, DISTORTION
 from nerfloom.kernels.dispatch import TRITON, Backend, Operation, derivatives
 from nerfloom.kernels.encodings.contraction import CONTRACT
 from nerfloom.kernels.encodings.frequency import FREQUENCY_ENCODING
+from nerfloom.kernels.encodings.integrated_directional import DIRECTIONAL_ENCODING
 from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
 from nerfloom.kernels.grids.hash_grid import HASH_GRID, hash_grid
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
@@ -42,12 +43,17 @@ from nerfloom.kernels.march.occupancy import REFRESH_OCCUPANCY, Occupancy
 from nerfloom.kernels.march.ray_order import SORT_BY_RAY
 from nerfloom.kernels.march.waves import MARCH, March, march
 from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, NETWORK
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.packed import TRACE_PACKED, PackedLeaves
+from nerfloom.kernels.octree.trace import TRACE_OCTREE
+from nerfloom.kernels.octree.weights import RAISE_WEIGHTS
 from nerfloom.kernels.rows import GATHER_ROWS
 from nerfloom.kernels.splats.blend import BLEND
 from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
 from nerfloom.kernels.splats.project import PROJECT, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TILES, tile_lists
 from nerfloom.kernels.surfaces.distance import DISTANCE_NETWORK
+from nerfloom.kernels.surfaces.samples import SURFACE_SAMPLES, UNIT_NORMALS, Ball, Intervals
 from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
 from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
 from nerfloom.kernels.traced.trace import TRACE, GridDensity
@@ -104,6 +110,17 @@ def grid_density() -> GridDensity:
     return GridDensity(1 / size, -BOX[0] / size, table, GRID, None, weights)
 
 
+def octree() -> OctreeLayout:
+    """40 leaves around the origin."""
+    cells = torch.stack([torch.arange(40) % 7, torch.arange(40) % 11, torch.arange(40) % 13], -1)
+    return OctreeLayout.build(torch.full((3,), -1.0), 0.125, (2, 2, 2), cells + 1)[0]
+
+
+def packed_leaves() -> PackedLeaves:
+    codes, colors = (torch.randint(256, shape, dtype=torch.uint8) for shape in ((40,), (40, 27)))
+    return PackedLeaves(codes, torch.linspace(0, 0.1, 256), colors, rand(27) / 255, rand(27))
+
+
 def excluded() -> Tensor:
     return torch.cat([torch.rand(LEVELS * CELLS**3) < 0.8, torch.tensor([False])])
 
@@ -150,6 +167,14 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     HASH_GRID: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), GRID, None),
     HASH_GRID_TANGENT: lambda: (torch.rand(50, 6), rand(GRID.num_entries, 2), GRID),
     DISTANCE_NETWORK: lambda: (torch.rand(50, 3), rand(GRID.num_entries, 2), rand(8, 6) - 0.6, rand(3, 8), GRID, None),
+    SURFACE_SAMPLES: lambda: (
+        rand(50, 8),
+        rand(1)[0] + 3,
+        torch.rand(50, 3),
+        Ball(rand(3), rand(3), 0.5, 0.3, 1e-3),
+        Intervals(torch.nn.functional.normalize(torch.randn(50, 3), dim=-1), rand(50), 0.4),
+    ),
+    UNIT_NORMALS: lambda: (rand(50, 7),),
     MULTISAMPLED_GRID: lambda: (rand(50, 1, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     FRUSTUM_BALLS: lambda: (frustums(), BOX, True),
@@ -160,6 +185,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     DENSITY_NETWORK: lambda: ([rand(40, 5), rand(40, 2)], [rand(8, 7), rand(3, 8) * 9 - 5], [rand(8), rand(3)]),
     FREQUENCY_ENCODING: lambda: (rand(9, 3), 4, True),
     SPHERICAL_HARMONICS: lambda: (unit(9), 4),
+    DIRECTIONAL_ENCODING: lambda: (unit(9), 3 * torch.rand(9), 5),
     CONTRACT: lambda: (5 * torch.randn(40, 3), BOX),
     COMPOSITE: lambda: (samples(), rand(12), rand(12, 3), rand(4, 3), 5 * rand(4)),
     DISTORTION: lambda: (rand(12), samples()),
@@ -179,6 +205,9 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     FILL: lambda: (rays(), Occupancy(torch.rand(16**3) < 0.1, BOX, 16), 0.05, 100, None, (2048, 2048)),
     REACH: lambda: (fill(*CASES[FILL]()).placed, rand(2048), 4.6, 100),
     TRACE: lambda: (marched(), grid_density()),
+    TRACE_OCTREE: lambda: (octree(), rand(40, 1) - 4, rand(40, 12), rays(), rand(100, 3)),
+    TRACE_PACKED: lambda: (octree(), packed_leaves(), rays(), rand(100, 3)),
+    RAISE_WEIGHTS: lambda: (octree(), rand(40, 1) - 4, rays(), torch.zeros(40)),
     TRACED_COLORS: lambda: (marched(), grid_density(), grid_color(), rand(100, 3)),
     TRACED_ERROR: lambda: (marched(), grid_density(), grid_color(), PixelTargets(rand(100, 3), rand(25, 3), rand(25))),
     REFRESH_OCCUPANCY: lambda: (torch.rand(200) * 0.4, torch.zeros(200, dtype=torch.bool), 0.9, 0.05, 0.01),

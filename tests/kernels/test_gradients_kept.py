@@ -21,6 +21,7 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.compositing.density import composite, composite_reference, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit, contract_to_unit_reference
 from nerfloom.kernels.encodings.frequency import frequency_encoding, frequency_encoding_reference
+from nerfloom.kernels.encodings.integrated_directional import directional_encoding, directional_encoding_reference
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics, spherical_harmonics_reference
 from nerfloom.kernels.grids.hash_grid import hash_grid, hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
@@ -43,10 +44,20 @@ from nerfloom.kernels.histograms.intervals import (
 from nerfloom.kernels.histograms.step_functions import blurred_excess, blurred_excess_reference
 from nerfloom.kernels.images.ssim import photometric_loss, photometric_reference
 from nerfloom.kernels.networks.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.trace import trace_octree, trace_octree_reference
 from nerfloom.kernels.splats.blend import blend, blend_reference
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference
+from nerfloom.kernels.surfaces.samples import (
+    Ball,
+    Intervals,
+    surface_samples,
+    surface_samples_reference,
+    unit_normals,
+    unit_normals_reference,
+)
 from nerfloom.samplers.occupancy import OccupancySampler
 from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.distortion_by_pairs import distortion_by_pairs
@@ -56,6 +67,7 @@ GRID = HashGridLayout.build(3, 4, 20, 8)
 PLANES = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
 BANDS: tuple[Band, ...] = ((0, 0, 1, 3), (0, 2, 0, 7), (1, 1, 9, 1), (1, 1, 8, 2))
 OFFSETS = torch.tensor([0, 3, 3, 8, 12])
+TREE = OctreeLayout.build(torch.zeros(3), 0.1, (1, 1, 1), torch.cartesian_prod(*[torch.arange(1, 8, 2)] * 3))[0]
 Function = Callable[..., Tensor]
 
 
@@ -86,6 +98,12 @@ class DeferredVariation(torch.autograd.Function):
         ctx.found.backward(grad)
         found: Tensor = ctx.deferred.summed(ctx.table.detach())
         return found
+
+
+def rays_through_tree() -> Rays:
+    random = torch.Generator().manual_seed(0)
+    targets, origins = 0.8 * torch.rand(40, 3, generator=random), torch.randn(40, 3, generator=random)
+    return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=-1), fars=torch.full((40,), 9.0))
 
 
 def rand(*shape: int) -> Tensor:
@@ -148,6 +166,16 @@ def density_network(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
     return run
 
 
+def around_a_ball(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
+    ball = Ball(torch.tensor([0.5, 0.4, 0.6]), torch.tensor([1.0, 0.8, 0.9]), 0.5, 0.3, 1e-3)
+
+    def run(network: Tensor, sharpness: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor) -> Tensor:
+        stopping, features = form(network, sharpness, positions, ball, Intervals(directions, lengths))
+        return torch.cat([stopping[:, None], features], -1)
+
+    return run
+
+
 def gaussians() -> dict[str, Tensor]:
     return {
         "means": torch.rand(20, 3) + torch.tensor([-0.5, -0.5, 3.0]), "log_scales": rand(20, 3) - 2,
@@ -201,6 +229,24 @@ OPERATIONS = {
             "second": rand(3, 8) - 0.6,
         },
         ("distance_network_forward", "distance_network_backward", "hash_grid_tangent_backward_table"),
+    ),
+    "surface samples": Operation(
+        around_a_ball(surface_samples),
+        around_a_ball(surface_samples_reference),
+        lambda: {
+            "network": rand(20, 8),
+            "sharpness": rand(1)[0] + 3,
+            "positions": torch.rand(20, 3),
+            "directions": torch.nn.functional.normalize(torch.randn(20, 3), dim=-1),
+            "lengths": torch.rand(20),
+        },
+        ("surface_samples", "surface_samples_backward"),
+    ),
+    "unit normals": Operation(
+        unit_normals,
+        unit_normals_reference,
+        lambda: {"features": rand(20, 7)},
+        ("unit_normals", "unit_normals_backward"),
     ),
     "multisampled grid": Operation(
         lambda points, table: multisampled_grid(points, table, GRID),
@@ -295,6 +341,12 @@ OPERATIONS = {
         lambda: {"directions": rand(9, 3)},
         ("spherical_harmonics", "spherical_harmonics_backward"),
     ),
+    "directional encoding": Operation(
+        directional_encoding,
+        directional_encoding_reference,
+        lambda: {"directions": rand(9, 3), "roughness": rand(9)},
+        ("directional_encoding", "directional_encoding_backward"),
+    ),
     "interval weights": Operation(
         interval_weights,
         lambda sigma, t: interval_weights_reference(sigma, t.detach()),
@@ -348,6 +400,14 @@ OPERATIONS = {
         },
         ("camera_rays",),
     ),
+    "octree": Operation(
+        lambda raw, coefficients: trace_octree(TREE, raw, coefficients, rays_through_tree(), torch.ones(3)).color,
+        lambda raw, coefficients: trace_octree_reference(
+            TREE, raw, coefficients, rays_through_tree(), torch.ones(40, 3)
+        ).color,
+        lambda: {"raw": rand(TREE.num_leaves, 1), "coefficients": rand(TREE.num_leaves, 12)},
+        ("octree_trace", "octree_trace_backward"),
+    ),
     "colours": Operation(
         lambda behind: gather_colors(COLORS, torch.arange(9), behind)[0],
         lambda behind: gather_colors_reference(COLORS, torch.arange(9), behind)[0],
@@ -368,6 +428,7 @@ WITHOUT_A_GRADIENT = {
     "hash_grid_tangent_forward",  # of the optimiser; and refused where a gradient is asked for
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
     "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
+    "octree_weights", "octree_adam", "octree_trace_packed",  # documented to have none; of the optimiser; of bytes
     "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for
 }  # fmt: skip
 

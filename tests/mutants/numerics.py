@@ -33,6 +33,11 @@ MUTANTS = {
             "in normalised device coordinates cameras that stand before or behind the middle see shifted pictures",
             "test_ndc.py::test_rays_are_where_the_projection_matrix_puts_their_points"),
     ],
+    "nerfloom.kernels.octree.layout": [
+        Mutant("octree-too-far", "_with_distances", "near[0, 0] == 0", "near[0, 0] > -1",
+            "rays through an octree jump over leaves", "kernels/test_octree.py"
+            "::test_distances_between_bricks_are_those_by_brute_force"),
+    ],
     "nerfloom.cameras.poses": [
         Mutant("held-out-in-order-of-files", "held_out", "sorted(A, key=lambda index: names[index])", "list(A)",
             "which photographs are held out depends on their order in the file, so figures are not nerfstudio's",
@@ -98,6 +103,13 @@ MUTANTS = {
             "fields/test_normals.py::test_a_balls_normals_point_outwards"),
         Mutant("orientation-penalty-sign", "normal_penalties", "A.clamp(min=0)", "A.clamp(max=0)",
             "normals that face the camera are punished", "fields/test_normals.py::test_penalties_in_closed_form"),
+    ],
+    "nerfloom.fields.reflective": [
+        Mutant("reflected-through", "Reflection.forward", "A - 2 * B * C", "A + 2 * B * C",
+            "directions are reflected at another plane: shiny things show nothing of what is around them",
+            "test_ref_nerf.py::test_light_by_hand"),
+        Mutant("cosine-sign", "Reflection.forward", "-away", "away",
+            "the directional network is told that surfaces face away", "test_ref_nerf.py::test_light_by_hand"),
     ],
     "nerfloom.geometry.alignment": [
         Mutant("refined-poses-aligned-mirrored", "align_cameras",
@@ -322,16 +334,24 @@ MUTANTS = {
     "nerfloom.rendering.volume": [
         Mutant("depth-not-normalised", "mean_distance", "A / torch.where(visible, opacity, torch.ones_like(A))", "A",
             "depth of what is not opaque comes out nearer", "kernels/test_compositing.py::test_slab"),
-        Mutant("directions-of-other-rays", "shade", "rays.directions.index_select(0, A)",
+        Mutant("directions-of-other-rays", "sample_values", "rays.directions.index_select(0, A)",
             "rays.directions.index_select(0, A.flip(0))",
             "colours are seen from another ray's direction",
             "rendering/test_volume.py::test_each_sample_has_the_camera_of_its_ray_and_is_seen_along_it"),
         Mutant("opacity-as-density", "volume_render", "composite_alpha if is_alpha else A", "A",
             "the opacity of a surface is taken for a density, by which it is next to transparent",
             "rendering/test_volume.py::test_opacity_is_shown_like_the_density_that_it_is_of"),
-        Mutant("gradient-scaling-inverted", "VolumeRenderer.shade", "A / B", "B / A",
+        Mutant("gradient-scaling-inverted", "VolumeRenderer.values", "A / B", "B / A",
             "what is near cameras learns most: floaters",
             "rendering/test_volume.py::test_gradients_are_scaled_near_cameras_in_training_and_values_are_not"),
+    ],
+    "nerfloom.samplers.first_crossing": [
+        Mutant("crossing-from-inside", "_noted", "paths.was > 0", "paths.was == paths.was",
+            "a ray that starts inside a solid meets it at once",
+            "samplers/test_first_crossing.py::test_a_ray_that_starts_inside_has_to_leave_first"),
+        Mutant("crossing-hard-edges", "crossings", "(0.5 - 0.5 * A / radius).clamp(max=1)", "torch.ones_like(A)",
+            "edges of traced pictures are jagged, and a pixel too wide",
+            "samplers/test_first_crossing.py::test_edges_cover_the_share_of_a_pixel_that_they_hide"),
     ],
     "nerfloom.samplers.cells": [
         Mutant("grid-cells-transposed", "places", "[A, B, C, D]", "[A, D, C, B]",
@@ -348,6 +368,15 @@ MUTANTS = {
         Mutant("proposals-endless", "_sampler", "scene.unbounded and (not scene.has_alpha)", "False",
             "the sky of captures is a hole through which the background shows",
             "truth/test_training.py::test_a_ray_of_a_capture_ends_in_matter_unless_photographs_tell_what_is_empty"),
+    ],
+    "nerfloom.samplers.error_bounded": [
+        Mutant("nearest-of-the-farther-end", "nearest_in_intervals", "torch.minimum(A, B)", "torch.maximum(A, B)",
+            "the bound of the opacity's error forgets the surface beside an interval's nearer end",
+            "samplers/test_error_bounded.py::test_nearest_is_that_of_a_place_outside_both_balls"),
+        Mutant("error-of-one-interval", "bounded_opacity", "(A * torch.exp(-nearest / beta)).cumsum(-1)",
+            "(A * torch.exp(-nearest / beta))",
+            "the opacity's error is bounded in each interval by itself, although errors add up",
+            "samplers/test_error_bounded.py::test_opacity_is_within_its_bound"),
     ],
     "nerfloom.samplers.hierarchical": [
         Mutant("drawn-in-front", "HierarchicalSampler._of_points", "A[:, 1:-1]", "A[:, :-2]",

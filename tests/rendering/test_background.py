@@ -249,15 +249,31 @@ def test_what_cannot_be_is_refused() -> None:
 
 def test_the_sphere_contains_box_and_cameras() -> None:
     assert UNBOUNDED.camera_to_worlds is not None
-    sphere = foreground_sphere(UNBOUNDED)
+    config = dataclasses.replace(instant_ngp.METHOD.config, background_model="sphere")
+    sphere = foreground_sphere(config, UNBOUNDED)
     assert sphere.tolist() == pytest.approx([0, 0, 0, 1.1 * 3])
     near = dataclasses.replace(UNBOUNDED, camera_to_worlds=UNBOUNDED.camera_to_worlds * 0.1)
-    assert float(foreground_sphere(near)[3]) == 1
-    assert float(foreground_sphere(dataclasses.replace(UNBOUNDED, camera_to_worlds=None))[3]) == pytest.approx(3**0.5)
-    config = dataclasses.replace(instant_ngp.METHOD.config, background_model="sphere")
+    assert float(foreground_sphere(config, near)[3]) == 1
+    alone = dataclasses.replace(UNBOUNDED, camera_to_worlds=None)
+    assert float(foreground_sphere(config, alone)[3]) == pytest.approx(3**0.5)
     inner = foreground(config, UNBOUNDED)
     assert not inner.unbounded
     assert inner.box.flatten().tolist() == pytest.approx([-3.3] * 3 + [3.3] * 3)
+
+
+def test_a_sphere_around_the_object_is_centred_where_cameras_look() -> None:
+    """Cameras on two axes through a point, at the distances 2 and 3; cameras that look apart get the other sphere."""
+    config = dataclasses.replace(instant_ngp.METHOD.config, background_model="sphere", sphere_around="object")
+    point = torch.tensor([0.3, -0.2, 0.1])
+    first = torch.cat([torch.eye(3), (point + torch.tensor([0.0, 0.0, 2.0]))[:, None]], dim=-1)
+    turned = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    second = torch.cat([turned, (point + torch.tensor([3.0, 0.0, 0.0]))[:, None]], dim=-1)
+    scene = dataclasses.replace(UNBOUNDED, num_cameras=2, camera_to_worlds=torch.stack([first, second]))
+    assert foreground_sphere(config, scene).tolist() == pytest.approx([0.3, -0.2, 0.1, 2.0])
+    apart = torch.stack([first, second]) * torch.tensor([-1.0, 1.0, -1.0, 1.0])
+    scene = dataclasses.replace(scene, camera_to_worlds=apart)
+    around = dataclasses.replace(config, sphere_around="cameras")
+    assert foreground_sphere(config, scene).tolist() == foreground_sphere(around, scene).tolist()
 
 
 def test_a_grid_outside_is_laid_out_as_contraction_does() -> None:

@@ -15,7 +15,7 @@ from nerfloom.ray_model import RayModel
 from nerfloom.registry import load_method, registered
 from nerfloom.rendering.background import SphereRenderer
 from nerfloom.rendering.rendered import Rendered
-from nerfloom.rendering.volume import VolumeRenderer, shade
+from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.proposal import ProposalSampler
@@ -203,4 +203,4 @@ def test_every_ray_method_scales_and_thins_gradients_if_asked(name: str) -> None
 def test_samples_that_nobody_evaluated_are_refused() -> None:
     field, rays = Cloud(), some_rays(2)
     with pytest.raises(ValueError, match="density and features are attached"):
-        shade(rays, UniformSampler(4).sample(rays, field, False), field, torch.ones(3))
+        VolumeRenderer().shade(rays, UniformSampler(4).sample(rays, field, False), field, torch.ones(3))

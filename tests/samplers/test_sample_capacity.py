@@ -9,7 +9,7 @@ from torch import Tensor
 from benchmarks.operations import Counting
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.rendering.volume import shade
+from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.sample_capacity import HEADROOM, MAX_SLOTS, SLOTS_MULTIPLE, SampleCapacity
 from tests.samplers.test_occupancy import BOX, CountingField, KeptField, random_rays
@@ -27,7 +27,7 @@ def rendered(made: OccupancySampler, field: CountingField, rays: Rays) -> tuple[
     """Colours, depths and opacities, and the gradient of the field's weights."""
     torch.manual_seed(5)
     samples = made.sample(rays, field, jitter=True)
-    found = shade(rays, samples, field, torch.tensor([0.2, 0.5, 0.9]))
+    found = VolumeRenderer().shade(rays, samples, field, torch.tensor([0.2, 0.5, 0.9]))
     field.weight.grad = None
     (found.rgb.square().sum() + found.accumulation.sum()).backward()
     assert field.weight.grad is not None

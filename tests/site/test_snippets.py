@@ -101,6 +101,7 @@ def test_pages_with_programs_are_executed() -> None:
         "guides/add-a-format",
         "guides/add-a-method",
         "guides/judge-geometry",
+        "guides/measure",
         "interfaces",
         "plugins",
     }

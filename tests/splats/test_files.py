@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.scale import Scale
 from nerfloom.cli.export import main
 from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.ply import read_columns, read_header, write_columns
@@ -565,7 +566,7 @@ UTM = torch.tensor([512345.678, 5403210.987, 432.1], dtype=torch.float64)
 
 
 def pretend(monkeypatch: pytest.MonkeyPatch, model: object, placement: Placement, method: str) -> None:
-    loaded = SimpleNamespace(model=model, placement=placement, method=method)
+    loaded = SimpleNamespace(model=model, placement=placement, method=method, scale=Scale())
     monkeypatch.setattr("nerfloom.cli.run_flags.trained_run", lambda path, *_: path)
     monkeypatch.setattr("nerfloom.training.load.load", lambda *_, **__: loaded)
 

@@ -167,7 +167,8 @@ def test_what_does_not_fit_is_refused(capture: Path, capture_run: Path, tmp_path
     file = tmp_path / "splat.ply"
     assert refused(eval_command.main, file).endswith("its photographs are unknown: give --data DIR")
     data = ("--data", capture)
-    for flag, value in (("--rays-per-pixel", 4), ("--load-checkpoint", file), ("--eval-appearance", "half")):
+    words = ("--eval-appearance", "half"), ("--eval-rendering", "volume")
+    for flag, value in (("--rays-per-pixel", 4), ("--load-checkpoint", file), *words):
         said = refused(eval_command.main, file, *data, flag, value)
         assert said == f"error: {flag} has no effect with a file of Gaussians: leave it out"
     assert "No such file" in refused(eval_command.main, tmp_path / "none.ply", *data)

@@ -22,6 +22,7 @@ from nerfloom.stress.variants import (
     plain_colored,
     transparent,
     twice,
+    with_distractors,
 )
 
 BALL = ball_views()
@@ -44,6 +45,18 @@ def test_photographs_of_one_colour(level: int) -> None:
     consistent(found)
     assert found.pixels.shape == (NUM_TRAIN * SIZE**2, 3)
     assert bool((found.pixels == level).all())
+
+
+def test_discs_are_opaque_and_each_image_has_its_own() -> None:
+    found = with_distractors(BALL.train, 0.2)
+    consistent(found)
+    changed = (found.pixels != BALL.train.pixels).any(-1).view(NUM_TRAIN, -1)
+    assert bool((changed.float().mean(1) > 0.15).all())
+    assert bool((changed.float().mean(1) < 0.45).all())
+    assert bool((found.pixels.view(NUM_TRAIN, -1, 4)[changed][:, 3] == 255).all())
+    assert len({tuple(row.tolist()) for row in changed}) == NUM_TRAIN
+    assert torch.equal(found.pixels, with_distractors(BALL.train, 0.2).pixels)
+    assert not torch.equal(found.pixels, with_distractors(BALL.train, 0.2, seed=1).pixels)
 
 
 def test_photographs_of_nothing() -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nerfloom import Loss, Model, PixelBatch, RayModel, Rays, Rendered, registry
 from nerfloom.base.errors import CheckpointError, ConfigError, DivergenceError
+from nerfloom.base.signals import stop_signals
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.methods import instant_ngp
@@ -25,7 +26,6 @@ from nerfloom.training import trainer as trainer_file
 from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint
 from nerfloom.training.datasets import first_split, load_split
 from nerfloom.training.run import create_folder
-from nerfloom.training.signals import stop_signals
 from nerfloom.training.trainer import Trainer
 from tests.conftest import TICK
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer

@@ -13,8 +13,8 @@ from nerfloom.data.dataset import load_dataset
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.processing import features, mapping, matching, transforms
-from nerfloom.processing import job as job_module
-from nerfloom.processing.job import Job
+from nerfloom.processing import reconstruction as module
+from nerfloom.processing.reconstruction import Reconstruction
 from tests.cli.helpers import called
 from tests.dataparsers.sparse_models import write_colmap
 from tests.truth.ball import CENTRE, COUNT, HEIGHT, NAMES, PINHOLE, RADIUS, WIDTH, Lens, photograph, write_photographs
@@ -41,18 +41,18 @@ def without_colmap(monkeypatch: pytest.MonkeyPatch, camera: str, order: list[str
         order: names that the photographs have been given.
     """
 
-    def extract(job: Job, *_: object) -> None:
-        job.database.touch()
+    def extract(state: Reconstruction, *_: object) -> None:
+        state.database.touch()
 
-    def reconstruct(job: Job, *_: object) -> list[int]:
-        write_colmap(job.work / "sparse" / "0", model_of(order), camera)
+    def reconstruct(state: Reconstruction, *_: object) -> list[int]:
+        write_colmap(state.work / "sparse" / "0", model_of(order), camera)
         return [COUNT]
 
     monkeypatch.setattr(features, "extract", extract)
     monkeypatch.setattr(matching, "choose_pairs", lambda *_: [])
     monkeypatch.setattr(matching, "match", lambda *_: None)
     monkeypatch.setattr(mapping, "reconstruct", reconstruct)
-    monkeypatch.setattr(job_module, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
+    monkeypatch.setattr(module, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
 
 
 @pytest.mark.medium

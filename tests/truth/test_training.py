@@ -24,8 +24,7 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.losses.terms import Distortion
 from nerfloom.registry import load_method
-from nerfloom.rendering.rendered import Rendered
-from nerfloom.rendering.volume import shade, volume_render
+from nerfloom.rendering.volume import sample_values, volume_render
 from nerfloom.samplers.choice import SamplingConfig, make_sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.training.checkpoint import load_checkpoint
@@ -342,11 +341,11 @@ def test_what_is_near_a_camera_learns_little(
     trainer = captured(shared_tiny, tmp_path, {"unbounded": True, "near": 0.05})
     given: list[tuple[Samples, Tensor]] = []
 
-    def noted(rays: Rays, samples: Samples, field: Field, background: Tensor, factors: Tensor, thin: float) -> Rendered:
+    def noted(rays: Rays, samples: Samples, field: Field, factors: Tensor, thin: float) -> tuple[Tensor, Tensor]:
         given.append((samples, factors))
-        return shade(rays, samples, field, background, factors, thin)
+        return sample_values(rays, samples, field, factors, thin)
 
-    monkeypatch.setattr("nerfloom.rendering.volume.shade", noted)
+    monkeypatch.setattr("nerfloom.rendering.volume.sample_values", noted)
     trainer.train_step()
     ((samples, factors),) = given
     half = float((trainer.model.scene.box[1] - trainer.model.scene.box[0])[0]) / 2

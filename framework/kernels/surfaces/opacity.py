@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid
 
 
 def surface_opacity(
@@ -34,8 +33,8 @@ def surface_opacity(
     if annealing < 1:
         falling = falling * annealing + torch.relu(0.5 - 0.5 * cosines) * (1 - annealing)
     half = falling * lengths / 2
-    # In logarithms, in which neither end underflows.
-    return -torch.expm1(logsigmoid(sharpness * (distances - half)) - logsigmoid(sharpness * (distances + half)))
+    # 1 - S(a) / S(b) = S(-a) (1 - exp(a - b)), in which nothing cancels.
+    return torch.sigmoid(sharpness * (half - distances)) * -torch.expm1(-2 * sharpness * half)
 
 
 def laplace_density(distances: Tensor, beta: Tensor) -> Tensor:

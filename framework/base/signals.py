@@ -96,3 +96,22 @@ def handled(numbers: tuple[int, ...], handler: Handler) -> Iterator[dict[int, An
     finally:
         for number, other in before.items():
             signal.signal(number, other)
+
+
+@contextmanager
+def stoppable() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C and SIGTERM set, so that running jobs can save; then raise `Stopped`.
+
+    Raises:
+        Stopped: at the end of the block, if there was a signal.
+    """
+    stopped, signals = threading.Event(), list[int]()
+
+    def record(number: int, frame: FrameType | None) -> None:
+        signals.append(number)
+        stopped.set()
+
+    with handled(NUMBERS, record):
+        yield stopped
+    if signals:
+        raise Stopped(signals[0], "stopped; run the same command to continue")

@@ -15,7 +15,7 @@ from nerfloom.processing.worker import run_in_child
 
 
 @dataclass(frozen=True)
-class Job:
+class Reconstruction:
     """A reconstruction in progress."""
 
     flags: ColmapFlags
@@ -59,7 +59,7 @@ class Job:
         count: Callable[[], int] | None = None,
         unit: str | None = None,
     ) -> Any:
-        """Run a function in a child process with this job's log.
+        """Run a function in a child process with this reconstruction's log.
 
         Args:
             work, arguments, title, total, count, unit: as in `run_in_child`.

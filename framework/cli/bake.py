@@ -1,0 +1,78 @@
+"""The command `ns-bake`: a trained field becomes an octree, which is drawn in real time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerfloom.base.errors import FlagError
+from nerfloom.cli.common import make_room, run_command, with_run
+from nerfloom.cli.flags import read_flags
+from nerfloom.cli.run_flags import RunFlags
+
+MIN_RESOLUTION, MAX_RESOLUTION = 16, 1024
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeFlags(RunFlags):
+    """Bake a trained run into an octree (.octree), which ns-eval, ns-render and ns-viewer open like a run.
+
+    The scene must lie in a box and be still. Colours are fitted to the field, and then learnt from the photographs."""
+
+    output_path: Path | None = None
+    """File to write, NAME.octree. Default: scene.octree in the run's folder."""
+    max_megabytes: float = 30.0
+    """Maximum size of the file, millions of bytes. It decides on the degree of harmonics, and then on the leaves."""
+    resolution: int = 512
+    """Cells along the longest edge of the box of all matter, 16 to 1024."""
+    degree: int | None = None
+    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, by the size."""
+    fine_tune_seconds: float = 30.0
+    """Time to learn from the photographs; 0: none."""
+
+
+def main() -> None:
+    """Run ns-bake on the arguments of the process."""
+    run_command(_command)
+
+
+def _command(arguments: list[str]) -> None:
+    flags = read_flags(BakeFlags, "ns-bake", with_run(arguments), takes="RUN_FOLDER")
+    _check(flags)
+    found = flags.check()
+    path = flags.output_path or found.parent / "scene.octree"
+    make_room(path)
+    import time
+
+    from nerfloom.base.console import say
+    from nerfloom.cameras.scale import write_scale
+    from nerfloom.export.bake import Baking, bake
+    from nerfloom.octrees.files import write_octree
+
+    start = time.perf_counter()
+    loaded = flags.load(found)
+    settings = Baking(flags.resolution, 1e6 * flags.max_megabytes, flags.degree, flags.fine_tune_seconds)
+    write_octree(path, bake(loaded, settings))
+    write_scale(path, loaded.scale)
+    size = path.stat().st_size / 1e6
+    say(f"{size:.2f} MB after {time.perf_counter() - start:.0f} s: {path}")
+    if size > flags.max_megabytes:
+        say(f"note: the file is larger than --max-megabytes {flags.max_megabytes:g}, because it compresses less")
+    say(f"compare it with its run: ns-eval {path} --data DIR")
+
+
+def _check(flags: BakeFlags) -> None:
+    if flags.output_path is not None and flags.output_path.suffix.lower() != ".octree":
+        raise FlagError(f"--output-path is {flags.output_path}; octrees are written to .octree files")
+    if not flags.max_megabytes > 0:
+        raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes:g}")
+    if not MIN_RESOLUTION <= flags.resolution <= MAX_RESOLUTION:
+        raise FlagError(f"--resolution is {flags.resolution}; it must be from {MIN_RESOLUTION} to {MAX_RESOLUTION}")
+    if flags.degree is not None and not 0 <= flags.degree <= 3:
+        raise FlagError(f"--degree is {flags.degree}; it must be from 0 to 3")
+    if not flags.fine_tune_seconds >= 0:
+        raise FlagError(f"--fine-tune-seconds is {flags.fine_tune_seconds:g}; it must be at least 0")
+
+
+if __name__ == "__main__":
+    main()

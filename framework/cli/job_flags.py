@@ -1,0 +1,49 @@
+"""Flags of commands that run jobs: where, and how many at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from nerfloom.base.errors import FlagError
+
+if TYPE_CHECKING:
+    from nerfloom.jobs.launcher import Launcher
+
+
+@dataclass(frozen=True)
+class JobFlags:
+    """Choose where jobs run, and how many at a time."""
+
+    launcher: Literal["processes", "ray", "slurm"] = "processes"
+    """What runs the jobs: processes on this machine, a Ray cluster, or Slurm by a script that is written. All leave the
+    same files."""
+    jobs: int | None = None
+    """Number of simultaneous jobs. Processes have a GPU each, or --num-threads of the CPU's cores each. Default: 1 by
+    processes; as many as there is room for by ray and slurm."""
+    ray_address: str | None = None
+    """Address of a running Ray cluster, such as 10.0.0.1:6379 or auto. Default: one is started on this machine."""
+
+    def chosen_launcher(self, folder: Path) -> Launcher:
+        """Return the launcher that the flags describe.
+
+        Args:
+            folder: folder of the jobs' files.
+
+        Raises:
+            ConfigError: if a flag's value is invalid, or a package is missing.
+        """
+        if self.ray_address is not None and self.launcher != "ray":
+            raise FlagError("--ray-address belongs to --launcher ray")
+        if self.launcher == "ray":
+            from nerfloom.jobs.ray import Ray
+
+            return Ray(self.jobs, self.ray_address)
+        if self.launcher == "slurm":
+            from nerfloom.jobs.slurm import Slurm
+
+            return Slurm(folder, self.jobs)
+        from nerfloom.jobs.processes import Processes
+
+        return Processes(1 if self.jobs is None else self.jobs)

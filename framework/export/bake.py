@@ -1,0 +1,172 @@
+"""Baking: a trained field becomes an octree, which a CPU draws in real time.
+
+As in PlenOctrees (Yu et al. 2021): cells with matter, less those that no training image sees; harmonics fitted to the
+field's colours; and then all leaves learn from the photographs.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from nerfloom.base.console import say, track
+from nerfloom.base.device import seed_step
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.dataset import Dataset
+from nerfloom.export.cameras import refined_cameras
+from nerfloom.export.octree_cells import MatterSearch
+from nerfloom.export.octree_colors import Seen, fitted_colors, seen_leaves
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.light import depths_of, raw_of
+from nerfloom.method import Method
+from nerfloom.octree_model import OctreeConfig, OctreeModel
+from nerfloom.octrees.octree import Octree
+from nerfloom.octrees.packing import packed
+from nerfloom.ray_model import RayModel
+from nerfloom.training.loaded import Loaded
+from nerfloom.training.trainer import Trainer
+
+METHOD = Method(OctreeConfig(), paper="arXiv:2103.14024", model=OctreeModel, name="octree")
+"""Learning of an octree from photographs."""
+MIN_WEIGHT = 0.02
+"""Minimum of a leaf's largest weight on training rays."""
+MAX_BYTES = 30e6
+"""Size of a file without another limit."""
+COMPRESSED = 0.85
+"""Expected size of a file, relative to its leaves' bytes."""
+DEGREES = (2, 1, 0)
+"""Degrees of harmonics to choose from, the best first."""
+FULL_SHARE = {2: 0.9, 1: 0.7, 0: 0.0}
+"""Share of the visible leaves that must fit for a degree to be chosen, before a smaller one is."""
+
+
+@dataclass(frozen=True)
+class Baking:
+    """Settings of baking."""
+
+    resolution: int = 512
+    """Cells along the longest edge of the matter's box."""
+    max_bytes: float = MAX_BYTES
+    """Maximum size of the file."""
+    degree: int | None = None
+    """Degree of the harmonics, 0 to 3; None to choose it by the size."""
+    seconds: float = 30.0
+    """Time to learn from the photographs; 0 for none."""
+
+
+def bake(loaded: Loaded, settings: Baking) -> Octree:
+    """Return the octree of a trained run, on the CPU, and say what was kept.
+
+    Args:
+        loaded: the run.
+        settings: size, resolution and time.
+
+    Raises:
+        ConfigError: if an octree of a box cannot show what the run shows.
+    """
+    model, dataset = _bakeable(loaded), loaded.dataset("train").to("cpu")
+    dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras))
+    seed_step(loaded.run.config.machine.seed, 0)
+    layout, raw, seen = _visible(model, dataset, settings.resolution)
+    degree, kept = _chosen(seen.largest, settings)
+    layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
+    kept = kept[rows]
+    raw, seen = raw[kept], replace(seen, largest=seen.largest[kept], by_view=seen.by_view[kept])
+    say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
+    coefficients = fitted_colors(model, layout.centers(), layout.cell, seen, degree)
+    depths = depths_of(raw[:, 0])
+    if settings.seconds > 0:
+        depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
+    leaves, lost = packed(depths, coefficients)
+    say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
+    scene = model.scene
+    return Octree(layout, leaves, loaded.input_placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
+
+
+def _bakeable(loaded: Loaded) -> RayModel[Any]:
+    """Return the run's model; refuse what an octree of a box cannot show."""
+    model, name = loaded.model, loaded.method
+    if not isinstance(model, RayModel):
+        raise ConfigError(f"ns-bake: {name} has no field to bake; a run of a method that casts rays has")
+    reason = None
+    if model.scene.moving:
+        reason = "its scene moves, and an octree does not"
+    elif model.scene.warped:
+        reason = "its rays are in normalised device coordinates; train without --ndc"
+    elif model.scene.unbounded:
+        reason = "its scene goes on outside of its box, and an octree ends there"
+    if reason is not None:
+        raise ConfigError(f"ns-bake: this run of {name} cannot be baked: {reason}; 'ns-export web' shows it in a page")
+    return model
+
+
+def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
+    """Return cells with matter, their raw densities (L, 1), and what training images see of them."""
+    search = MatterSearch(model)
+    grid = search.tight(resolution)
+    cells, depths = search.cells(grid)
+    layout, rows = OctreeLayout.build(grid.origin, grid.cell, grid.size, cells)
+    if not layout.num_leaves:
+        raise ConfigError("ns-bake: the run has no matter in its box; is it trained?")
+    raw = raw_of(depths[rows])[:, None]
+    seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
+    visible = int((seen.largest > MIN_WEIGHT).sum())
+    edges = " x ".join(str(8 * count) for count in grid.size)
+    say(f"{layout.num_leaves:,} of {edges} cells have matter, and training images see {visible:,} of these")
+    return layout, raw, seen
+
+
+def _chosen(largest: Tensor, settings: Baking) -> tuple[int, Tensor]:
+    """Return the degree of harmonics, and the leaves (L,) int64 that fit: those with the largest weights.
+
+    Args:
+        largest: (N,) largest weight of each leaf.
+        settings: the size.
+    """
+    visible = (largest > MIN_WEIGHT).nonzero()[:, 0]
+    if not len(visible):
+        raise ConfigError("ns-bake: no training image sees matter in the box; is the run trained?")
+    degrees = DEGREES if settings.degree is None else (settings.degree,)
+    for degree in degrees:
+        room = int(settings.max_bytes / (COMPRESSED * (1 + 3 * (degree + 1) ** 2)))
+        if room >= FULL_SHARE.get(degree, 0.0) * len(visible) or degree == degrees[-1]:
+            break
+    if room < 1:
+        raise ConfigError(f"ns-bake: no leaf fits into {settings.max_bytes / 1e6:g} MB; give --max-megabytes 1 or more")
+    if room < len(visible):
+        say(f"the size leaves room for {room:,} of {len(visible):,} leaves: those with the largest weights")
+        visible = visible[largest[visible].topk(room).indices].sort().values
+    return degree, visible
+
+
+def learnt(
+    layout: OctreeLayout, raw: Tensor, coefficients: Tensor, dataset: Dataset, seconds: float
+) -> tuple[Tensor, Tensor]:
+    """Return optical depths (L,) and coefficients (L, 3 K) after learning from photographs.
+
+    Args:
+        layout: where the L leaves are.
+        raw: (L, 1) raw densities at the start.
+        coefficients: (L, 3 K) coefficients at the start.
+        dataset: the training images.
+        seconds: time to learn.
+    """
+    config = replace(METHOD.config, max_seconds=seconds, max_num_iterations=None, vis="none")
+    trainer = Trainer(METHOD, config, dataset)
+    trainer.prepare(start=False)
+    model = trainer.model
+    assert isinstance(model, OctreeModel)
+    model.set_octree(layout, raw, coefficients)
+    steps, start = trainer.steps(), time.perf_counter()
+    for percent in track(range(100), "Learning from photographs", total=100):
+        for report in steps:
+            if report.progress >= (percent + 1) / 100:
+                break
+    state = trainer.state
+    say(
+        f"{state.step:,} steps on photographs in {time.perf_counter() - start:.0f} s: {state.train_psnr:.2f} dB on them"
+    )
+    return model.depths(), model.colors.table.detach()

@@ -1,0 +1,103 @@
+"""The cells of a grid in which a trained model has matter, found octant by octant, so memory grows with surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from nerfloom.base.console import track
+from nerfloom.export.density import LatticeDensity
+from nerfloom.export.lattice import lattice_of
+from nerfloom.kernels.octree.layout import BRICK, OCTANT
+from nerfloom.octrees.grid import Grid
+from nerfloom.renderable import Renderable
+
+MIN_DEPTH = 0.01
+"""Minimum optical depth of a cell's edge."""
+PROBES = 4
+"""Positions in an octant where the density is evaluated, if the model has no occupancy grid."""
+COARSE = 64
+"""Octants along the longest edge for finding the box of the matter."""
+OCTANTS_AT_ONCE = 4096
+"""Octants whose cells are evaluated together."""
+
+
+class MatterSearch:
+    """A search for a model's matter.
+
+    Args:
+        model: the model, in evaluation mode, whose density can be evaluated.
+
+    Raises:
+        ConfigError: if the model has no density.
+    """
+
+    def __init__(self, model: Renderable) -> None:
+        self.box = model.scene.box.double().cpu()
+        self._evaluate = LatticeDensity(model, lattice_of(model.scene.box, 512), 1.0)
+
+    def tight(self, resolution: int) -> Grid:
+        """Return the grid of the box of all matter.
+
+        Args:
+            resolution: cells along the longest edge.
+        """
+        coarse = Grid.of(self.box[0], self.box[1], COARSE * OCTANT)
+        octants = self.octants(coarse)
+        if not len(octants):
+            return Grid.of(self.box[0], self.box[1], resolution)
+        low, high = octants.amin(0), octants.amax(0) + 1
+        edges = [coarse.origin + coarse.cell * OCTANT * end for end in (low, high)]
+        return Grid.of(torch.maximum(edges[0], self.box[0]), torch.minimum(edges[1], self.box[1]), resolution)
+
+    def octants(self, grid: Grid) -> Tensor:
+        """Return the octants (N, 3) int64 of a grid that may hold matter."""
+        counts = [count * BRICK // OCTANT for count in grid.size]
+        found = torch.zeros(counts, dtype=torch.bool)
+        if self._evaluate.grid is not None:
+            found = self._in_occupied(grid, counts)
+        else:
+            offsets = torch.rand(PROBES, 3, generator=torch.Generator().manual_seed(0))
+            ranges = [torch.arange(count) for count in counts[1:]]
+            for x in track(range(counts[0]), "Looking for matter", total=counts[0]):
+                slab = torch.cartesian_prod(torch.tensor([x]), *ranges).view(-1, 1, 3)
+                positions = grid.positions(((slab + offsets) * OCTANT).reshape(-1, 3))
+                sigma = self._evaluate.density(positions).view(-1, PROBES)
+                dense = (sigma.amax(-1) * grid.cell > MIN_DEPTH).view(counts[1:])
+                found[x] = dense
+            found = functional.max_pool3d(found[None, None].float(), 3, 1, 1)[0, 0] > 0
+        return found.nonzero()
+
+    def _in_occupied(self, grid: Grid, counts: list[int]) -> Tensor:
+        """Return the octants that a cell of the occupancy grid overlaps, by their corners and centres."""
+        found = torch.zeros(counts, dtype=torch.bool)
+        ranges = [torch.arange(2 * count + 1) for count in counts[1:]]
+        shape = [3, *(len(each) for each in ranges)]
+        for x in range(counts[0]):
+            half = torch.cartesian_prod(torch.arange(2 * x, 2 * x + 3), *ranges)
+            kept = self._evaluate.kept(grid.positions(half * (OCTANT / 2))).view(shape)
+            found[x] = functional.max_pool3d(kept[None, None].float(), 3, 2)[0, 0, 0] > 0
+        return found
+
+    def cells(self, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Return the cells (N, 3) int64 with matter, and the optical depth (N,) of their edges.
+
+        The density is that of a cell's centre.
+        """
+        octants, within = self.octants(grid), torch.cartesian_prod(*[torch.arange(OCTANT)] * 3)
+        found = [(torch.zeros(0, 3, dtype=torch.int16), torch.zeros(0))]
+        for part in _tracked(octants):
+            cells = (part[:, None] * OCTANT + within).reshape(-1, 3)
+            depths = self._evaluate.density(grid.positions(cells + 0.5)) * grid.cell
+            kept = depths > MIN_DEPTH
+            found.append((cells[kept].to(torch.int16), depths[kept]))
+        cells, depths = (torch.cat(parts) for parts in zip(*found, strict=True))
+        return cells.long(), depths
+
+
+def _tracked(octants: Tensor) -> Iterator[Tensor]:
+    parts = octants.split(OCTANTS_AT_ONCE)
+    yield from track(parts, "Evaluating cells", total=len(parts))

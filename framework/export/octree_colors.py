@@ -1,0 +1,124 @@
+"""Colours of an octree's leaves: what training images see of each, and harmonics fitted to the field's colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerfloom.base.console import track
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.fields.base import Field
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.weights import raise_weights
+from nerfloom.ray_model import RayModel
+
+MAX_VIEWS = 48
+"""Maximum number of cameras from which colours are fitted."""
+DIRECTIONS = {0: 4, 1: 8, 2: 14, 3: 24}
+"""Number of directions in which a leaf's colour is evaluated, by the degree of its harmonics."""
+RIDGE = 0.03
+"""Penalty of harmonics that depend on the direction, relative to the sum of the weights: few directions tell little."""
+LEAVES_AT_ONCE = 2**14
+"""Leaves whose colours are evaluated together."""
+STOP = 1e-3
+"""Transmittance below which rays end."""
+RAYS_AT_ONCE = 2**18
+"""Rays that are traced together."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The L leaves of an octree as training images see them."""
+
+    largest: Tensor
+    """(L,) largest weight on any ray."""
+    by_view: Tensor
+    """(L, V) uint8 largest weight in each of V images, times 255."""
+    positions: Tensor
+    """(V, 3) positions of their cameras."""
+    pixels: PixelSet
+    """Pixels, of all images, whose rays meet a leaf."""
+
+
+@torch.no_grad()
+def seen_leaves(layout: OctreeLayout, raw: Tensor, cameras: Cameras, near: float, far: float) -> Seen:
+    """Return what images see of the leaves of an octree, which needs one walk of each pixel's ray.
+
+    Args:
+        layout: where the L leaves are.
+        raw: (L, 1) raw densities, as in `trace_octree`.
+        cameras: M training cameras.
+        near, far: distances where rays start and end.
+    """
+    count, largest = len(cameras), torch.zeros(layout.num_leaves)
+    chosen = [index * count // min(count, MAX_VIEWS) for index in range(min(count, MAX_VIEWS))]
+    by_view = torch.zeros(layout.num_leaves, len(chosen), dtype=torch.uint8)
+    sets = []
+    for index in track(range(count), "Looking at leaves", total=count):
+        weights, hit = torch.zeros(layout.num_leaves), []
+        for pixels in cameras.image_pixels(index).split(RAYS_AT_ONCE):
+            hit.append(raise_weights(layout, raw, cameras.pixel_rays(pixels, near, far), weights, STOP) > 0)
+        torch.maximum(largest, weights, out=largest)
+        sets.append(PixelSet.of_mask(torch.cat(hit), cameras.ends[index]))
+        if index in chosen:
+            by_view[:, chosen.index(index)] = (255 * weights).round().to(torch.uint8)
+    return Seen(largest, by_view, cameras.camera_to_worlds[chosen, :, 3], PixelSet.joined(sets))
+
+
+@torch.no_grad()
+def fitted_colors(model: RayModel[Any], centers: Tensor, size: float, seen: Seen, degree: int) -> Tensor:
+    """Return coefficients (L, 3 K) of harmonics: weighted least squares, leaf by leaf, to the field's colours.
+
+    Each leaf's colour is evaluated in the directions of the cameras that see it best.
+
+    Args:
+        model: the model in evaluation mode.
+        centers: (L, 3) centres of the leaves.
+        size: edge of a leaf, scene units.
+        seen: what training images see of the leaves; weights are those of the fit.
+        degree: degree of the harmonics, 0 to 3.
+    """
+    out = torch.zeros(len(centers), 3 * (degree + 1) ** 2)
+    parts = torch.arange(len(centers)).split(LEAVES_AT_ONCE)
+    for part in track(parts, "Fitting colours", total=len(parts)):
+        weights, order = seen.by_view[part].float().topk(min(DIRECTIONS[degree], seen.by_view.shape[1]))
+        away = centers[part, None] - seen.positions[order]
+        directions = torch.nn.functional.normalize(away, dim=-1)
+        with model.rendering():
+            found = _colors(model.field, centers[part].to(model.device), directions.to(model.device), size)
+        out[part] = fitted(directions, found.cpu(), weights + 1e-3, degree)
+    return out
+
+
+def _colors(field: Field, positions: Tensor, directions: Tensor, size: float) -> Tensor:
+    """Return the field's colours (B, D, 3) at positions (B, 3) in directions (B, D, 3)."""
+    count, number = directions.shape[:2]
+    points = Points(positions, None, torch.full((count,), size / 2, device=positions.device)).sized(size / 12**0.5)
+    features = field.density(points)[1]
+    repeated = features.repeat_interleave(number, 0)
+    return field.color(repeated, directions.reshape(-1, 3)).float().view(count, number, 3)
+
+
+def fitted(directions: Tensor, colors: Tensor, weights: Tensor, degree: int) -> Tensor:
+    """Return coefficients (B, 3 K) that minimise the weighted squared error of colours in some directions.
+
+    Args:
+        directions: (B, D, 3) unit vectors.
+        colors: (B, D, 3) colours seen in these directions.
+        weights: (B, D) weights of the errors.
+        degree: degree of the harmonics, 0 to 3.
+    """
+    count, number = weights.shape
+    basis = spherical_harmonics(directions.reshape(-1, 3).contiguous(), degree + 1).view(count, number, -1)
+    share = weights / weights.sum(-1, keepdim=True)
+    weighted = (basis * share[..., None]).transpose(1, 2)
+    ridge = torch.full((basis.shape[-1],), RIDGE)
+    ridge[0] = 0
+    normal = weighted @ basis + torch.diag(ridge)
+    return torch.linalg.solve(normal, weighted @ colors).transpose(1, 2).reshape(count, -1)

@@ -1,0 +1,79 @@
+"""A job: commands that run one after the other and leave files, by which others see that it is finished."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of a job.
+
+    Args:
+        command: program and arguments.
+        started: file that the command leaves early; if it exists, `resume` is run instead of `command`.
+        resume: command that goes on where an earlier one was stopped.
+    """
+
+    command: tuple[str, ...]
+    started: Path | None = None
+    resume: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Resources:
+    """Needs of a job on the machine that runs it.
+
+    Args:
+        cores: number of CPU cores; None for all of a machine.
+        gpus: number of GPUs.
+    """
+
+    cores: int | None = None
+    gpus: int = 0
+
+
+@dataclass(frozen=True)
+class Job:
+    """Commands that run one after the other. Running a job again goes on where it was stopped.
+
+    Args:
+        title: name of the job in messages.
+        description: what it does, such as its budget; a message at its start has it.
+        steps: the commands.
+        log: file for the output of the commands.
+        finished: returns whether the job's files are complete; called where the jobs are launched.
+        resources: what the job needs of a machine.
+    """
+
+    title: str
+    description: str
+    steps: tuple[Step, ...]
+    log: Path
+    finished: Callable[[], bool]
+    resources: Resources = Resources()
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return what another process needs to run the job, as plain data."""
+        steps = [
+            {
+                "command": list(step.command),
+                "started": None if step.started is None else str(step.started),
+                "resume": list(step.resume),
+            }
+            for step in self.steps
+        ]
+        return {"steps": steps, "log": str(self.log)}
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A failed job."""
+
+    reason: str
+    """Last line of its output, or the signal that ended it."""
+    log: Path
+    """File of its output."""

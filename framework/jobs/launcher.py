@@ -1,0 +1,84 @@
+"""The interface of launchers, and what all of them tell the user about their jobs."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+from nerfloom.base.console import say
+from nerfloom.jobs.job import Failure, Job
+
+
+def nothing(job: Job) -> None:
+    """Ignore a finished job."""
+
+
+class Launcher(ABC):
+    """A way to run jobs: on this machine, or on others that share its files.
+
+    Jobs leave the same files whichever launcher runs them. A job that is finished is not run again, and one that was
+    stopped goes on, so the same call continues after an interruption, also by another launcher.
+    """
+
+    @property
+    @abstractmethod
+    def sharing(self) -> str | None:
+        """A sentence for reports on what a job's machine did besides; None if jobs ran one after the other."""
+
+    @abstractmethod
+    def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
+        """Run every unfinished job; failures are reported, and the other jobs continue.
+
+        Args:
+            jobs: the jobs, in the order in which they start.
+            on_finished: called in this thread with each job that is finished, at once.
+
+        Returns:
+            The failed jobs.
+
+        Raises:
+            ConfigError: if the jobs cannot run this way.
+            Stopped: on a signal, after the running jobs have saved.
+        """
+
+
+class Ledger:
+    """The state of a launcher's jobs, told to the user in a line at every change.
+
+    Args:
+        jobs: the jobs.
+        on_finished: called with each finished job.
+    """
+
+    def __init__(self, jobs: Sequence[Job], on_finished: Callable[[Job], None]) -> None:
+        self.failures: dict[Job, Failure] = {}
+        """The failed jobs."""
+        self._numbers = {job: f"[{number}/{len(jobs)}]" for number, job in enumerate(jobs, 1)}
+        self._on_finished = on_finished
+
+    def unfinished(self) -> list[Job]:
+        """Return the jobs that have to run, and report the others."""
+        waiting = []
+        for job, number in self._numbers.items():
+            if job.finished():
+                say(f"{number} {job.title}: already finished")
+                self._on_finished(job)
+            else:
+                waiting.append(job)
+        return waiting
+
+    def started(self, job: Job) -> None:
+        """Report the start of a job."""
+        say(f"{self._numbers[job]} {job.title}: {job.description}")
+
+    def ended(self, job: Job, reason: str | None) -> None:
+        """Report the end of a job.
+
+        Args:
+            reason: why it failed; None if its commands succeeded.
+        """
+        if reason is None and job.finished():
+            self._on_finished(job)
+            return
+        failure = self.failures[job] = Failure(reason or "it ended without a result", job.log)
+        say(f"  {job.title} failed: {failure.reason} (full output: {failure.log})")

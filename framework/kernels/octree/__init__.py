@@ -1,0 +1,1 @@
+"""Light along rays through the leaves of a sparse voxel octree."""

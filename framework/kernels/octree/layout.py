@@ -1,0 +1,156 @@
+"""The places of the leaves of a sparse voxel octree.
+
+All leaves are cubes of one size, the cells of a grid over a box. Of the octree's levels, three are kept: bricks of 8^3
+cells, their octants of 4^3, and cells. A dense grid of bricks says where they are and, in empty space, how far away the
+nearest one is, so that a ray passes it in few steps. An octant is a bit set of its cells, as in Laine and Karras 2010,
+"Efficient sparse voxel octrees", and the leaves of an octant follow each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from nerfloom.kernels import native
+
+BRICK, OCTANT = 8, 4
+"""Cells along an edge of a brick, and of an octant."""
+MAX_DISTANCE = 16
+"""Maximum recorded distance to a brick, in bricks."""
+MAX_BRICKS = 2**24
+"""Maximum number of bricks in the box, empty ones included."""
+
+
+@dataclass(frozen=True)
+class OctreeLayout:
+    """The leaves of an octree: L cells of a grid, in B bricks. `build` makes it, and everything relies on that."""
+
+    origin: Tensor
+    """(3,) corner of the first cell, scene units."""
+    cell: float
+    """Edge of a cell, scene units."""
+    bricks: Tensor
+    """(X, Y, Z) int32 index of each brick; for an empty one, minus the Chebyshev distance to the nearest, in bricks."""
+    masks: Tensor
+    """(B, 8) int64 leaves of each octant, bit x + 4 y + 16 z for cell (x, y, z) of octant x + 2 y + 4 z."""
+    firsts: Tensor
+    """(B, 8) int32 index of the first leaf of each octant."""
+    num_leaves: int
+    """Number of leaves."""
+
+    @classmethod
+    def build(cls, origin: Tensor, cell: float, size: Sequence[int], cells: Tensor) -> tuple[OctreeLayout, Tensor]:
+        """Construct the layout of given leaves.
+
+        Args:
+            origin: (3,) corner of the first cell, scene units.
+            cell: edge of a cell, scene units.
+            size: number of bricks along each axis.
+            cells: (N, 3) int64 coordinates of the leaves; repeated ones count once.
+
+        Returns:
+            The layout, and the row (L,) of `cells` of each leaf.
+
+        Raises:
+            ValueError: if there are too many bricks, or a leaf is outside of them.
+        """
+        x, y, z = size
+        if min(size) < 1 or x * y * z > MAX_BRICKS:
+            raise ValueError(f"an octree of {x} x {y} x {z} bricks; there must be 1 to {MAX_BRICKS:,}")
+        limit = BRICK * torch.tensor(size, device=cells.device)
+        if len(cells) and not bool(((cells >= 0) & (cells < limit)).all()):
+            raise ValueError("a leaf is outside of the octree's box")
+        within, octant = cells % OCTANT, cells % BRICK // OCTANT
+        place = cells // BRICK
+        brick = (place[:, 0] * y + place[:, 1]) * z + place[:, 2]
+        bit = within[:, 0] + 4 * within[:, 1] + 16 * within[:, 2]
+        key = (brick * 8 + octant[:, 0] + 2 * octant[:, 1] + 4 * octant[:, 2]) * 64 + bit
+        key, rows = key.sort(stable=True)
+        if len(key):
+            once = torch.ones_like(key, dtype=torch.bool)
+            once[1:] = key[1:] != key[:-1]
+            key, rows = key[once], rows[once]
+        used, index = torch.unique_consecutive(key // 512, return_inverse=True)
+        slot = index * 8 + key // 64 % 8
+        masks = key.new_zeros(len(used) * 8).index_add_(0, slot, 1 << (key % 64))
+        counts = torch.bincount(slot, minlength=len(used) * 8)
+        filled = torch.full((x * y * z,), -1, dtype=torch.int32, device=cells.device)
+        filled[used] = torch.arange(len(used), dtype=torch.int32, device=cells.device)
+        return cls(
+            origin.float().contiguous(),
+            float(cell),
+            _with_distances(filled.view(x, y, z)),
+            masks.view(-1, 8),
+            (counts.cumsum(0) - counts).to(torch.int32).view(-1, 8),
+            len(key),
+        ), rows
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Number of bricks along each axis."""
+        x, y, z = self.bricks.shape
+        return x, y, z
+
+    @property
+    def box(self) -> Tensor:
+        """The grid's corners (2, 3), scene units."""
+        edges = self.cell * BRICK * torch.tensor(self.size, device=self.origin.device)
+        return torch.stack([self.origin, self.origin + edges])
+
+    def places(self) -> Tensor:
+        """Return the coordinates (B, 3) int64 of the bricks, in bricks."""
+        filled = self.bricks >= 0
+        places, index = filled.nonzero(), self.bricks[filled].long()
+        return torch.empty_like(places).index_copy_(0, index, places)
+
+    def cells(self) -> Tensor:
+        """Return the coordinates (L, 3) int64 of the leaves, in cells."""
+        return cells_of(self.places(), self.masks)
+
+    def centers(self) -> Tensor:
+        """Return the centres (L, 3) of the leaves, scene units."""
+        return self.origin + self.cell * (self.cells() + 0.5)
+
+    def to(self, device: torch.device | str) -> OctreeLayout:
+        """Return the layout on `device`."""
+        moved = (values.to(device) for values in (self.origin, self.bricks, self.masks, self.firsts))
+        origin, bricks, masks, firsts = moved
+        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.num_leaves)
+
+    def arguments(self) -> tuple[Any, ...]:
+        """Check the layout's arguments of compiled functions and return them."""
+        count = (len(self.masks), 8)
+        return (
+            native.pointer(self.origin, "the origin", (3,)), self.cell, native.integers(self.size),
+            native.pointer(self.bricks, "the bricks", self.size, torch.int32),
+            native.pointer(self.masks, "the masks", count, torch.int64),
+            native.pointer(self.firsts, "the octants", count, torch.int32),
+        )  # fmt: skip
+
+
+def cells_of(places: Tensor, masks: Tensor) -> Tensor:
+    """Return the coordinates (L, 3) int64 of leaves, in cells and in order.
+
+    Args:
+        places: (B, 3) int64 coordinates of bricks, in bricks.
+        masks: (B, 8) int64 leaves of their octants, as in `OctreeLayout`.
+    """
+    bits = torch.arange(64, device=masks.device)
+    brick, octant, bit = ((masks[:, :, None] >> bits) & 1).nonzero().unbind(-1)
+    octants = torch.stack([octant & 1, octant >> 1 & 1, octant >> 2], -1)
+    return BRICK * places[brick] + OCTANT * octants + torch.stack([bit & 3, bit >> 2 & 3, bit >> 4], -1)
+
+
+def _with_distances(bricks: Tensor) -> Tensor:
+    """Return `bricks` (X, Y, Z) with minus the distance to the nearest brick where there is none."""
+    filled = bricks >= 0
+    near, distance = filled[None, None].float(), filled.new_ones(bricks.shape, dtype=torch.int32)
+    for _ in range(MAX_DISTANCE - 1):
+        near = functional.max_pool3d(near, 3, 1, 1)
+        distance += near[0, 0] == 0
+    return torch.where(filled, bricks, -distance).contiguous()

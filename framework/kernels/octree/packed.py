@@ -1,0 +1,102 @@
+"""Light along rays through an octree whose leaves are bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.light import (
+    LAYOUT,
+    RAYS,
+    OctreeLight,
+    check_leaves,
+    contiguous,
+    light_of,
+    outputs_of,
+    ray_arguments,
+)
+
+_trace_packed = native.Function("octree_trace_packed", LAYOUT + "pppppi" + RAYS + "pfppppi")
+
+
+@dataclass(frozen=True)
+class PackedLeaves:
+    """Leaves in bytes."""
+
+    codes: Tensor
+    """(L,) uint8 index into `table`."""
+    table: Tensor
+    """(256,) float32 optical depth of a cell's edge, of each code."""
+    colors: Tensor
+    """(L, 3 K) uint8 coefficients of K harmonics, channel by channel."""
+    scales: Tensor
+    """(3 K,) float32; a coefficient is scale * byte + offset."""
+    offsets: Tensor
+    """(3 K,) float32."""
+
+    def depths(self) -> Tensor:
+        """Return the optical depth (L,) of a cell's edge, of each leaf."""
+        return self.table[self.codes.long()]
+
+    def coefficients(self) -> Tensor:
+        """Return the coefficients (L, 3 K) of the leaves."""
+        return self.colors.float() * self.scales + self.offsets
+
+    def to(self, device: torch.device | str) -> PackedLeaves:
+        """Return the leaves on `device`."""
+        return PackedLeaves(*(values.to(device) for values in vars(self).values()))
+
+
+def trace_packed(
+    layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
+) -> OctreeLight:
+    """Return the light of R rays through an octree whose leaves are bytes, without gradient.
+
+    Args:
+        layout: where the L leaves are.
+        leaves: their values.
+        rays: the rays.
+        background: (R, 3) or (3,) colour of the background.
+        stop: transmittance below which a ray ends; see `error_bound`.
+    """
+    check_leaves(layout, leaves.codes, leaves.colors)
+    background = background.expand(len(rays), 3)
+    return TRACE_PACKED((rays.origins, rays.directions, background), layout, leaves, rays, background, stop)
+
+
+def trace_packed_reference(
+    layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
+) -> OctreeLight:
+    """Compute `trace_packed` in PyTorch, on any device and for any float type.
+
+    `layout`, `leaves`, `rays`, `background` and `stop` are as in `trace_packed`.
+    """
+    kind = rays.origins.dtype
+    return light_of(layout, leaves.depths().to(kind), leaves.coefficients().to(kind), rays, background, stop)
+
+
+TRACE_PACKED: Operation[..., OctreeLight] = Operation("trace_packed", trace_packed_reference)
+
+
+@TRACE_PACKED.implementation(CPP, order=0)
+def _packed(
+    layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
+) -> OctreeLight:
+    rays, background = contiguous(rays), background.contiguous()
+    out, addresses = outputs_of(rays)
+    count, values = leaves.colors.shape
+    _trace_packed(
+        *layout.arguments(), native.pointer(leaves.codes, "codes", (count,), torch.uint8),
+        native.pointer(leaves.table, "the table", (256,)),
+        native.pointer(leaves.colors, "colours", (count, values), torch.uint8),
+        native.pointer(leaves.scales, "scales", (values,)), native.pointer(leaves.offsets, "offsets", (values,)),
+        values, *ray_arguments(rays), native.pointer(background, "the background", (len(rays), 3)), stop, *addresses,
+        native.threads(),
+    )  # fmt: skip
+    return out

@@ -1,0 +1,56 @@
+"""The largest weight of each leaf of an octree, by which leaves that no image shows are known."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels import native
+from nerfloom.kernels.compositing.density import exclusive_sum, ray_sum
+from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.light import LAYOUT, RAYS, contiguous, depths_of, ray_arguments
+from nerfloom.kernels.octree.walk import leaf_samples
+
+_weights = native.Function("octree_weights", LAYOUT + "pq" + RAYS + "fppi")
+
+
+def raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0) -> Tensor:
+    """Raise each leaf's weight, in place, to its largest on R rays, and return the opacity (R,) of the rays.
+
+    Args:
+        layout: where the L leaves are.
+        raw: (L, 1) raw densities, as in `trace_octree`.
+        rays: the rays.
+        weights: (L,) largest weights so far.
+        stop: transmittance below which a ray ends.
+    """
+    return RAISE_WEIGHTS((raw, rays.origins, weights), layout, raw, rays, weights, stop)
+
+
+@torch.no_grad()
+def raise_weights_reference(
+    layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0
+) -> Tensor:
+    """Compute `raise_weights` in PyTorch; `layout`, `raw`, `rays`, `weights` and `stop` are as there."""
+    samples, leaves = leaf_samples(layout, rays)
+    tau = depths_of(raw[leaves, 0]) * samples.deltas / layout.cell
+    through = torch.exp(-exclusive_sum(tau, samples))
+    found = torch.where(through >= stop, through * -torch.expm1(-tau), torch.zeros_like(tau))
+    weights.scatter_reduce_(0, leaves, found.to(weights), "amax")
+    return ray_sum(found, samples)
+
+
+RAISE_WEIGHTS: Operation[..., Tensor] = Operation("raise_weights", raise_weights_reference)
+
+
+@RAISE_WEIGHTS.implementation(CPP, order=0)
+def _raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0) -> Tensor:
+    count, opacity = layout.num_leaves, rays.fars.new_empty(len(rays))
+    _weights(
+        *layout.arguments(), native.pointer(raw, "raw densities", (count, 1)), count,
+        *ray_arguments(contiguous(rays)), stop, native.pointer(weights, "weights", (count,)), opacity.data_ptr(),
+        native.threads(),
+    )  # fmt: skip
+    return opacity

@@ -1,0 +1,219 @@
+"""Samples of a signed distance that is a ball plus a network's output: what stops light there, and its colour's inputs.
+
+With the outputs y and the gradient dy_0 / du of a network in the unit box (`distance.py`), u = (x - low) scale:
+
+    f(x) = |x - c| - r + b y_0
+    n(x) = (x - c) / |x - c| + b scale dy_0 / du
+
+An interval along a ray stops light by NeuS's opacity, a point by VolSDF's density (`opacity.py`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from nerfloom.kernels import native
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.surfaces.opacity import laplace_density, surface_opacity
+from nerfloom.kernels.triton_backend import later
+
+PLACED = 6
+"""Number of features before the network's: gradient of the distance, and position in units of the ball."""
+SHORTEST = 1e-12
+"""Length below which a gradient has no direction."""
+
+
+class Ball(NamedTuple):
+    """The distance that a network's output is added to."""
+
+    centre: Tensor
+    """(3,) scene coordinates."""
+    scale: Tensor
+    """(3,) unit coordinates per scene unit."""
+    size: float
+    """Unit of the network's output, scene units."""
+    radius: float
+    """Radius, scene units."""
+    rounding: float
+    """Radius within which the ball is rounded off at its centre, scene units; a distance has no gradient there."""
+
+
+class Intervals(NamedTuple):
+    """N intervals along rays, around their samples."""
+
+    directions: Tensor
+    """(N, 3) unit directions of their rays."""
+    lengths: Tensor
+    """(N,) lengths, scene units."""
+    annealing: float = 1.0
+    """Share of the slope's annealing that is done (`surface_opacity`)."""
+
+
+def ball_distance(network: Tensor, positions: Tensor, ball: Ball) -> tuple[Tensor, Tensor]:
+    """Return the distances (N,) and their gradients (N, 3), for any device and float type.
+
+    Args:
+        network: (N, D + 3) outputs of a network, and the gradient of the first by the position in the unit box.
+        positions: (N, 3) scene coordinates.
+        ball: the distance that the first output is added to.
+    """
+    offsets = positions - ball.centre
+    lengths = (offsets.square().sum(-1) + ball.rounding**2).sqrt()
+    distances = lengths - ball.radius + ball.size * network[:, 0]
+    return distances, offsets / lengths[:, None] + ball.size * ball.scale * network[:, -3:]
+
+
+def surface_samples(
+    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return what stops light at samples, and the inputs of their colour.
+
+    The compiled form has first derivatives by `network` and `sharpness`.
+
+    Args:
+        network: (N, D + 3) outputs of a network, and the gradient of the first by the position in the unit box.
+        sharpness: () inverse width of the surface, 1/length.
+        positions: (N, 3) scene coordinates of the samples.
+        ball: the distance that the first output is added to.
+        intervals: the intervals around the samples; None for points.
+
+    Returns:
+        (N,) opacity of the intervals (NeuS, equation 13), or density at the points (VolSDF, equation 2), 1/length; and
+        features (N, 6 + D - 1): gradient of the distance, position relative to the ball, and the further outputs.
+    """
+    along = (None, None) if intervals is None else intervals[:2]
+    return SURFACE_SAMPLES((network, sharpness, positions, *along), network, sharpness, positions, ball, intervals)
+
+
+def surface_samples_reference(
+    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+) -> tuple[Tensor, Tensor]:
+    """Compute `surface_samples` in PyTorch, for any device and float type, with derivatives of any order.
+
+    `network`, `sharpness`, `positions`, `ball`, `intervals` and the result are as there.
+    """
+    distances, gradients = ball_distance(network, positions, ball)
+    features = torch.cat([gradients, (positions - ball.centre) / ball.size, network[:, 1:-3]], dim=-1)
+    if intervals is None:
+        return laplace_density(distances, 1 / sharpness), features
+    cosines = (gradients * intervals.directions).sum(-1)
+    return surface_opacity(distances, cosines, intervals.lengths, sharpness, intervals.annealing), features
+
+
+def unit_normals(features: Tensor) -> Tensor:
+    """Return `features` (N, F) with the first three, the gradient of the distance, as a unit vector.
+
+    The compiled form has first derivatives. A gradient shorter than 1e-12 becomes 0.
+    """
+    return UNIT_NORMALS((features,), features)
+
+
+def unit_normals_reference(features: Tensor) -> Tensor:
+    """Compute `unit_normals` of `features` in PyTorch, for any device and float type."""
+    return torch.cat([safe_normalize(features[:, :3], SHORTEST), features[:, 3:]], dim=-1)
+
+
+SURFACE_SAMPLES = Operation("surface_samples", surface_samples_reference)
+UNIT_NORMALS = Operation("unit_normals", unit_normals_reference)
+_samples = native.Function("surface_samples", "pqippppfppfffppi")
+_samples_backward = native.Function("surface_samples_backward", "pqippppfppfffppppi")
+_unit = native.Function("unit_normals", "pqifpi")
+_unit_backward = native.Function("unit_normals_backward", "pqifppi")
+SURFACE_SAMPLES.implementation(TRITON, differentiable=2)(later("surfaces.samples_triton", "surface_samples"))
+UNIT_NORMALS.implementation(TRITON)(later("surfaces.samples_triton", "unit_normals"))
+
+
+@SURFACE_SAMPLES.implementation(CPP, differentiable=2)
+def _compiled(
+    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+) -> tuple[Tensor, Tensor]:
+    directions, lengths, annealing = intervals or (None, None, 1.0)
+    rows = (None if each is None else each.contiguous() for each in (positions, directions, lengths))
+    return _Samples.apply(network.contiguous(), sharpness, ball, annealing, *rows)
+
+
+class _Samples(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        network: Tensor,
+        sharpness: Tensor,
+        ball: Ball,
+        annealing: float,
+        positions: Tensor,
+        directions: Tensor | None,
+        lengths: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(network, sharpness, positions, directions, lengths)
+        ctx.ball, ctx.annealing = ball, annealing
+        count, width = network.shape
+        stopping, features = network.new_empty(count), network.new_empty(count, PLACED + width - 4)
+        arguments = _arguments(network, sharpness, ball, annealing, positions, directions, lengths)
+        _samples(*arguments, stopping.data_ptr(), features.data_ptr(), native.threads())
+        ctx.set_materialize_grads(False)
+        return stopping, features
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, of_stopping: Tensor | None, of_features: Tensor | None) -> tuple[Tensor | None, ...]:
+        network, sharpness, *rows = ctx.saved_tensors
+        of_stopping, of_features = (None if x is None else x.contiguous() for x in (of_stopping, of_features))
+        of_network, of_sharpness, count = torch.empty_like(network), torch.zeros_like(sharpness), len(network)
+        shapes = (count,), (count, PLACED + network.shape[1] - 4)
+        _samples_backward(
+            *_arguments(network, sharpness, ctx.ball, ctx.annealing, *rows),
+            None if of_stopping is None else native.pointer(of_stopping, "the gradient", shapes[0]),
+            None if of_features is None else native.pointer(of_features, "the features' gradient", shapes[1]),
+            of_network.data_ptr(), of_sharpness.data_ptr(), native.threads(),
+        )  # fmt: skip
+        return of_network, of_sharpness, *[None] * 5
+
+
+def _arguments(
+    network: Tensor,
+    sharpness: Tensor,
+    ball: Ball,
+    annealing: float,
+    positions: Tensor,
+    directions: Tensor | None,
+    lengths: Tensor | None,
+) -> tuple[Any, ...]:
+    """Return the leading arguments that both compiled functions have."""
+    count = len(network)
+    return (
+        native.pointer(network, "the network's output", (count, network.shape[1])), count, network.shape[1] - 3,
+        native.pointer(positions, "positions", (count, 3)),
+        None if directions is None else native.pointer(directions, "directions", (count, 3)),
+        None if lengths is None else native.pointer(lengths, "lengths", (count,)),
+        native.pointer(sharpness, "the sharpness", ()), annealing,
+        native.pointer(ball.centre, "the centre", (3,)), native.pointer(ball.scale, "the scale", (3,)),
+        ball.size, ball.radius, ball.rounding,
+    )  # fmt: skip
+
+
+@UNIT_NORMALS.implementation(CPP)
+def _compiled_unit(features: Tensor) -> Tensor:
+    return _UnitNormals.apply(features.contiguous())
+
+
+class _UnitNormals(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, features: Tensor) -> Tensor:
+        ctx.save_for_backward(features)
+        out, (count, width) = torch.empty_like(features), features.shape
+        address = native.pointer(features, "features", (count, width))
+        _unit(address, count, width, SHORTEST, out.data_ptr(), native.threads())
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (features,) = ctx.saved_tensors
+        out, (count, width), grad = torch.empty_like(features), features.shape, grad.contiguous()
+        address = native.pointer(grad, "the gradient", (count, width))
+        _unit_backward(features.data_ptr(), count, width, SHORTEST, address, out.data_ptr(), native.threads())
+        return out

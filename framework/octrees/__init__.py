@@ -1,0 +1,1 @@
+"""Octrees whose leaves have density and colour: their values in bytes, pictures of them, and their files."""

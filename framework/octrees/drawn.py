@@ -1,0 +1,118 @@
+"""Renderables whose pictures are light through an octree, and fixed octrees, such as those of a file."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nerfloom.cameras.cameras import subpixels
+from nerfloom.cameras.view import View
+from nerfloom.data.scene import Scene
+from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.octree.light import OctreeLight, error_bound
+from nerfloom.kernels.octree.packed import trace_packed
+from nerfloom.kernels.octree.walk import leaf_at
+from nerfloom.octrees.octree import Octree
+from nerfloom.renderable import RendersRays
+from nerfloom.rendering.rendered import Picture, Rendered
+from nerfloom.rendering.volume import mean_distance
+
+RAYS_AT_ONCE = 2**18
+"""Number of rays that are traced in one call."""
+
+
+class DrawsOctree(RendersRays):
+    """A renderable whose pictures are light through an octree."""
+
+    early_stop: float = 1 / 255
+    """Maximum error of a colour channel in [0, 1] because rays end where little light is left."""
+
+    @abstractmethod
+    def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
+        """Return the light of R rays.
+
+        Args:
+            rays: the rays.
+            background: (R, 3) or (3,) colour of the background.
+            stop: transmittance below which a ray ends.
+        """
+
+    @property
+    @abstractmethod
+    def largest(self) -> float:
+        """Largest error of a colour channel of a ray that ends at once: `error_bound` at a transmittance of 1."""
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        """Render R rays; colours are not clamped.
+
+        Args:
+            rays: the rays; R may be 0.
+            background: (R, 3) or (3,) colour in [0, 1] of the background.
+        """
+        light = self.light(rays, background, self.early_stop / self.largest)
+        return Rendered(
+            rgb=light.color,
+            depth=mean_distance(light.moment, light.opacity.detach(), rays.fars),
+            median_depth=light.median,
+            accumulation=light.opacity,
+            num_samples=0,
+            error_bound=self.early_stop,
+        )
+
+    @property
+    def rays_at_once(self) -> int:
+        """Number of rays that are traced in one call."""
+        return RAYS_AT_ONCE
+
+    @torch.no_grad()
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        per_pixel, pixels = view.rays_per_pixel or self.rays_per_pixel, view.pixels()
+        offsets, background = subpixels(per_pixel, self.device), background.to(self.device, torch.float32)
+        parts = []
+        with self.rendering():
+            for some in pixels.reshape(-1).split(max(self.rays_at_once // per_pixel, 1)):
+                rays = view.camera.pixel_rays(some, self.scene.near, self.scene.far, None, offsets)
+                parts.append(self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel))
+        size = tuple(pixels.shape)
+        return Picture(
+            torch.cat([part.rgb for part in parts]).clamp(0, 1).view(*size, 3),
+            torch.cat([part.depth for part in parts]).view(size),
+            torch.cat([part.median_depth for part in parts]).view(size),
+            torch.cat([part.accumulation for part in parts]).view(size),
+            num_rays=pixels.numel() * per_pixel,
+        )
+
+
+class DrawnOctree(DrawsOctree):
+    """A renderable of an octree that does not change.
+
+    Args:
+        octree: the octree, on the device that renders it.
+        scene: the scene that defines its frame.
+    """
+
+    def __init__(self, octree: Octree, scene: Scene) -> None:
+        self.octree, self.scene = octree, scene
+        self._largest = error_bound(octree.leaves.coefficients(), 1.0)
+
+    @property
+    def device(self) -> torch.device:
+        return self.octree.layout.origin.device
+
+    @property
+    def largest(self) -> float:
+        return max(self._largest, 1.0)
+
+    def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
+        return trace_packed(self.octree.layout, self.octree.leaves, rays, background, stop)
+
+    def density(self, points: Points) -> Tensor:
+        """Return the density (N,) at `points`, in 1/length."""
+        layout = self.octree.layout
+        leaf = leaf_at(layout, points.positions)
+        depths = self.octree.leaves.depths() / layout.cell
+        return torch.where(leaf >= 0, depths[leaf.clamp(min=0)], 0.0) if len(depths) else leaf.float() * 0

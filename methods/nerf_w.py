@@ -1,0 +1,249 @@
+"""NeRF in the Wild: light that differs between photographs, and people and things that are in one of them only.
+
+Martin-Brualla et al., "NeRF in the Wild: Neural Radiance Fields for Unconstrained Photo Collections", CVPR 2021. Each
+training image has an appearance vector, an input of the static colours, and a transient vector, from which a second
+head makes density, colour and uncertainty that exist in that image alone. Where an image disagrees with the others,
+to say so costs less than to change the scene. Views that are no training images show the static part alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from nerfloom import Decision, Field, Method, Picture, Rays, Rendered, Sampler, Samples, Scene, View
+from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.optimised import Optimised
+from nerfloom.data.dataset import Dataset
+from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
+from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
+from nerfloom.fields.nerf import NeRFField
+from nerfloom.fields.transient import TransientHead
+from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.losses.functions import doubted_error
+from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
+from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_capture
+from nerfloom.rendering.outputs import Output
+from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_render
+from nerfloom.samplers.choice import contracted_box, decide_samples, make_sampler
+from nerfloom.samplers.proposal import half_edge
+
+APPEARANCE_SIZE = 48
+"""Default length of appearance vectors if the appearance varies."""
+PAPER_WIDTH, GRID_WIDTH = 256, 64
+"""Features of a hidden layer, of the paper's networks and of those on a hash grid. The heads of the first have half."""
+PAPER_RATE = 0.05
+"""Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
+START = 0.05
+"""Transient density before training, per half edge of the box."""
+SAMPLES = 2**15
+"""Samples per training step with an occupancy grid over a box."""
+STATIC = Output("static", "color", of_training=True)
+TRANSIENT = Output("transient", "color", of_training=True)
+UNCERTAINTY = Output("uncertainty", "scalar", of_training=True)
+
+
+@dataclass(frozen=True)
+class NerfWConfig(
+    HashGridConfig,
+    CaptureConfig,
+    AppearanceConfig,
+    max_num_iterations=30_000,
+    num_rays_per_batch=2_048,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
+    eval_num_rays_per_chunk=4_096,
+):
+    """Settings of nerf-w; open ones depend on the scene."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "appearance_embedding_dim": (0, 2**10),
+        "transient_embedding_dim": (1, 2**10),
+        "transient_resolution": (1, 2**8),
+        "least_uncertainty": (1e-4, 1e4),
+        "transient_density_mult": AT_LEAST_0,
+    }
+    """Allowed range of each numeric setting."""
+    encoding: Literal["hash-grid", "frequency"] = "hash-grid"
+    """hash-grid: small networks on a hash grid. frequency: the paper's networks, of 8 layers of 256 features."""
+    appearance_embedding_dim: Auto[int] = AUTO
+    """Length of each image's appearance vector. auto: 48, as in the paper, if light or exposure differ between images,
+    otherwise 0."""
+    transient_embedding_dim: int = 16
+    """Length of an image's transient vectors."""
+    transient_resolution: int = 1
+    """Vectors along each side of an image, interpolated between; 1: one for each image, as in the paper."""
+    least_uncertainty: float = 0.1
+    """Standard deviation of colours where nothing is transient; 0.03 in the paper."""
+    transient_density_mult: float = 0.01
+    """Weight of the mean transient density, per half edge of the box."""
+
+
+class WildRenderer(VolumeRenderer):
+    """Volume rendering of the static field alone, and together with the transient part of the rays' images.
+
+    In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
+    constant densities. The paper's equation 8 adds the opacities of both instead, which is the same for thin intervals.
+
+    Depth, opacity and weights are those of the static part. The uncertainty is composited by the transient density
+    alone (equation 11), so that the static part does not change on its account.
+
+    Args:
+        head: the transient part.
+        least: uncertainty where nothing is transient.
+        unit_length: gradients are scaled within this distance from the camera, scene units; None for no scaling.
+        thin: samples are thinned below this fraction of the mean gradient of the static part; 0 for none.
+    """
+
+    outputs = (STATIC, TRANSIENT, UNCERTAINTY)
+
+    def __init__(self, head: TransientHead, least: float, unit_length: float | None, thin: float = 0.0) -> None:
+        super().__init__(unit_length, thin)
+        self.head, self.least = head, least
+
+    def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
+        sigma, rgb = self.values(rays, samples, field)
+        static = volume_render(rays, samples, sigma, rgb, background)
+        extras = {STATIC.name: static.rgb, TRANSIENT.name: torch.zeros_like(static.rgb)}
+        extras[UNCERTAINTY.name] = torch.full_like(static.depth, self.least)
+        vectors = self.head.vectors_of(rays)
+        if vectors is None:
+            return replace(static, extras=extras)
+        assert samples.features is not None
+        density, color, doubt = self.head(
+            samples.features, samples.positions(rays).detach(), vectors.index_select(0, samples.ray_indices)
+        )
+        share = (density / (sigma + density).clamp(min=torch.finfo(torch.float32).tiny))[:, None]
+        both = volume_render(rays, samples, sigma + density, torch.lerp(rgb, color, share), background)
+        assert both.weights is not None
+        extras[TRANSIENT.name] = ray_sum((both.weights[:, None] * share * color).detach(), samples)
+        nothing_behind, doubts = torch.zeros_like(background), doubt[:, None].expand(-1, 3)
+        extras[UNCERTAINTY.name] = self.least + volume_render(rays, samples, density, doubts, nothing_behind).rgb[:, 0]
+        extras["transient_density"] = ray_sum(density, samples) / samples.counts.clamp(min=1)
+        return replace(static, rgb=both.rgb, extras=extras)
+
+
+class DoubtedError(LossTerm):
+    """Error of colours in units of their uncertainty."""
+
+    def __init__(self) -> None:
+        super().__init__("rgb")
+
+    def __call__(self, shown: RenderedBatch) -> Tensor:
+        pixels, batch = shown.pixels, shown.batch
+        least = shown.model.config.least_uncertainty
+        return doubted_error(pixels.rgb, batch.rgb, pixels.extras[UNCERTAINTY.name], least, shown.weights)
+
+
+class TransientDensity(LossTerm):
+    """Mean transient density, per half edge of the box: NeRF-W, equation 13, in the unit of `doubted_error`."""
+
+    def __init__(self) -> None:
+        super().__init__("transient", "transient_density_mult")
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        density = shown.rendered.extras["transient_density"]
+        unit = 2 * shown.model.config.least_uncertainty**2 * half_edge(shown.model.scene.box)
+        return unit * density.mean() if len(density) else None
+
+
+class NerfW(RefinedModel[NerfWConfig], plain=True):
+    """A model that believes images only as far as others agree with them."""
+
+    losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
+    renderer: WildRenderer
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """Appearance vectors of the training images; None if there are none."""
+        return self.field.appearance if isinstance(self.field, (EncodedField, NeRFField)) else None
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        with nullcontext() if view.image is None else self._showing(view.image):
+            return super().render_view(view, background)
+
+    def start(self, dataset: Dataset) -> None:
+        """Lay the maps of transient vectors over the images.
+
+        Args:
+            dataset: the training images.
+        """
+        cameras = dataset.cameras
+        half = torch.maximum(cameras.widths / cameras.fx, cameras.heights / cameras.fy) / 2
+        self.renderer.head.reach.fill_(float(half.max()))
+
+    @contextmanager
+    def _showing(self, image: int) -> Iterator[None]:
+        """Render with the appearance and the transient part of a training image, within a `with` block."""
+        own, appearance = self.renderer.head, self.appearance
+        own.shown_image = image
+        try:
+            with nullcontext() if appearance is None else appearance.shown(appearance.vectors[image].detach()):
+                yield
+        finally:
+            own.shown_image = None
+
+
+def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decision]]:
+    """Fill in the settings that depend on the scene.
+
+    Returns:
+        Settings without open ones, and a record of each setting that was filled in.
+    """
+    config, scaled = fill(config, Choice("gradient_scaling", True, "what is near one camera may be in its image alone"))
+    varies = scene.appearance_varies
+    size = APPEARANCE_SIZE if varies else 0
+    appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
+    config, made = decide_capture(config, scene, appearance)
+    config, samples = decide_samples(config, SAMPLES)
+    return config, scaled + made + samples
+
+
+def make_field(config: NerfWConfig, scene: Scene) -> EncodedField | NeRFField:
+    """Return the static field, with appearance vectors if their length is not 0."""
+    size, appearance = config.appearance_embedding_dim, None
+    if size:
+        appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
+    if config.encoding == "frequency":
+        field = NeRFField(PAPER_WIDTH, contracted=contracted_box(config, scene), appearance=appearance)
+        field.optimised = Optimised(learning_rate=PAPER_RATE * config.learning_rate)
+        return field
+    return EncodedField(
+        scene.box, HashGrid.of(config, 0.0), GRID_WIDTH, unbounded=config.contraction, appearance=appearance
+    )
+
+
+def sampler(config: NerfWConfig, scene: Scene) -> Sampler:
+    """Return the configured sampler, which knows the static density alone."""
+    return make_sampler(config, replace(scene, unbounded=config.contraction))
+
+
+def renderer(config: NerfWConfig, scene: Scene) -> WildRenderer:
+    """Return the renderer, with the transient head."""
+    features, width = (PAPER_WIDTH, PAPER_WIDTH // 2) if config.encoding == "frequency" else (NUM_FEATURES, GRID_WIDTH)
+    known, sizes = scene.camera_to_worlds, (config.transient_embedding_dim, config.transient_resolution, width)
+    poses = torch.eye(3, 4).repeat(scene.num_cameras, 1, 1) if known is None else known
+    head = TransientHead(features, *sizes, scene.box, poses, START / half_edge(scene.box))
+    return WildRenderer(head, config.least_uncertainty, scaled_up_to(config, scene), config.thin_gradients)
+
+
+METHOD = Method(
+    NerfWConfig(),
+    paper="arXiv:2008.02268",
+    field=make_field,
+    sampler=sampler,
+    renderer=renderer,
+    model=NerfW,
+    decide=decide,
+)

@@ -1,0 +1,167 @@
+"""Ref-NeRF: colours from reflected directions, roughness and predicted normals, for things that shine.
+
+Verbin et al., "Ref-NeRF: Structured View-Dependent Appearance for Neural Radiance Fields", CVPR 2022. By default its
+parts stand on a hash grid (Mueller et al. 2022), which two CPU cores train in minutes; `--encoding frequency` has the
+paper's networks on Mip-NeRF's integrated encoding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from nerfloom import Decision, Method, RayModel, Renderer, Sampler, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.integrated import IntegratedEncoding
+from nerfloom.fields.base import MLP
+from nerfloom.fields.reflective import (
+    Reflection,
+    ReflectiveField,
+    ReflectiveGrid,
+    ReflectiveNetworks,
+    SkippingNetwork,
+)
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
+from nerfloom.kernels.encodings.integrated_directional import MAX_BANDS
+from nerfloom.losses.normals import NormalPenalty
+from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
+from nerfloom.rendering.reflections import ReflectionRenderer
+from nerfloom.rendering.volume import scaled_up_to
+from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler
+from nerfloom.samplers.proposal import half_edge
+
+SAMPLES = {"hash-grid": 2**15, "frequency": 2**12}
+"""Samples per training step with an occupancy grid."""
+DEPTH, DIRECTIONAL_SKIP = 8, 4
+"""Hidden layers of the paper's two networks, and those of the directional one before its input is repeated."""
+
+
+@dataclass(frozen=True)
+class RefNeRFConfig(
+    HashGridConfig,
+    HierarchicalConfig,
+    max_num_iterations=250_000,
+    num_rays_per_batch=4_096,
+    learning_rate=AUTO,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
+    background="white",
+    log2_table_size=17,
+    num_coarse_samples=128,
+    num_fine_samples=128,
+    eval_num_rays_per_chunk=8_192,
+    thin_gradients=0.5,
+):
+    """Settings of ref-nerf."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "hidden_width": (2, 2**14),
+        "bottleneck_width": (1, 2**12),
+        "direction_bands": (1, MAX_BANDS),
+        "position_frequencies": (1, MAX_FREQUENCIES),
+        "normal_loss_mult": AT_LEAST_0,
+        "orientation_loss_mult": AT_LEAST_0,
+        "open_levels_until": (0, 1),
+    }
+    """Allowed range of each numeric setting."""
+    encoding: Literal["hash-grid", "frequency"] = "hash-grid"
+    """hash-grid: small networks on a hash grid. frequency: the paper's networks of 8 layers, for GPUs."""
+    max_resolution: Auto[int] = AUTO
+    """Cells per axis at the finest level. auto: a power of two, at least 1 cell per pixel of the images (hash-grid)."""
+    learning_rate: Auto[float] = AUTO
+    """Initial learning rate of Adam. auto: 0.01 on a hash grid, 0.0005 for the paper's networks."""
+    hidden_width: Auto[int] = AUTO
+    """Features per hidden layer. auto: 64 on a hash grid, 256 for the paper's networks."""
+    bottleneck_width: Auto[int] = AUTO
+    """Features that the directional network takes beside directions. auto: 16 on a hash grid, 128 otherwise."""
+    direction_bands: int = MAX_BANDS
+    """Bands of the directional encoding, of degrees 1, 2, 4, 8 and 16."""
+    position_frequencies: int = 16
+    """Number of frequencies in the integrated encoding of positions (frequency)."""
+    open_levels_until: float = 0.3
+    """Fraction of the budget during which levels of the hash grid open, from coarse to fine (hash-grid)."""
+    normal_loss_mult: Auto[float] = AUTO
+    """Weight of the difference between predicted normals and those of the density. auto: 0.003 on a hash grid, 0.0003
+    for the paper's networks."""
+    orientation_loss_mult: float = 0.1
+    """Weight of the penalty on predicted normals that face away from the camera."""
+
+
+class RefNeRF(RayModel[RefNeRFConfig], plain=True):
+    """A model with penalties on predicted normals; a coarse level has a weight of a tenth."""
+
+    losses = (
+        COLOR_ERROR,
+        CoarseColorError(0.1),
+        SamplerLoss(),
+        *KNOWN_DISTANCES,
+        NormalPenalty("normals", "normal_loss_mult"),
+        NormalPenalty("orientation", "orientation_loss_mult"),
+    )
+
+
+def decide(config: RefNeRFConfig, scene: Scene) -> tuple[RefNeRFConfig, list[Decision]]:
+    """Fill in the settings that depend on the encoding and the scene.
+
+    Returns:
+        Settings without open ones, and a record of each setting that was filled in.
+    """
+    on_grid = config.encoding == "hash-grid"
+    reason = "there may be something outside the box" if scene.unbounded else f"--encoding is {config.encoding}"
+    bounded = "occupancy" if on_grid else "hierarchical"
+    config, made = fill(config, Choice("sampler", "proposal" if scene.unbounded else bounded, reason))
+    config, samples = decide_samples(config, SAMPLES[config.encoding])
+    config, _ = fill(
+        config,
+        Choice("learning_rate", 1e-2 if on_grid else 5e-4, reason),
+        Choice("hidden_width", 64 if on_grid else 256, reason),
+        Choice("bottleneck_width", 16 if on_grid else 128, reason),
+        Choice("normal_loss_mult", 3e-3 if on_grid else 3e-4, reason),
+    )
+    finest = 2 ** (scene.image_size - 1).bit_length()
+    each = f"each of the images' {scene.image_size} pixels gets one or more"
+    config, cells = fill(config, Choice("max_resolution", finest, each, "finest cells along an axis"))
+    return config, made + samples + (cells if on_grid else [])
+
+
+def make_field(config: RefNeRFConfig, scene: Scene) -> ReflectiveField:
+    """Return a field on a hash grid, or the paper's networks."""
+    width, bottleneck, bands = config.hidden_width, config.bottleneck_width, config.direction_bands
+    inputs, unbounded = Reflection.num_inputs(bottleneck, bands), contracted_box(config, scene) is not None
+    if config.encoding == "hash-grid":
+        reflection = Reflection(MLP(inputs, width, width, 3, bias=False, activation="sigmoid"), bands)
+        grid = HashGrid.of(config, config.open_levels_until)
+        return ReflectiveGrid(scene.box, grid, reflection, width, bottleneck, unbounded)
+    encoding = IntegratedEncoding(
+        scene.box,
+        config.position_frequencies,
+        deviation=half_edge(scene.box) / scene.image_size,
+        contracted=unbounded,
+    )
+    directional = SkippingNetwork(inputs, width, DEPTH, DIRECTIONAL_SKIP, 3, "sigmoid")
+    return ReflectiveNetworks(encoding, Reflection(directional, bands), width, DEPTH, bottleneck)
+
+
+def sampler(config: RefNeRFConfig, scene: Scene) -> Sampler:
+    """Return the configured sampler; the coarse level of hierarchical sampling is the field itself."""
+    return make_sampler(config, scene, make_coarse=lambda: None)
+
+
+def renderer(config: RefNeRFConfig, scene: Scene) -> Renderer:
+    """Return a renderer that also shows what colours are made of."""
+    return ReflectionRenderer(scaled_up_to(config, scene), config.thin_gradients)
+
+
+METHOD = Method(
+    RefNeRFConfig(),
+    paper="arXiv:2112.03907",
+    field=make_field,
+    sampler=sampler,
+    renderer=renderer,
+    model=RefNeRF,
+    decide=decide,
+)

@@ -1,0 +1,120 @@
+"""Baking: cells against closed forms, harmonics against numpy's least squares, and a run against its octree."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import nerfloom
+from nerfloom.base.errors import ConfigError
+from nerfloom.data.scene import Scene
+from nerfloom.export.bake import Baking, bake
+from nerfloom.export.octree_cells import MatterSearch
+from nerfloom.export.octree_colors import fitted
+from nerfloom.geometry.points import Points
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.octrees.files import read_octree
+from tests.cli.helpers import TINY_NGP, called
+
+RADIUS, SIGMA = 0.4, 50.0
+BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])
+
+
+class Ball:
+    """A model of which the density is known."""
+
+    scene = Scene(box=BOX, near=0.1, far=9.0, num_cameras=1, has_alpha=True, moving=False, image_size=40)
+    device = torch.device("cpu")
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def rendering(self):
+        from contextlib import nullcontext
+
+        return nullcontext()
+
+    def density(self, points: Points) -> Tensor:
+        self.asked += len(points.positions)
+        return SIGMA * (points.positions.norm(dim=-1) < RADIUS).float()
+
+
+def test_the_box_fits_the_matter_and_cells_fill_it() -> None:
+    model = Ball()
+    search = MatterSearch(model)
+    grid = search.tight(64)
+    low, high = grid.origin, grid.origin + 8 * grid.cell * torch.tensor(grid.size)
+    assert bool((low <= -RADIUS).all()) and bool((high >= RADIUS).all())  # noqa: PT018
+    assert float((high - low).max()) < 2.6 * RADIUS + 16 * grid.cell
+    cells, depths = search.cells(grid)
+    volume = len(cells) * grid.cell**3
+    assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
+    torch.testing.assert_close(depths, torch.full_like(depths, SIGMA * grid.cell))
+    assert float(grid.positions(cells + 0.5).norm(dim=-1).max()) < RADIUS
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_harmonics_are_fitted_as_by_numpy(degree: int) -> None:
+    torch.manual_seed(degree)
+    directions = torch.nn.functional.normalize(torch.randn(5, 30, 3), dim=-1)
+    colors, weights = torch.rand(5, 30, 3), torch.rand(5, 30)
+    found = fitted(directions, colors, weights, degree).view(5, 3, -1)
+    for leaf in range(5):
+        basis = spherical_harmonics(directions[leaf].contiguous(), degree + 1).double().numpy()
+        share = np.sqrt(weights[leaf].double().numpy() / weights[leaf].double().sum().item())[:, None]
+        ridge = np.sqrt(0.03) * np.eye(basis.shape[1])[1:]
+        left = np.concatenate([share * basis, ridge])
+        right = np.concatenate([share * colors[leaf].double().numpy(), np.zeros((len(ridge), 3))])
+        truth = np.linalg.lstsq(left, right, rcond=None)[0]
+        np.testing.assert_allclose(found[leaf].T.numpy(), truth, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_run_and_its_octree(shared_tiny: Path, tmp_path: Path) -> None:
+    words = ("--data", shared_tiny, "--output-dir", tmp_path, "--timestamp", "run", "--max-num-iterations", 400)
+    done = called("ns-train", "instant-ngp", *words, *TINY_NGP)
+    assert done.returncode == 0, done.stderr
+    (config,) = tmp_path.rglob("config.yml")
+    file = tmp_path / "x.octree"
+    flags = ("--output-path", file, "--resolution", 48, "--fine-tune-seconds", 3, "--max-megabytes", 2)
+    done = called("ns-bake", config.parent, *flags)
+    assert done.returncode == 0, done.stderr
+    assert file.stat().st_size < 2e6
+    run, octree = nerfloom.load(config.parent), nerfloom.load(file, data=shared_tiny)
+    teacher, student = run.evaluate()["psnr"], octree.evaluate()["psnr"]
+    print(f"run {teacher:.2f} dB, octree {student:.2f} dB")
+    assert student > teacher - 1.5
+    done = called("ns-eval", file, "--data", shared_tiny)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "x.eval.json").is_file()
+    done = called("ns-bake", config.parent, *flags[:2], "--resolution", 48, "--fine-tune-seconds", 0, "--degree", 1)
+    assert done.returncode == 0, done.stderr
+    assert read_octree(file).leaves.colors.shape[1] == 12
+    other = replace(run, model=replace_scene(run.model))
+    with pytest.raises(ConfigError, match="outside of its box"):
+        bake(other, Baking())
+
+
+def replace_scene(model):
+    model.scene = replace(model.scene, unbounded=True)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--resolution", 8), "--resolution"),
+        (("--degree", 4), "--degree"),
+        (("--max-megabytes", 0), "--max-megabytes"),
+        (("--fine-tune-seconds", -1), "--fine-tune-seconds"),
+        (("--output-path", "x.ply"), ".octree"),
+    ],
+)
+def test_flags_that_cannot_be(flags: tuple[object, ...], named: str, tmp_path: Path) -> None:
+    done = called("ns-bake", tmp_path, *flags)
+    assert done.returncode == 2
+    assert named in done.stderr
+    assert len(done.stderr.splitlines()) == 1

@@ -1,0 +1,30 @@
+"""Octrees about which everything is known."""
+
+import torch
+from torch import Tensor
+
+from nerfloom.cameras.poses import Placement
+from nerfloom.kernels.encodings.spherical_harmonics import CONSTANT
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.octrees.octree import Octree
+from nerfloom.octrees.packing import packed
+
+RADIUS, CELL = 0.5, 0.05
+
+
+def ball_cells(radius: float = RADIUS) -> Tensor:
+    """Cells (N, 3) of a ball in a box of 4^3 bricks around the origin."""
+    cells = torch.cartesian_prod(*[torch.arange(32)] * 3)
+    return cells[((cells - 15.5).norm(dim=-1) * CELL) < radius]
+
+
+def ball(degree: int = 1, depth: float = 5.0) -> Octree:
+    """An opaque ball, red above its middle along z and blue below, from every side."""
+    layout, rows = OctreeLayout.build(torch.full((3,), -16 * CELL), CELL, (4, 4, 4), ball_cells())
+    above = layout.centers()[:, 2] > 0
+    color = torch.where(above[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.1, 0.1, 0.9])) / CONSTANT
+    coefficients = torch.zeros(len(rows), 3, (degree + 1) ** 2)
+    coefficients[..., 0] = color
+    leaves, _ = packed(torch.full((len(rows),), depth), coefficients.view(len(rows), -1))
+    placement = Placement.of(torch.eye(3, 4), 0.25)
+    return Octree(layout, leaves, placement, 0.1, 10.0, True, 400)

@@ -1,0 +1,96 @@
+"""An octree is looked at, judged and exported like a run."""
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+import nerfloom
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.view import View
+from nerfloom.evaluation.error_bound import limited_error
+from nerfloom.geometry.points import Points
+from nerfloom.octrees.drawn import DrawnOctree
+from nerfloom.octrees.files import write_octree
+from tests.cli.helpers import called
+from tests.octrees.balls import CELL, RADIUS, ball
+
+
+def front() -> Cameras:
+    """A camera at x = 0, y = -3 that looks along y, z up."""
+    pose = torch.tensor([[[1.0, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0]]])
+    size = torch.tensor([40])
+    length = torch.tensor([60.0])
+    return Cameras(pose, length, length, torch.tensor([20.0]), torch.tensor([20.0]), size, size)
+
+
+def test_a_ball_from_the_front() -> None:
+    octree = ball()
+    model = DrawnOctree(octree, octree.scene)
+    picture = model.render_view(View(front()), model.background)
+    assert picture.size == (40, 40)
+    torch.testing.assert_close(picture.rgb[0, 0], torch.ones(3))
+    torch.testing.assert_close(picture.rgb[15, 20], torch.tensor([0.9, 0.1, 0.1]), atol=0.01, rtol=0)
+    torch.testing.assert_close(picture.rgb[24, 20], torch.tensor([0.1, 0.1, 0.9]), atol=0.01, rtol=0)
+    assert float(picture.accumulation[20, 20]) > 0.99
+    assert float(picture.median_depth[20, 20]) == pytest.approx(3 - RADIUS, abs=2 * CELL)
+    assert float(picture.depth[20, 20]) == pytest.approx(3 - RADIUS, abs=2 * CELL)
+    assert float(picture.median_depth[0, 0]) == 10
+    disc = np.pi * (60 * RADIUS / 3) ** 2
+    assert float(picture.accumulation.sum()) == pytest.approx(disc, rel=0.1)
+    finer = model.render_view(View(front(), rays_per_pixel=4, stride=2), model.background)
+    assert finer.size == (20, 20)
+    assert float((finer.rgb - picture.rgb[1::2, 1::2]).abs().mean()) < 0.05
+
+
+def test_density_is_that_of_the_leaf() -> None:
+    octree = ball(depth=2.0)
+    model = DrawnOctree(octree, octree.scene)
+    positions = torch.tensor([[0.0, 0, 0], [0.3, 0.1, 0], [0.7, 0, 0], [9.0, 0, 0], [torch.nan, 0, 0]])
+    found = model.density(Points(positions))
+    torch.testing.assert_close(found, torch.tensor([2 / CELL, 2 / CELL, 0, 0, 0]), rtol=1e-4, atol=0)
+
+
+def test_an_error_bound_is_kept() -> None:
+    octree = ball(depth=0.4)
+    model = DrawnOctree(octree, octree.scene)
+    views = []
+    for bound in (0.0, 0.1):
+        with limited_error(model, bound):
+            views.append(model.render_view(View(front()), model.background).rgb)
+    assert 0 < float((views[0] - views[1]).abs().max()) < 0.1
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    write_octree(tmp_path / "ball.octree", ball())
+    return tmp_path / "ball.octree"
+
+
+def test_it_is_opened_like_a_run(file: Path) -> None:
+    loaded = nerfloom.load(file)
+    assert not loaded.is_run
+    assert float(loaded.render(front()).accumulation.max()) > 0.99
+    with pytest.raises(ConfigError, match="photographs are unknown"):
+        loaded.evaluate()
+
+
+@pytest.mark.medium
+def test_commands_open_it(file: Path) -> None:
+    folder = file.parent / "orbit"
+    done = called("ns-render", "orbit", file, "--num-frames", 3, "--downscale-factor", 8, "--output-path", folder)
+    assert done.returncode == 0, done.stderr
+    frames = np.stack([iio.imread(path) for path in sorted(folder.glob("*.png"))]).astype(float)
+    assert (frames[:, 0, 0] == 255).all()
+    assert frames.min() < 60
+    done = called("ns-render", "orbit", file, "--up=z", "--output-path", file.parent)
+    assert "an octree knows which way is up" in done.stderr
+
+
+@pytest.mark.medium
+def test_another_frame_is_refused(file: Path, shared_tiny: Path) -> None:
+    with pytest.raises(DataError, match="another frame"):
+        nerfloom.load(file, data=shared_tiny)

@@ -1,0 +1,168 @@
+"""NeRF-W: its loss, compositing of two parts, what held-out views show, and where transient vectors are."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfloom import Field, Points, Rays, Samples
+from nerfloom.fields.transient import TransientHead
+from nerfloom.losses.functions import doubted_error
+from nerfloom.methods import nerf_w
+from nerfloom.methods.nerf_w import START, WildRenderer
+from nerfloom.samplers.proposal import half_edge
+from nerfloom.testing import assert_method
+from nerfloom.testing.ball import cameras_at
+from tests.training.helpers import TINY
+
+LEAST = 0.1
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+def test_the_loss_is_the_likelihood_of_a_normal_distribution() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rgb, true = torch.rand(2, 500, 3, generator=generator, dtype=torch.float64)
+    doubt = LEAST + torch.rand(500, generator=generator, dtype=torch.float64)
+    weights = torch.rand(500, generator=generator, dtype=torch.float64)
+    rgb.requires_grad_()
+    doubt.requires_grad_()
+    spread = torch.distributions.Normal(rgb, doubt[:, None])
+    clear = torch.distributions.Normal(rgb.detach(), LEAST).log_prob(rgb.detach())
+    expected = (2 * LEAST**2 * (clear - spread.log_prob(true)) * weights[:, None]).mean()
+    found = doubted_error(rgb, true, doubt, LEAST, weights)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+    for one, other in zip(*(torch.autograd.grad(x, (rgb, doubt)) for x in (found, expected)), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-18)
+    torch.testing.assert_close(
+        doubted_error(rgb, true, torch.full_like(doubt, LEAST), LEAST), (rgb - true).square().mean()
+    )
+    # The best uncertainty is the root of the mean squared error, but never less than the least.
+    errors = (rgb - true).detach().square().mean(-1).sqrt()
+    best = errors.clamp(min=LEAST).requires_grad_()
+    (slope,) = torch.autograd.grad(doubted_error(rgb.detach(), true, best, LEAST), best)
+    assert float(slope[errors > LEAST].abs().max()) < 1e-15
+    assert bool((slope[errors < LEAST] > 0).all())
+    assert doubted_error(rgb[:0], true[:0], doubt[:0], LEAST).item() == 0
+
+
+class Slabs(Field):
+    """Given densities and colours, one sample after the other."""
+
+    def __init__(self, sigma: Tensor, rgb: Tensor) -> None:
+        super().__init__()
+        self.sigma, self.rgb = sigma, rgb
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return self.sigma, self.rgb
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        return features
+
+
+class Given(TransientHead):
+    """A transient part of given values, the same in every image."""
+
+    def __init__(self, density: Tensor, color: Tensor, doubt: Tensor) -> None:
+        super().__init__(3, 2, 1, 8, BOX, torch.eye(3, 4).repeat(4, 1, 1), 0.1)
+        self.given = density, color, doubt
+
+    def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return self.given
+
+
+def two_parts() -> tuple[Rays, Samples, Slabs, Given]:
+    """Two rays of five intervals, in float64."""
+    generator = torch.Generator().manual_seed(1)
+    sigma, density, doubt = 2 * torch.rand(3, 10, generator=generator, dtype=torch.float64)
+    rgb, color = torch.rand(2, 10, 3, generator=generator, dtype=torch.float64)
+    sigma[2] = density[2] = 0.0
+    directions = torch.tensor([[0.0, 0, 1], [0.6, 0, 0.8]], dtype=torch.float64)
+    rays = Rays(torch.zeros(2, 3, dtype=torch.float64), directions, camera_indices=torch.tensor([0, 3]))
+    edges = torch.tensor([0.0, 0.3, 0.9, 1.1, 2.0, 2.7], dtype=torch.float64).repeat(2, 1)
+    return rays, Samples.regular(edges[:, :-1], edges[:, 1:]), Slabs(sigma, rgb), Given(density, color, doubt)
+
+
+def test_two_parts_are_composited_as_many_thin_slices() -> None:
+    """Reference: 20,000 slices of each interval, whose light is that of equation 8; and equation 11."""
+    rays, samples, field, head = two_parts()
+    background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    found = WildRenderer(head, LEAST, None).render(rays, samples, field, background)
+    density, color, doubt = (x.double() for x in head.given)
+    count = 20_000
+    for ray in range(2):
+        passed = alone = hazy = torch.ones(()).double()  # transmittance: both parts, the static, the transient one
+        rgb, transient, static = torch.zeros(3, 3).double()
+        uncertain = torch.tensor(LEAST).double()
+        for i in range(5 * ray, 5 * ray + 5):
+            thin = float(samples.deltas[i]) / count
+            one, other = (-torch.expm1(-x * thin) for x in (field.sigma[i], density[i]))
+            ahead = passed * torch.exp(-(field.sigma[i] + density[i]) * thin * torch.arange(count).double()).sum()
+            rgb = rgb + ahead * (one * field.rgb[i] + other * color[i])
+            transient = transient + ahead * other * color[i]
+            uncertain = uncertain + hazy * -torch.expm1(-density[i] * samples.deltas[i]) * doubt[i]
+            hazy = hazy * torch.exp(-density[i] * samples.deltas[i])
+            passed = passed * torch.exp(-(field.sigma[i] + density[i]) * samples.deltas[i])
+            static = static + alone * -torch.expm1(-field.sigma[i] * samples.deltas[i]) * field.rgb[i]
+            alone = alone * torch.exp(-field.sigma[i] * samples.deltas[i])
+        torch.testing.assert_close(found.rgb[ray], rgb + passed * background, atol=5e-5, rtol=0)
+        torch.testing.assert_close(found.extras["transient"][ray], transient, atol=5e-5, rtol=0)
+        torch.testing.assert_close(found.extras["uncertainty"][ray], uncertain, atol=5e-5, rtol=0)
+        torch.testing.assert_close(found.extras["static"][ray], static + alone * background, atol=1e-12, rtol=0)
+        mean = density[5 * ray : 5 * ray + 5].mean()
+        torch.testing.assert_close(found.extras["transient_density"][ray], mean)
+
+
+def test_rays_of_no_training_image_show_the_static_part() -> None:
+    rays, samples, field, head = two_parts()
+    renderer, background = WildRenderer(head, LEAST, None), torch.zeros(3, dtype=torch.float64)
+    of_image = renderer.render(rays, samples, field, background)
+    held_out = renderer.render(dataclasses.replace(rays, camera_indices=None), samples, field, background)
+    assert not torch.allclose(of_image.rgb, held_out.rgb)
+    torch.testing.assert_close(held_out.rgb, of_image.extras["static"], rtol=0, atol=0)
+    assert not held_out.extras["transient"].any()
+    assert (held_out.extras["uncertainty"] == LEAST).all()
+    head.shown_image = 3
+    shown = renderer.render(dataclasses.replace(rays, camera_indices=None), samples, field, background)
+    torch.testing.assert_close(shown.rgb, of_image.rgb, rtol=0, atol=0)
+
+
+def test_before_training_the_transient_part_is_nearly_transparent() -> None:
+    box = torch.tensor([[-3.0] * 3, [3.0] * 3])
+    torch.manual_seed(0)
+    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1), START / half_edge(box))
+    positions = 6 * torch.rand(1000, 3) - 3
+    density, color, doubt = head(torch.randn(1000, 16), positions, torch.randn(1000, 16))
+    assert density.shape == doubt.shape == (1000,)
+    assert color.shape == (1000, 3)
+    assert float(density.detach().median()) * 2 * half_edge(box) < 4 * START  # optical depth across the box
+    assert float(doubt.detach().min()) > 0
+    other = head(torch.zeros(1, 16), torch.zeros(1, 3), torch.ones(1, 16))
+    assert not torch.equal(other[1], head(torch.zeros(1, 16), torch.zeros(1, 3), torch.zeros(1, 16))[1])
+
+
+@pytest.mark.parametrize("resolution", [1, 2, 5])
+def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
+    """Each image's vectors are linear over it, so that what is looked up is that function of the pixel's place."""
+    cameras = cameras_at(torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-3.0, 1, 2]]), 40, 9)
+    head = TransientHead(16, 3, resolution, 8, BOX, cameras.camera_to_worlds, 0.1)
+    head.reach.fill_(float((cameras.widths / cameras.fx).max()) / 2)
+    place = torch.linspace(-1, 1, resolution) if resolution > 1 else torch.zeros(1)
+    row, column = torch.meshgrid(place, place, indexing="ij")
+    with torch.no_grad():
+        maps = torch.stack([torch.stack([column, row, torch.full_like(row, i)], -1) for i in range(3)])
+        head.vectors.copy_(maps.view(-1, 3))
+    for index in range(3):
+        rays = cameras.pixel_rays(cameras.image_pixels(index).flatten(), 1.0, 9.0)
+        found = head.vectors_of(rays)
+        assert found is not None
+        across = (torch.arange(9) + 0.5) / 4.5 - 1
+        down, along = torch.meshgrid(-across, across, indexing="ij")  # the camera's y axis points up
+        linear = torch.stack([along, down], -1).view(-1, 2) if resolution > 1 else torch.zeros(81, 2)
+        torch.testing.assert_close(found[:, :2], linear, atol=1e-5, rtol=0)
+        torch.testing.assert_close(found[:, 2], torch.full((81,), float(index)), atol=1e-5, rtol=0)
+
+
+@pytest.mark.medium
+def test_the_papers_networks_pass() -> None:
+    assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))

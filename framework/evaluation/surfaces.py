@@ -16,7 +16,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.triangles import area_vectors, draw_on_triangles, nearest_on_triangles
 
-DENSE = 200_000
+DENSE = 800_000
 """Number of points on a mesh where nearest faces are looked for."""
 CANDIDATES = 8
 """Number of nearest points on a mesh whose faces are compared exactly."""
@@ -173,7 +173,7 @@ def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]
 
     Of a mesh, the nearest of the faces at the `CANDIDATES` nearest of many points on it, at least one on each face. The
     distance to that face is exact. It may exceed the distance to the mesh only where another face is nearer by less
-    than the points are apart.
+    than the points are apart: so the distance of a mesh to itself is small, and not exactly 0.
 
     Args:
         positions: (N, 3) float64.

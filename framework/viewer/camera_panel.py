@@ -108,4 +108,4 @@ def move_camera(client: Any, pose: Tensor, fov: float) -> None:
 
 def plain(text: str) -> str:
     """Return `text` without Markdown marks, which the panel would interpret."""
-    return "".join(letter if letter.isalnum() or letter in "-. " else "-" for letter in text)
+    return "".join(letter if letter.isalnum() or letter in "-. ,:" else "-" for letter in text)

@@ -233,7 +233,7 @@ def test_crop(browser: Chromium, run: Path) -> None:
 
 def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
     """Two clicks on the ball, its scale, and the length in it."""
-    places = (230, 330), (330, 380)
+    places = (330, 380), (430, 300)
     with started(command("ns-viewer"), run, "--websocket-port", 17507) as (_, address):
         tab = browser.open(address)
         shown(tab)

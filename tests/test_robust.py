@@ -9,7 +9,7 @@ import torch
 
 from nerfloom.base.config import from_plain
 from nerfloom.base.errors import ConfigError
-from nerfloom.data.pixels.batch import PixelBatch, ViewBatch, draw_batch
+from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.pixels.contradicted import (
     ALL_UNTIL,
     MEMORY,
@@ -18,10 +18,10 @@ from nerfloom.data.pixels.contradicted import (
     STEPS_PER_LOOK,
     ContradictedTiles,
 )
-from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.pixels.tiles import Tiles
 from nerfloom.data.sources import BatchSource, Request, make_source
 from nerfloom.registry import load_method
+from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.stress.scenes import ball_views
 from nerfloom.training.step import forward
 from nerfloom.training.trainer import Trainer
@@ -120,59 +120,22 @@ def test_all_pixels_count_at_first_and_without_draws() -> None:
     assert few.tiles.side >= MIN_SIDE
 
 
-def contradicting(kind: str) -> tuple[BatchSource, torch.Tensor]:
+def contradicting() -> tuple[BatchSource, torch.Tensor]:
     """A source with --robust whose first tiles are contradicted, and which (P,) bool of all pixels are in them."""
     config = dataclasses.replace(load_method("instant-ngp").config, robust=True)
-    source = make_source(kind, BALL.train, config)
+    source = make_source("pixels", BALL.train, config)
     assert source.contradicted is not None
     source.contradicted.state[:5, 4] = 1
     return source, source.contradicted.counting(torch.arange(len(BALL.train.pixels))) == 0
 
 
 def test_pixels_of_a_batch_have_weights_of_0_or_1() -> None:
-    source, out = contradicting("pixels")
+    source, out = contradicting()
     batch = source.draw(Request(0, 2000))
     assert isinstance(batch, PixelBatch)
     assert batch.weights is not None
     assert torch.equal(batch.weights == 0, out[batch.pixels])
     assert 0 < float((batch.weights == 0).float().mean()) < 0.5
-
-
-def test_whole_images_leave_out_the_same_pixels_and_what_masks_leave_out() -> None:
-    source, out = contradicting("views")
-    ends = BALL.train.cameras.offsets
-    for step in range(len(BALL.train)):
-        batch = source.draw(Request(step, 0))
-        assert isinstance(batch, ViewBatch)
-        assert batch.kept is not None
-        assert torch.equal(batch.kept.view(-1), ~out[ends[batch.index] : ends[batch.index + 1]])
-    mask = torch.rand(len(out)) < 0.5
-    kept = PixelSet.of_mask(mask)
-    source = source.drawing_from(dataclasses.replace(BALL.train, kept=kept, drawn=kept))
-    batch = source.draw(Request(0, 0))
-    here = slice(int(ends[batch.index]), int(ends[batch.index + 1]))
-    assert torch.equal(batch.kept.view(-1), (mask & ~out)[here])
-
-
-def test_images_and_pixels_learn_the_same_means() -> None:
-    """From all pixels of one image, those that a mask leaves out aside."""
-    mask = torch.rand(len(BALL.train.pixels)) < 0.7
-    kept = PixelSet.of_mask(mask)
-    data = dataclasses.replace(BALL.train, kept=kept, drawn=kept)
-    config = dataclasses.replace(load_method("instant-ngp").config, robust=True)
-    views, pixels = (make_source(kind, data, config) for kind in ("views", "pixels"))
-    request = Request(1, 0)
-    batch = views.draw(request)
-    rgb = torch.rand_like(batch.rgb)
-    views.learn(request, batch, rgb)
-    numbers = data.cameras.image_pixels(batch.index)
-    of_pixels = dataclasses.replace(
-        draw_batch(data, 1, "black"), pixels=numbers[mask[numbers]], rgb=batch.rgb.view(-1, 3)[mask[numbers]]
-    )
-    pixels.learn(request, of_pixels, rgb.view(-1, 3)[mask[numbers]])
-    assert views.contradicted is not None
-    assert pixels.contradicted is not None
-    torch.testing.assert_close(views.contradicted.state, pixels.contradicted.state)
 
 
 @pytest.mark.parametrize("method", ["instant-ngp", "vanilla-nerf"])
@@ -193,7 +156,7 @@ def test_left_out_pixels_have_no_effect_on_colours(method: str) -> None:
 
 
 def test_a_resumed_source_decides_the_same() -> None:
-    source, out = contradicting("pixels")
+    source, out = contradicting()
     for step in range(2 * STEPS_PER_LOOK):
         request = Request(step, 4096, progress=0.5)
         batch = source.draw(request)
@@ -204,6 +167,14 @@ def test_a_resumed_source_decides_the_same() -> None:
     assert source.contradicted is not None
     assert torch.equal(other.contradicted.state, source.contradicted.state)
     assert 0 < float(other.contradicted.share) < 0.5
+
+
+def test_gradients_near_cameras_are_scaled_as_well() -> None:
+    config, scene = load_method("instant-ngp").config, BALL.train.scene
+    scaled = scaled_up_to(dataclasses.replace(config, gradient_scaling=True), scene)
+    assert scaled is not None
+    assert scaled_up_to(dataclasses.replace(config, robust=True), scene) == scaled
+    assert scaled_up_to(config, scene) is None
 
 
 def test_what_contradicts_the_setting_is_refused() -> None:

@@ -184,19 +184,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class RobustConfig(TrainConfig):
-    """Settings of a method that can leave out pixels that other images contradict."""
-
-    RANGES: ClassVar[dict[str, Range]] = {"robust_factor": (1, 1e6)}
-    """Allowed ranges."""
-    robust: bool = False
-    """Do not learn from regions that the other images contradict, such as people who walk through."""
-    robust_factor: float = 2.0
-    """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust)."""
-
-
-@dataclass(frozen=True)
-class RayConfig(RobustConfig):
+class RayConfig(TrainConfig):
     """Settings of every method that casts rays."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -209,6 +197,7 @@ class RayConfig(RobustConfig):
         "free_space_loss_mult": AT_LEAST_0,
         "rays_shared_by": (0, 100),
         "thin_gradients": (0, 16),
+        "robust_factor": (1, 1e6),
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
@@ -238,6 +227,11 @@ class RayConfig(RobustConfig):
     expected gradient stays the same. 0: keep all. CPU only."""
     gradient_scaling: bool = False
     """Scale gradients near cameras down by squared distance, up to half of the box's edge, against floaters."""
+    robust: bool = False
+    """Do not learn from regions that the other images contradict, such as people who walk through. It scales gradients
+    near cameras too, so that these do not become fog there."""
+    robust_factor: float = 2.0
+    """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust)."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. Affects memory and speed, not the result."""
 

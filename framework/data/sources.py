@@ -203,13 +203,10 @@ class ViewSource(BatchSource):
         dataset: the images.
         background: background of transparent pixels; "random" is one colour for the whole image.
         seed: the seed of the run.
-        contradicted: tiles that do not count; None if all do.
     """
 
-    def __init__(
-        self, dataset: Dataset, background: Background, seed: int, contradicted: ContradictedTiles | None = None
-    ) -> None:
-        self.dataset, self.background, self.seed, self.contradicted = dataset, background, seed, contradicted
+    def __init__(self, dataset: Dataset, background: Background, seed: int) -> None:
+        self.dataset, self.background, self.seed = dataset, background, seed
         self._order: tuple[int, list[int]] | None = None
         self._views: dict[int, View] = {}
         """Views of images drawn so far; sizes and lenses are read from the device once."""
@@ -225,35 +222,11 @@ class ViewSource(BatchSource):
         if index not in self._views:
             self._views[index] = View.of(dataset.cameras, index, dataset.times)
         view = self._views[index]
-        kept = self._kept(index)
-        if self.contradicted is not None:
-            counting = self.contradicted.counting(dataset.cameras.image_pixels(index)).view(rgba.shape[:2]) > 0
-            kept = counting if kept is None else kept & counting
+        kept = None
+        if dataset.kept is not None:
+            first, last = dataset.cameras.ends[index : index + 2]
+            kept = dataset.kept.mask(first, last).view(rgba.shape[:2])
         return ViewBatch(index, view, composite(rgba, behind), behind, alpha, kept, self._distances(index))
-
-    def _kept(self, index: int) -> Tensor | None:
-        """Return the pixels (H, W) bool of an image that masks keep; None for all."""
-        dataset = self.dataset
-        if dataset.kept is None:
-            return None
-        first, last = dataset.cameras.ends[index : index + 2]
-        return dataset.kept.mask(first, last).view(dataset.cameras.sizes[index][0], -1)
-
-    def learn(self, request: Request, batch: ViewBatch, rgb: Tensor) -> None:
-        if self.contradicted is None:
-            return
-        errors, kept = rgb - batch.rgb, self._kept(batch.index)
-        errors = errors if kept is None else torch.where(kept[..., None], errors, torch.nan)
-        self.contradicted.learn(self.dataset.cameras.image_pixels(batch.index), errors.view(-1, 3))
-        if request.step % STEPS_PER_LOOK == 0:
-            self.contradicted.decide(request.progress)
-
-    def state(self) -> Tensor | None:
-        return None if self.contradicted is None else self.contradicted.state
-
-    def restore(self, state: Tensor | None) -> None:
-        if self.contradicted is not None and state is not None:
-            self.contradicted.state.copy_(state)
 
     def _distances(self, index: int) -> Tensor | None:
         dataset = self.dataset
@@ -283,7 +256,7 @@ class ViewSource(BatchSource):
         return self._order[1][place]
 
     def drawing_from(self, dataset: Dataset) -> ViewSource:
-        return ViewSource(dataset, self.background, self.seed, self.contradicted)
+        return ViewSource(dataset, self.background, self.seed)
 
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
@@ -298,14 +271,14 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
         ConfigError: if settings contradict each other.
     """
     background = training_background(config.background, dataset.scene.has_alpha)
-    contradicted = ContradictedTiles(dataset, config.robust_factor) if config.robust else None
     if kind == "views":
-        return ViewSource(dataset, background, config.machine.seed, contradicted)
+        return ViewSource(dataset, background, config.machine.seed)
     num_images = config.images_per_batch or None
     keypoints = KEYPOINTS if num_images is None and config.depth_loss_mult and not dataset.scene.has_depth else 0.0
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
+    contradicted = ContradictedTiles(dataset, config.robust_factor) if config.robust else None
     if contradicted is not None and config.draw_by_error:
         raise ConfigError("--draw-by-error prefers large errors, and --robust leaves them out: choose one of them")
     return PixelSource(

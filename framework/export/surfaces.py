@@ -45,7 +45,7 @@ def found_surfaces(
         method: the method of the field, which casts rays: instant-ngp, or nerfacto where there may be something outside
             the scene's box, which instant-ngp does not see.
         dataset: the images.
-        config: settings of the calling run; machine, background and `--robust` are used.
+        config: settings of the calling run; machine and background are used.
         steps: maximum number of training steps of the field.
         seconds: maximum training time of the field, seconds; infinity for no limit.
         count: maximum number of points.
@@ -61,8 +61,6 @@ def found_surfaces(
         max_seconds=limit,
         machine=config.machine,
         background=config.background,
-        robust=config.robust,
-        robust_factor=config.robust_factor,
     )
     trainer = Trainer(method, settings, dataset)
     for report in track(trainer.steps(), "Looking for surfaces", total=steps):

@@ -121,9 +121,8 @@ CONDITIONS = (
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
     Condition(
         "distractors",
-        "discs at other places in each training photograph, 10 % of its pixels, and --robust",
+        "discs at other places in each training photograph, 10 % of its pixels",
         _train(lambda d: with_distractors(d, DISTRACTED)),
-        _fixed(robust=True),
         reason="a dozen small photographs: what a disc hides is seen in few others",
         may_refuse=True,
     ),

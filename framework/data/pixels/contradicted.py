@@ -2,10 +2,10 @@
 
 Where an image shows somebody whom the others do not, the model shows what is behind. Its colours there are wrong in the
 same direction throughout a region. Where texture or an edge is not sharp yet, errors are as large, but their signs
-differ from pixel to pixel. So each tile keeps a running mean of the signed errors of its drawn pixels, and a tile is
-contradicted if the square of that mean is many times the median of all tiles. What is learnt has a small mean. The
-rule compares tiles with each other, so it needs no share of pixels to leave out, and few are left out where nothing
-moves.
+differ from pixel to pixel. So each tile keeps a running mean of the signed errors of its drawn pixels. A tile is
+contradicted if the square of that mean, averaged over 3 x 3 tiles, is several times the median of all tiles, and not
+small in itself. So there is no share of pixels that is always left out: where nothing moves, the means of all tiles
+become small.
 
 That errors tell what moves, and that neighbours decide together, is from RobustNeRF (Sabour et al. 2023); that all
 pixels count at first, from SpotLessSplats (Sabour et al. 2024).

@@ -21,7 +21,6 @@ from nerfloom.data.pixels.contradicted import (
 from nerfloom.data.pixels.tiles import Tiles
 from nerfloom.data.sources import BatchSource, Request, make_source
 from nerfloom.registry import load_method
-from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.stress.scenes import ball_views
 from nerfloom.training.step import forward
 from nerfloom.training.trainer import Trainer
@@ -167,14 +166,6 @@ def test_a_resumed_source_decides_the_same() -> None:
     assert source.contradicted is not None
     assert torch.equal(other.contradicted.state, source.contradicted.state)
     assert 0 < float(other.contradicted.share) < 0.5
-
-
-def test_gradients_near_cameras_are_scaled_as_well() -> None:
-    config, scene = load_method("instant-ngp").config, BALL.train.scene
-    scaled = scaled_up_to(dataclasses.replace(config, gradient_scaling=True), scene)
-    assert scaled is not None
-    assert scaled_up_to(dataclasses.replace(config, robust=True), scene) == scaled
-    assert scaled_up_to(config, scene) is None
 
 
 def test_what_contradicts_the_setting_is_refused() -> None:

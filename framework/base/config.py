@@ -228,8 +228,7 @@ class RayConfig(TrainConfig):
     gradient_scaling: bool = False
     """Scale gradients near cameras down by squared distance, up to half of the box's edge, against floaters."""
     robust: bool = False
-    """Do not learn from regions that the other images contradict, such as people who walk through. It scales gradients
-    near cameras too, so that these do not become fog there."""
+    """Do not learn from regions that the other images contradict, such as people who walk through."""
     robust_factor: float = 2.0
     """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust)."""
     eval_num_rays_per_chunk: int = 8_192

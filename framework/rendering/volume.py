@@ -87,8 +87,7 @@ def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
 
 def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
     """Return the distance from cameras where the scaling of gradients ends, scene units; None for no scaling."""
-    scaled = config.gradient_scaling or config.robust  # else what only one image shows becomes fog before its camera
-    return half_edge(scene.box) if scaled else None
+    return half_edge(scene.box) if config.gradient_scaling else None
 
 
 def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:

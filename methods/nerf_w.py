@@ -42,7 +42,7 @@ PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features of a hidden layer, of the paper's networks and of those on a hash grid. The heads of the first have half."""
 PAPER_RATE = 0.05
 """Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
-START = 0.2
+START = 0.05
 """Transient density before training, per half edge of the box."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid over a box."""
@@ -82,13 +82,12 @@ class NerfWConfig(
     otherwise 0."""
     transient_embedding_dim: int = 16
     """Length of an image's transient vectors."""
-    transient_resolution: int = 16
-    """Vectors along each side of an image, between which they are interpolated; 1 in the paper: one for each image."""
+    transient_resolution: int = 1
+    """Vectors along each side of an image, interpolated between; 1: one for each image, as in the paper."""
     least_uncertainty: float = 0.1
     """Standard deviation of colours where nothing is transient; 0.03 in the paper."""
     transient_density_mult: float = 0.01
     """Weight of the mean transient density, per half edge of the box."""
-    bounded_sampler = "proposal"
 
 
 class WildRenderer(VolumeRenderer):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 from torch import Tensor
 
@@ -85,7 +86,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     return Octree(layout, leaves, loaded.input_placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
 
 
-def _bakeable(loaded: Loaded) -> RayModel:
+def _bakeable(loaded: Loaded) -> RayModel[Any]:
     """Return the run's model; refuse what an octree of a box cannot show."""
     model, name = loaded.model, loaded.method
     if not isinstance(model, RayModel):
@@ -102,7 +103,7 @@ def _bakeable(loaded: Loaded) -> RayModel:
     return model
 
 
-def _visible(model: RayModel, dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
+def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
     """Return cells with matter, their raw densities (L, 1), and what training images see of them."""
     search = MatterSearch(model)
     grid = search.tight(resolution)

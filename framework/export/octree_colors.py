@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -71,7 +72,7 @@ def seen_leaves(layout: OctreeLayout, raw: Tensor, cameras: Cameras, near: float
 
 
 @torch.no_grad()
-def fitted_colors(model: RayModel, centers: Tensor, size: float, seen: Seen, degree: int) -> Tensor:
+def fitted_colors(model: RayModel[Any], centers: Tensor, size: float, seen: Seen, degree: int) -> Tensor:
     """Return coefficients (L, 3 K) of harmonics: weighted least squares, leaf by leaf, to the field's colours.
 
     Each leaf's colour is evaluated in the directions of the cameras that see it best.

@@ -21,6 +21,7 @@ from nerfloom.kernels.compositing.density import COMPOSITE, DISTORTION
 from nerfloom.kernels.dispatch import TRITON, Backend, Operation, derivatives
 from nerfloom.kernels.encodings.contraction import CONTRACT
 from nerfloom.kernels.encodings.frequency import FREQUENCY_ENCODING
+from nerfloom.kernels.encodings.integrated_directional import DIRECTIONAL_ENCODING
 from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
 from nerfloom.kernels.grids.hash_grid import HASH_GRID, hash_grid
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
@@ -184,6 +185,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     DENSITY_NETWORK: lambda: ([rand(40, 5), rand(40, 2)], [rand(8, 7), rand(3, 8) * 9 - 5], [rand(8), rand(3)]),
     FREQUENCY_ENCODING: lambda: (rand(9, 3), 4, True),
     SPHERICAL_HARMONICS: lambda: (unit(9), 4),
+    DIRECTIONAL_ENCODING: lambda: (unit(9), 3 * torch.rand(9), 5),
     CONTRACT: lambda: (5 * torch.randn(40, 3), BOX),
     COMPOSITE: lambda: (samples(), rand(12), rand(12, 3), rand(4, 3), 5 * rand(4)),
     DISTORTION: lambda: (rand(12), samples()),

@@ -88,10 +88,6 @@ def test_commands_open_it(file: Path) -> None:
     assert frames.min() < 60
     done = called("ns-render", "orbit", file, "--up=z", "--output-path", file.parent)
     assert "an octree knows which way is up" in done.stderr
-    done = called(
-        "ns-export", "marching-cubes", file, "--output-dir", file.parent, "--resolution", 32, "--format", "ply"
-    )
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.medium

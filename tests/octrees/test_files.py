@@ -74,7 +74,7 @@ def test_damaged_and_hostile_files(tmp_path: Path) -> None:
     refused("masks", masks=good["masks"].astype(np.float64))
     refused("codes", codes=good["codes"][:-1])
     refused("colors", colors=good["colors"][:, :-1])
-    refused("codes", masks=np.zeros_like(good["masks"]))
+    refused("shape", masks=np.zeros_like(good["masks"]))
     refused("coefficients", scales=good["scales"][:5])
     refused("not finite", scales=np.full(12, np.nan, np.float32))
     refused("negative", table=-good["table"] - 1)

@@ -57,6 +57,7 @@ TINY: dict[str, dict[str, Any]] = {
         "num_proposal_samples": (24, 12),
         "num_nerf_samples": 8,
         "num_rays_per_batch": 256,
+        "sampler": "proposal",
         "transient_resolution": 4,
     },
     "nerf-w+frequency": {

@@ -4,6 +4,7 @@
 namespace {
 
 constexpr int64_t ROWS = 1024;  // rows of a chunk
+constexpr int64_t AHEAD = 8;    // rows that are fetched before they are used
 
 // By value and without aliases, so that the compiler takes whole vectors.
 template <int F>
@@ -21,6 +22,11 @@ void update_rows(float* values, float* mean, float* square, float* seen, const f
                  int64_t count, const adam::Settings& s, int threads) {
     for_ranges(threads, count, ROWS, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; i++) {
+            if (i + AHEAD < end) {
+                const int64_t later = int64_t(rows[i + AHEAD]) * F;
+                for (const float* from : {values + later, mean + later, square + later})
+                    for (int f = 0; f < F; f += 16) __builtin_prefetch(from + f);
+            }
             const float* g = grad + i * F;
             bool any = false;
             for (int f = 0; f < F; f++) any |= g[f] != 0;

@@ -8,7 +8,8 @@
 
 namespace {
 
-constexpr int64_t RAYS = 1024;  // rays of a chunk
+constexpr int64_t RAYS = 256;  // rays of a chunk, whose leaves stay in cache
+constexpr size_t AHEAD = 16;   // visits that are fetched before they are used
 constexpr int MOST = 48;        // values of a leaf: 16 harmonics of 3 channels
 
 // Leaves of floats: the optical depth of a cell's edge is exp(raw - 1), from 1 on raw itself.
@@ -22,6 +23,10 @@ struct Raw {
         return x > 1.0f ? x : low;
     }
     const float* row(int32_t leaf) const { return colors + int64_t(leaf) * values; }
+    void expect(int32_t leaf) const {
+        octree::fetch(raw + leaf);
+        if (values > 0) octree::fetch(row(leaf), values);
+    }
     float decoded(int, float sum, float) const { return sum; }
 };
 
@@ -34,6 +39,7 @@ struct Packed {
     float value(int32_t leaf) const { return table[codes[leaf]]; }
     static Floats depth(Floats x) { return x; }
     const uint8_t* row(int32_t leaf) const { return colors + int64_t(leaf) * values; }
+    void expect(int32_t leaf) const { octree::fetch(codes + leaf), octree::fetch(row(leaf), values); }
     float decoded(int value, float sum, float weight) const { return scales[value] * sum + offsets[value] * weight; }
 };
 
@@ -75,6 +81,7 @@ struct Shade {
     alignas(64) float sums[LANES][N];
     alignas(64) float through[LANES], moment[LANES], median[LANES];
 
+    void expect(int32_t leaf) const { leaves.expect(leaf); }
     void start(int lane, int64_t) {
         for (int k = 0; k < N; k++) sums[lane][k] = 0;
         through[lane] = 1, moment[lane] = 0, median[lane] = -1;
@@ -151,6 +158,7 @@ struct Record {
     std::vector<std::vector<Part>>& rays;
     int64_t first;
 
+    void expect(int32_t leaf) const { leaves.expect(leaf); }
     void start(int lane, int64_t) { met[lane].clear(), through[lane] = 1; }
     void meet(const int32_t* leaf, const float* t0, const float* t1, int32_t* ends) {
         const Step step(leaves, leaf, load(t0), load(t1), per_cell, through, limit, ends);
@@ -204,9 +212,13 @@ int64_t give_rows(const std::vector<std::vector<Visit>>& chunks, int64_t leaves,
     for_chunks(threads, shares, [&](int64_t share, int) {
         const int32_t from = int32_t(leaves * share / shares), to = int32_t(leaves * (share + 1) / shares);
         int64_t count = 0;
-        for (const auto& visits : chunks)
-            for (const Visit& v : visits)
-                if (v.leaf >= from && v.leaf < to && slots[size_t(v.leaf)] < 0) slots[size_t(v.leaf)] = 0, count++;
+        for (const auto& visits : chunks) {
+            for (size_t i = 0; i < visits.size(); i++) {
+                if (i + AHEAD < visits.size()) octree::fetch(&slots[size_t(visits[i + AHEAD].leaf)]);
+                const int32_t leaf = visits[i].leaf;
+                if (leaf >= from && leaf < to && slots[size_t(leaf)] < 0) slots[size_t(leaf)] = 0, count++;
+            }
+        }
         rows[size_t(share) + 1] = count;
     });
     for (int64_t share = 0; share < shares; share++) rows[size_t(share) + 1] += rows[size_t(share)];
@@ -289,9 +301,16 @@ EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t*
         for_chunks(threads, shares, [&](int64_t share, int) {
             const int64_t rows = touched ? *rows_used : leaves;
             const int32_t from = int32_t(rows * share / shares), to = int32_t(rows * (share + 1) / shares);
+            const auto place = [&](const Visit& v) { return touched ? slots[size_t(v.leaf)] : v.leaf; };
             for (const auto& visits : chunks) {
-                for (const Visit& v : visits) {
-                    const int32_t at = touched ? slots[size_t(v.leaf)] : v.leaf;
+                for (size_t i = 0; i < visits.size(); i++) {
+                    if (touched && i + 2 * AHEAD < visits.size()) octree::fetch(&slots[size_t(visits[i + 2 * AHEAD].leaf)]);
+                    if (i + AHEAD < visits.size()) {
+                        const int32_t later = place(visits[i + AHEAD]);
+                        if (later >= from && later < to) octree::fetch(grad_colors + int64_t(later) * values, values);
+                    }
+                    const Visit& v = visits[i];
+                    const int32_t at = place(v);
                     if (at < from || at >= to) continue;
                     grad_raw[at] += v.slope;
                     float* row = grad_colors + int64_t(at) * values;

@@ -28,8 +28,16 @@ struct Beams {  // R rays
     const float *nears, *fars;          // (R)
 };
 
+// Leaves are spread over memory: without this, a walk mostly waits.
+template <typename T>
+inline void fetch(const T* from, int count = 1) {
+    const char* bytes = reinterpret_cast<const char*>(from);
+    for (int64_t byte = 0; byte < int64_t(count * sizeof(T)); byte += 64) __builtin_prefetch(bytes + byte);
+    __builtin_prefetch(bytes + count * sizeof(T) - 1);
+}
+
 // The walk of one ray in each lane. `Light` follows what a ray has met:
-//   start(lane, ray); finish(lane, ray);
+//   start(lane, ray); finish(lane, ray); expect(leaf): it is met soon, and its values should be on their way.
 //   meet(leaf, t0, t1, ends): a step of all lanes through leaves (-1: none) from t0 to t1; sets ends for rays that end.
 template <typename Light>
 class Walk {
@@ -122,8 +130,9 @@ private:
         }
         const int bit = (x & 3) | (y & 3) << 2 | (z & 3) << 4;
         low[0][lane] = x, low[1][lane] = y, low[2][lane] = z, size[lane] = 1;
-        if (mask >> bit & 1)
-            leaf[lane] = g.firsts[int64_t(brick) * 8 + octant] + __builtin_popcountll(mask & ((uint64_t(1) << bit) - 1));
+        if (!(mask >> bit & 1)) return;
+        leaf[lane] = g.firsts[int64_t(brick) * 8 + octant] + __builtin_popcountll(mask & ((uint64_t(1) << bit) - 1));
+        light.expect(leaf[lane]);
     }
 
     static Ints whole(const int32_t* from) {

@@ -13,7 +13,6 @@ from nerfloom.base.optimised import RowChange
 from nerfloom.base.pace import Pace
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.splats.project import SplatCamera
-from nerfloom.losses.robust import RobustColors
 from nerfloom.model import Model
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.density_control import DensityControl
@@ -55,7 +54,6 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
 
     def __init__(self, config: SplattingConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
-        self.robust = None if config.robust == "off" else RobustColors(config)
         self.position_rate = config.rate_factor * config.position_rate
         self.columns = self.declared_columns()
         for name, column in self.columns.items():

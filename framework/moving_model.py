@@ -24,7 +24,7 @@ class MovingModel(RayModel[MotionConfigT], LearnsMotion, Generic[MotionConfigT],
             batch: pixels with their true colours.
             step: number of training steps done.
         """
-        if not self.scene.moving or batch.alpha is None or self.config.transparent_share == 1 or batch.patches:
+        if not self.scene.moving or batch.alpha is None or self.config.transparent_share == 1:
             return super().loss(batch, step)
         part, kept = thinned(batch, self.config.transparent_share)
         loss = super().loss(part, step)

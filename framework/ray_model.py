@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
@@ -22,7 +21,6 @@ from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError
-from nerfloom.losses.robust import RobustColors
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model
@@ -59,7 +57,6 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
-        self.robust = None if config.robust == "off" else RobustColors(config)
         self.poses: PoseRefinement | None = None
         """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
@@ -86,7 +83,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         """
         factors = {term: term.factor(self.config, step) for term in self.losses}
         terms = [term for term, factor in factors.items() if factor and term.applies(batch, self)]
-        known = self._traced(batch, step) if terms == [COLOR_ERROR] else None
+        known = self._traced(batch) if terms == [COLOR_ERROR] else None
         if known is not None:
             return Loss({COLOR_ERROR.name: known.error}, known.rgb, known.num_samples)
         rendered = self.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))
@@ -97,15 +94,13 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             values |= named if factor == 1 else {name: factor * value for name, value in named.items()}
         return Loss(values, shown.pixels.rgb.detach(), rendered.num_samples)
 
-    def _traced(self, batch: PixelBatch, step: int) -> TracedError | None:
+    def _traced(self, batch: PixelBatch) -> TracedError | None:
         """Return the mean squared error of a batch's colours if a native call can compute it; else None."""
         if not self.plain or self.poses is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
-        robust = None if self.robust is None or self.robust.waits(step) else self.robust
-        weigh = None if robust is None else partial(robust.pixel_weights, batch=batch)
-        parts, thin = (self.sampler, self.field, self.renderer), self.config.thin_gradients
-        return error_of_traced(batch.rays, pixels, *parts, thin, weigh)
+        parts = self.sampler, self.field, self.renderer
+        return error_of_traced(batch.rays, pixels, *parts, self.config.thin_gradients)
 
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
@@ -174,8 +169,6 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         for term in self.losses:
             if (reason := term.varies(self.config)) is not None:
                 return StepKind(varies=reason)
-        if self.robust is not None and self.robust.waits(step):
-            return StepKind(varies="all pixels still count")
         if not all(opening.complete for opening in parts(self, OpenLevels)):
             return StepKind(varies="levels are still opening")
         return self.sampler.step_kind(step)

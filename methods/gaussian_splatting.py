@@ -162,8 +162,6 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
         rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
         kept = None if batch.kept is None else reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
-        if self.robust is not None and not self.robust.waits(step):
-            kept = self.robust.image_pixels(rgb, target, kept)
         if kept is not None:  # other pixels have no error
             target = torch.where(kept[..., None], target, rgb.detach())
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}

@@ -110,7 +110,7 @@ class SmoothColorError(ColorError):
     def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
         if not shown.model.scene.unbounded:
             return super().error(rgb, shown)
-        return charbonnier(rgb, shown.batch.rgb, shown.weights)
+        return charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
 
 
 class MipNeRF360(RefinedModel[MipNeRF360Config], plain=True):

@@ -143,7 +143,7 @@ class DoubtedError(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor:
         pixels, batch = shown.pixels, shown.batch
         least = shown.model.config.least_uncertainty
-        return doubted_error(pixels.rgb, batch.rgb, pixels.extras[UNCERTAINTY.name], least, shown.weights)
+        return doubted_error(pixels.rgb, batch.rgb, pixels.extras[UNCERTAINTY.name], least, shown.batch.weights)
 
 
 class TransientDensity(LossTerm):

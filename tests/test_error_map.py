@@ -30,7 +30,7 @@ def test_squares_are_counted_through_images_of_unlike_sizes(dataset: Dataset) ->
         columns = -(-width // 8)
         expected += [next_square + y // 8 * columns + x // 8 for y in range(height) for x in range(width)]
         next_square += columns * -(-height // 8)
-    assert errors.squares(torch.arange(len(dataset.pixels))).tolist() == expected
+    assert errors.tiles.of(torch.arange(len(dataset.pixels))).tolist() == expected
     assert len(errors.errors) == next_square
 
 
@@ -57,7 +57,7 @@ def test_large_errors_are_drawn_more_often_as_stated(dataset: Dataset) -> None:
     torch.manual_seed(0)
     errors = ErrorMap(dataset)
     everywhere = torch.arange(len(dataset.pixels))
-    bad = errors.squares(everywhere) == 3
+    bad = errors.tiles.of(everywhere) == 3
     errors.learn(everywhere, torch.zeros(len(everywhere)))
     for _ in range(200):
         errors.learn(everywhere, bad.float())

@@ -77,8 +77,9 @@ def test_a_source_is_made_as_the_model_asks(images: Dataset) -> None:
 
 def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Dataset) -> None:
     source = PixelSource(images, "black", 0, by_error=True)
-    batch = source.draw(Request(0, 50))
-    source.learn(batch, torch.full((50,), 9.0))
+    request = Request(0, 50)
+    batch = source.draw(request)
+    source.learn(request, batch, batch.rgb + 3)
     learnt = source.state()
     assert learnt is not None
     assert len(learnt.unique()) > 1

@@ -143,11 +143,10 @@ class TrainConfig:
 
     # Values of settings that a method lacks, so that shared code need not know the class of its settings. Without
     # annotation they are no fields, and so no flags.
-    sampler, bounded_sampler, time_slices, robust = "", "occupancy", 1, "off"
-    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = False
+    sampler, bounded_sampler, time_slices, robust_factor = "", "occupancy", 1, 2.0
+    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = robust = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
-    robust_quantile, robust_steps = 0.8, 1_000
 
     def __init_subclass__(cls, **defaults: Any) -> None:
         """Change defaults of inherited settings, as in `class MyConfig(RayConfig, learning_rate=1e-2)`.
@@ -185,22 +184,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class RobustConfig(TrainConfig):
-    """Settings of a method that can leave out pixels that other images contradict."""
-
-    RANGES: ClassVar[dict[str, Range]] = {"robust_quantile": (0.05, 1), "robust_steps": (0, 1e6)}
-    """Allowed ranges."""
-    robust: Literal["off", "percentile"] = "off"
-    """Whether to learn from pixels that the other images contradict, such as people who walk through. percentile: leave
-    out regions with large errors (RobustNeRF, SpotLessSplats); off: learn from all pixels."""
-    robust_quantile: float = 0.8
-    """Share of pixels that agree with the other images for certain (percentile); fine texture and edges are added."""
-    robust_steps: int = 1_000
-    """Steps during which all pixels count, until there is a scene that images can contradict (percentile)."""
-
-
-@dataclass(frozen=True)
-class RayConfig(RobustConfig):
+class RayConfig(TrainConfig):
     """Settings of every method that casts rays."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -213,6 +197,7 @@ class RayConfig(RobustConfig):
         "free_space_loss_mult": AT_LEAST_0,
         "rays_shared_by": (0, 100),
         "thin_gradients": (0, 16),
+        "robust_factor": (1, 1e6),
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
@@ -242,6 +227,10 @@ class RayConfig(RobustConfig):
     expected gradient stays the same. 0: keep all. CPU only."""
     gradient_scaling: bool = False
     """Scale gradients near cameras down by squared distance, up to half of the box's edge, against floaters."""
+    robust: bool = False
+    """Do not learn from regions that the other images contradict, such as people who walk through."""
+    robust_factor: float = 2.0
+    """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust)."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. Affects memory and speed, not the result."""
 

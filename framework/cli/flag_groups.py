@@ -20,7 +20,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from nerfloom.base.config import AppearanceConfig, RayConfig, RobustConfig, TrainConfig
+from nerfloom.base.config import AppearanceConfig, RayConfig, TrainConfig
 from nerfloom.cli.flag_help import plain_flags
 from nerfloom.data.parsed_scene import DataParser
 from nerfloom.losses.few_images import FewImagesConfig
@@ -42,7 +42,6 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     "background": (BackgroundConfig,),
     "ray": (RayConfig,),
     "appearance": (AppearanceConfig,),
-    "robust": (RobustConfig,),
     "few images": (FewImagesConfig,),
     "motion": (MotionConfig,),
     "optimisation": (

@@ -155,6 +155,8 @@ def _finish(run: Run, trainer: Trainer) -> None:
     rungs = skip_report(trainer)
     for line in lines(rungs):
         say(line)
+    if (tiles := trainer.source.contradicted) is not None:
+        say(f"--robust: {float(tiles.share):.1%} of the images' tiles do not count, as other images contradict them")
     if isinstance(trainer.model, HasGaussians):
         say(_count(trainer.model))
     write_report(run.folder / "skip_report.json", as_plain(rungs))

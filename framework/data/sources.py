@@ -28,6 +28,7 @@ from nerfloom.data.pixels.batch import (
     known_distances,
     training_background,
 )
+from nerfloom.data.pixels.contradicted import STEPS_PER_LOOK, ContradictedTiles
 from nerfloom.data.pixels.error_map import ErrorMap
 from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.data.sparse_depth import SparseDepth
@@ -45,6 +46,8 @@ class Request:
     """Number of rays through each pixel: 1, through its centre, or another square number."""
     points: bool = True
     """Whether to draw some additional pixels with a sparse depth, if the source learns from them."""
+    progress: float = 0.0
+    """Fraction of the budget spent, 0 to 1."""
 
 
 KEYPOINTS = 1 / 8
@@ -64,6 +67,8 @@ class BatchSource(ABC):
     """The images to draw from."""
     varies: str | None = "batches are made on the host"
     """Why drawing a batch differs from step to step (`StepKind`); None if it does not."""
+    contradicted: ContradictedTiles | None = None
+    """Tiles that do not count, with `--robust`."""
 
     @abstractmethod
     def draw(self, request: Request) -> Any:
@@ -77,12 +82,13 @@ class BatchSource(ABC):
             dataset: the same images, with a different selection of pixels to draw.
         """
 
-    def learn(self, batch: Any, squared_errors: Tensor) -> None:  # noqa: B027, most have nothing to learn
+    def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:  # noqa: B027, most have nothing to learn
         """Record the errors of a rendered batch.
 
         Args:
+            request: the step's request.
             batch: the batch, from `draw`.
-            squared_errors: squared error of each pixel, averaged over channels, with the shape of the batch's pixels.
+            rgb: rendered colours, with the shape of `batch.rgb`.
         """
 
     def state(self) -> Tensor | None:
@@ -108,7 +114,7 @@ class PixelSource(BatchSource):
         keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
         clear: (M,) distances from cameras that images show to be empty; None if they are not used.
         num_images: number of images that the pixels of a step come from; None for all.
-        patches_from: step from which on pixels come in square patches; None for single pixels.
+        contradicted: tiles that do not count; None if all do.
     """
 
     def __init__(
@@ -120,9 +126,9 @@ class PixelSource(BatchSource):
         keypoints: float = 0.0,
         clear: Tensor | None = None,
         num_images: int | None = None,
-        patches_from: int | None = None,
+        contradicted: ContradictedTiles | None = None,
     ) -> None:
-        self.clear, self.num_images, self.patches_from = clear, num_images, patches_from
+        self.clear, self.num_images, self.contradicted = clear, num_images, contradicted
         self.dataset, self.background, self.seed = dataset, background, seed
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.errors = ErrorMap(dataset) if by_error else None
@@ -136,26 +142,19 @@ class PixelSource(BatchSource):
         look_up, count = self._look_up(request.step), request.num_pixels
         keypoints = round(self.keypoints * count) if request.points else 0
         batch = draw_batch(
-            self.dataset,
-            count,
-            self.background,
-            self.errors,
-            offsets,
-            look_up,
-            keypoints,
-            self.num_images,
-            self._in_patches(request.step),
+            self.dataset, count, self.background, self.errors, offsets, look_up, keypoints, self.num_images
         )
+        if self.contradicted is not None:
+            counting = self.contradicted.counting(batch.pixels)
+            weights = counting if batch.weights is None else counting * batch.weights
+            batch = replace(batch, weights=weights)
         if self.clear is None or batch.rays.camera_indices is None:
             return batch
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
 
-    def _in_patches(self, step: int) -> bool:
-        return self.patches_from is not None and step >= self.patches_from
-
     def _look_up(self, step: int) -> LookUp | None:
         """Return the function that looks up a step's colours read ahead from a file; None if none are."""
-        if self.dataset.mapped is None or self.num_images is not None or self._in_patches(step):
+        if self.dataset.mapped is None or self.num_images is not None:
             return None
         self.stream = self.stream or PixelStream(self.dataset, self.seed)
         return partial(self.stream.look_up, step)
@@ -168,21 +167,31 @@ class PixelSource(BatchSource):
             keypoints=self.keypoints,
             clear=self.clear,
             num_images=self.num_images,
-            patches_from=self.patches_from,
+            contradicted=self.contradicted,
         )
         source.errors = self.errors
         return source
 
-    def learn(self, batch: PixelBatch, squared_errors: Tensor) -> None:
+    def learn(self, request: Request, batch: PixelBatch, rgb: Tensor) -> None:
         if self.errors is not None:
-            self.errors.learn(batch.pixels, squared_errors)
+            self.errors.learn(batch.pixels, (rgb - batch.rgb).square().mean(-1))
+        if self.contradicted is not None:
+            self.contradicted.learn(batch.pixels, rgb - batch.rgb)
+            if request.step % STEPS_PER_LOOK == 0:
+                self.contradicted.decide(request.progress)
 
-    def state(self) -> Tensor | None:
+    @property
+    def _learnt(self) -> Tensor | None:
+        if self.contradicted is not None:
+            return self.contradicted.state
         return None if self.errors is None else self.errors.errors
 
+    def state(self) -> Tensor | None:
+        return self._learnt
+
     def restore(self, state: Tensor | None) -> None:
-        if self.errors is not None and state is not None:
-            self.errors.errors.copy_(state)
+        if self._learnt is not None and state is not None:
+            self._learnt.copy_(state)
 
 
 class ViewSource(BatchSource):
@@ -269,7 +278,9 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
-    by_error, patches_from = config.draw_by_error, None if config.robust == "off" else config.robust_steps
-    if patches_from is not None and by_error:
+    contradicted = ContradictedTiles(dataset, config.robust_factor) if config.robust else None
+    if contradicted is not None and config.draw_by_error:
         raise ConfigError("--draw-by-error prefers large errors, and --robust leaves them out: choose one of them")
-    return PixelSource(dataset, background, config.machine.seed, by_error, keypoints, clear, num_images, patches_from)
+    return PixelSource(
+        dataset, background, config.machine.seed, config.draw_by_error, keypoints, clear, num_images, contradicted
+    )

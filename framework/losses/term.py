@@ -34,14 +34,6 @@ class RenderedBatch:
         """The P pixels as rendered."""
         return self.rendered.to_pixels(self.batch.rays_per_pixel, self.model.outputs)
 
-    @cached_property
-    def weights(self) -> Tensor | None:
-        """Factors (P,) of the pixels' colour errors: the batch's, and 0 for pixels that a robust loss leaves out."""
-        batch, robust = self.batch, self.model.robust
-        if robust is None or robust.waits(self.step):
-            return batch.weights
-        return robust.pixel_weights(self.pixels.rgb, batch)
-
 
 class LossTerm(ABC):
     """One term of the objective of a method that casts rays.

@@ -56,7 +56,7 @@ class ColorError(LossTerm):
             rgb: (P, 3) rendered colours.
             shown: the rendered batch, with true colours and pixel weights.
         """
-        return mean_squared_error(rgb, shown.batch.rgb, shown.weights)
+        return mean_squared_error(rgb, shown.batch.rgb, shown.batch.weights)
 
 
 class CoarseColorError(ColorError):

@@ -1,4 +1,4 @@
-"""Masks of what moves: a short training with the robust loss finds what other images contradict."""
+"""Masks of what moves: a short training with `--robust` finds what other images contradict."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
 from PIL import Image
-from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
 
 from nerfloom.base.config import from_plain
-from nerfloom.base.console import say, track
-from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.losses.robust import error_counts, error_quantile, image_inliers, window_side
-from nerfloom.model import Model
+from nerfloom.base.console import say
+from nerfloom.data.dataset import load_dataset
 from nerfloom.processing import transforms
 from nerfloom.processing.images import save
 from nerfloom.processing.output import FINISHED
@@ -26,46 +21,10 @@ from nerfloom.training.trainer import Trainer
 
 METHOD = "nerfacto"
 """The method that looks for what moves."""
-SETTINGS: dict[str, Any] = {"max_num_iterations": None, "robust": "percentile", "vis": "none"}
-"""Its settings."""
+SETTINGS: dict[str, Any] = {"max_num_iterations": None, "robust": True, "gradient_scaling": True, "vis": "none"}
+"""Its settings. Without scaled gradients people become fog before their camera, which nothing contradicts."""
 LONGER_SIDE = 400
 """Longer side of the images that it learns from, pixels, at least; images are reduced by 2, 4 or 8."""
-
-
-def moving(errors: Tensor, threshold: Tensor) -> Tensor:
-    """Return the regions of an image that show something that moves.
-
-    These are the pixels that `image_inliers` leaves out, without what is thinner or smaller than half of one of its
-    windows, and a quarter of a window larger on each side, for shadows and blurred edges.
-
-    Args:
-        errors: (H, W) squared errors of a trained model.
-        threshold: () error below which a pixel agrees with the other images.
-
-    Returns:
-        (H, W) bool.
-    """
-    contradicted = (~image_inliers(errors, threshold)).float()[None, None]
-    window = window_side(max(errors.shape))
-    size, border = window // 2 + 1, window // 4
-    core = (avg_pool2d(contradicted, size, 1, border, count_include_pad=False) > 0.5) & (contradicted > 0)
-    return max_pool2d(core.float(), 2 * border + 1, 1, border)[0, 0] > 0
-
-
-def found_masks(model: Model[Any], dataset: Dataset, quantile: float) -> list[Tensor]:
-    """Return what moves in each training image of a model, M masks (H, W) bool.
-
-    Args:
-        model: a model trained with the robust loss.
-        dataset: M training images.
-        quantile: share of all pixels that agree with the other images for certain.
-    """
-    errors = []
-    for index in track(range(len(dataset)), "Looking for what moves", total=len(dataset)):
-        rgb = model.render_rgb(dataset.view(index), model.background)
-        errors.append((rgb - dataset.image(index)[..., :3].float() / 255).square().mean(-1))
-    threshold = error_quantile(torch.stack([error_counts(each) for each in errors]).sum(0), quantile)
-    return [moving(each, threshold) for each in errors]
 
 
 def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
@@ -92,18 +51,20 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     with ProgressBar(f"{METHOD}, to find what moves") as bar:
         for report in trainer.steps():
             bar.show(report)
-    masks, names, share = found_masks(trainer.model, trainer.train_set, config.robust_quantile), [], 0.0
-    for mask, path in zip(masks, parsed.image_paths, strict=True):
+    tiles, cameras, names, share = trainer.source.contradicted, trainer.train_set.cameras, [], 0.0
+    assert tiles is not None
+    for index, path in enumerate(parsed.image_paths):
+        counting = tiles.counting(cameras.image_pixels(index)).view(cameras.sizes[index][0], -1)
         name = Path(*path.relative_to(output).parts[1:]).as_posix()
         with Image.open(output / "images" / name) as image:
             size = image.size
-        grey = Image.fromarray(((~mask).cpu().numpy() * 255).astype("uint8"))
+        grey = Image.fromarray((counting.cpu().numpy() * 255).astype("uint8"))
         target = output / "masks" / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         save(grey.resize(size, Image.Resampling.NEAREST), target)
         frames[name]["mask_path"] = f"masks/{name}.png"
         names.append(f"{name}.png")
-        share += float(mask.float().mean()) / len(masks)
+        share += float(1 - counting.mean()) / len(parsed.image_paths)
     write_pyramid(output / "masks", names, num_downscales, masks=True)
     transforms.write(output / FINISHED, content)
     say(f"masks leave out {share:.1%} of all pixels; look at {output / 'masks'} before you train with them")

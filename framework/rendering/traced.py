@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -20,13 +18,7 @@ from nerfloom.samplers.occupancy import OccupancySampler
 
 
 def error_of_traced(
-    rays: Rays,
-    pixels: PixelTargets,
-    sampler: Sampler,
-    field: Field,
-    renderer: Renderer,
-    thin: float = 0.0,
-    weigh: Callable[[Tensor], Tensor] | None = None,
+    rays: Rays, pixels: PixelTargets, sampler: Sampler, field: Field, renderer: Renderer, thin: float = 0.0
 ) -> TracedError | None:
     """Return the mean squared error of pixels in training mode, computed by `traced_error`.
 
@@ -37,8 +29,6 @@ def error_of_traced(
         field: density and colour.
         renderer: turns samples into colours.
         thin: as in `traced_error`.
-        weigh: function from the pixels' colours (P, 3) to their weights (P,), if the weights depend on the colours; the
-            rays are then rendered once before.
 
     Returns:
         None if there are no rays, or if a part overrides the basic computation.
@@ -48,12 +38,7 @@ def error_of_traced(
     parts = _plain(rays, sampler, field, renderer)
     if parts is None or (isinstance(renderer, VolumeRenderer) and renderer.unit_length is not None):
         return None
-    stop = sampler.train_early_stop
-    if weigh is not None:
-        with torch.no_grad():
-            shown = traced_colors(sampler.begin(rays, True, stop), *parts, pixels.background)
-        pixels = pixels._replace(weights=weigh(shown.color.view(len(pixels.target), -1, 3).mean(1)))
-    return traced_error(sampler.begin(rays, True, stop), *parts, pixels, thin)
+    return traced_error(sampler.begin(rays, True, sampler.train_early_stop), *parts, pixels, thin)
 
 
 def traced_rays(rays: Rays, background: Tensor, sampler: Sampler, field: Field, renderer: Renderer) -> Rendered | None:

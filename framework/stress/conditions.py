@@ -29,8 +29,8 @@ If test views are easier than the plain ones (all white, black or transparent), 
 degrees), the maximum is `MAX_LOSS`.
 """
 
-DISTRACTED, ROBUST_STEPS = 0.1, 100
-"""Share of pixels that distractors cover, and `robust_steps` of such a short run."""
+DISTRACTED = 0.1
+"""Share of pixels that distractors cover."""
 A_THIRD = "a third of the steps teach nothing, as they should"
 
 Change = Callable[[Views], Views]
@@ -121,9 +121,8 @@ CONDITIONS = (
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
     Condition(
         "distractors",
-        "discs at other places in each training photograph, 10 % of its pixels, and the robust loss",
+        "discs at other places in each training photograph, 10 % of its pixels",
         _train(lambda d: with_distractors(d, DISTRACTED)),
-        _fixed(robust="percentile", robust_steps=ROBUST_STEPS),
         reason="a dozen small photographs: what a disc hides is seen in few others",
         may_refuse=True,
     ),

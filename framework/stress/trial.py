@@ -88,8 +88,8 @@ class StressedSource(BatchSource):
     def drawing_from(self, dataset: Dataset) -> StressedSource:
         return StressedSource(self.source.drawing_from(dataset), self.condition)
 
-    def learn(self, batch: Any, squared_errors: Tensor) -> None:
-        self.source.learn(batch, squared_errors)
+    def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:
+        self.source.learn(request, batch, rgb)
 
 
 def attempt(condition: Condition, run: Run, views: Views, budget: Budget) -> Trial:

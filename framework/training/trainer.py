@@ -285,8 +285,9 @@ class Trainer:
         state, start = self.state, time.perf_counter()
         if self.config.max_seconds is not None and processes().count == 1:  # several must take equal steps
             self._keep_pace(Pace(state.step, state.seconds, self.config.max_seconds, self.steps_per_read))
-        batch, result = self._drawn_and_taken()
-        self.source.learn(batch, result.squared_errors)
+        request = self._request()
+        batch, result = self._drawn_and_taken(request)
+        self.source.learn(request, batch, result.loss.rgb)
         weights = getattr(batch, "weights", None)
         mse = (result.squared_errors if weights is None else result.squared_errors * weights).mean()
         finite = result.finite if isinstance(result.finite, Tensor) else torch.full_like(mse, result.finite)
@@ -319,9 +320,9 @@ class Trainer:
         if self.batch_size is not None:
             self.batch_size.keep_pace(pace)
 
-    def _drawn_and_taken(self) -> tuple[Any, StepResult]:
+    def _drawn_and_taken(self, request: Request) -> tuple[Any, StepResult]:
         """Return a batch and the result of a step on it. The next step overwrites both."""
-        model, source, optimizer, request = self.model, self.source, self.optimizer, self._request()
+        model, source, optimizer = self.model, self.source, self.optimizer
         step, progress, seed, rank = self.state.step, self.progress, self.config.machine.seed, processes().rank
         if self.graphs is None:
             seed_step(seed, step, rank)
@@ -346,13 +347,13 @@ class Trainer:
         """Return the request for the next batch: at first one ray per pixel, later the rendering's number."""
         state = self.state
         if self.batch_size is None:
-            return Request(state.step, 0)
+            return Request(state.step, 0, progress=self.progress)
         config = self.batch_size.config
         late = self.progress >= config.train_rays_per_pixel_from
         rays_per_pixel = config.rays_per_pixel if late else 1
         rays = self.batch_size.rays(self.model.samples_per_step, state.samples_per_ray)
         points = self.train_set.sparse_depth is not None and self.progress < POINTS_UNTIL
-        return Request(state.step, max(rays // rays_per_pixel, 1), rays_per_pixel, points)
+        return Request(state.step, max(rays // rays_per_pixel, 1), rays_per_pixel, points, self.progress)
 
     def _count_bad(self, step: int, finite: bool) -> None:
         """Count dropped steps; raise DivergenceError after too many in a row."""

@@ -78,7 +78,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert list(found) == [
         "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
         *["background options"] * (method in WITH_BACKGROUND), "ray options",
-        *["appearance options"] * (method in ("nerf-w", "nerfacto", "neus", "volsdf", "zip-nerf")), "robust options",
+        *["appearance options"] * (method in ("nerf-w", "nerfacto", "neus", "volsdf", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
         "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",

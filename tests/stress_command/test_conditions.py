@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfloom.base.config import RobustConfig, from_plain
+from nerfloom.base.config import from_plain
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.stress import USAGE
 from nerfloom.data.sources import make_source
@@ -78,10 +78,6 @@ def test_each_has_settings_that_are_accepted_or_refused(condition: Condition) ->
         assert changed.mixed_precision is False
     elif condition.name == "1-ray":
         assert replace(changed, train_rays_per_pixel_from=config.train_rays_per_pixel_from) == config
-    elif condition.name == "distractors":
-        assert isinstance(changed, RobustConfig)
-        assert changed.robust == "percentile"
-        assert replace(changed, robust="off", robust_steps=config.robust_steps) == config
     elif condition.name == "another-seed":
         assert changed.machine.seed == config.machine.seed + 1
         assert replace(changed, machine=config.machine) == config

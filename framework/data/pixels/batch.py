@@ -14,7 +14,6 @@ from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.depths import ray_distances
 from nerfloom.data.pixels.error_map import ErrorMap
-from nerfloom.data.pixels.patches import PATCH, patch_stride, patches_around
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.argument_checks import check_indices
@@ -49,20 +48,18 @@ class PixelBatch:
     """(R,) distance from the camera that the pixel's image shows to be empty; None if unknown."""
     weights: Tensor | None = None
     """(R,) factors of the pixels' losses, with mean 1, if pixels were not drawn uniformly or differ in size."""
-    patches: int = 0
-    """Number of patches of PATCH x PATCH pixels, which come first, row by row; the other pixels are single ones."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
 
     def __getitem__(self, chosen: Tensor) -> PixelBatch:
-        """Return the pixels of a mask (R,) bool, or of indices (Q,) int64, with their rays, as single ones."""
+        """Return the pixels of a mask (R,) bool, or of indices (Q,) int64, with their rays."""
         index = chosen.nonzero().squeeze(-1) if chosen.dtype is torch.bool else chosen
-        of_pixels = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("rays", "patches")}
+        of_pixels = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "rays"}
         some: dict[str, Any] = {name: value[index] for name, value in of_pixels.items() if value is not None}
         per_pixel = self.rays_per_pixel
         rays = (index[:, None] * per_pixel + torch.arange(per_pixel, device=index.device)).view(-1)
-        return replace(self, rays=self.rays[rays], patches=0, **some)
+        return replace(self, rays=self.rays[rays], **some)
 
     @property
     def rays_per_pixel(self) -> int:
@@ -179,7 +176,6 @@ def draw_batch(
     look_up: LookUp | None = None,
     keypoints: int = 0,
     num_images: int | None = None,
-    patches: bool = False,
 ) -> PixelBatch:
     """Draw a batch of pixels.
 
@@ -196,18 +192,12 @@ def draw_batch(
             drawing (`PixelStream.look_up`).
         keypoints: number of pixels drawn from `dataset.sparse_depth`; they are the last ones.
         num_images: number of images that the other pixels come from; None for all.
-        patches: whether the other pixels are patches around drawn ones; their number is rounded to whole patches, at
-            least one, and pixels that masks leave out have a weight of 0. Not with `errors` and `look_up`.
     """
     uniform, sparse = count - keypoints, dataset.sparse_depth
-    num_patches = max(round(uniform / PATCH**2), 1) if patches else 0
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
-    drawn = num_patches if patches else uniform if errors is None else 2 * uniform
+    drawn = uniform if errors is None else 2 * uniform
     flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
     stored = None
-    if patches:
-        flat = patches_around(flat, dataset.cameras, patch_stride(dataset.scene.image_size))
-        uniform, count = len(flat), len(flat) + keypoints
     if not dataset.resident:
         stored = dataset.stored(flat) if look_up is None else look_up(flat).to(dataset.device)
         flat = flat.to(dataset.device)
@@ -227,12 +217,9 @@ def draw_batch(
             torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)
         )
         batch = replace(batch, distances=distances, deviations=deviations)
-    if patches and dataset.kept is not None:
-        kept = dataset.kept.contains(batch.pixels).float()
-        weights = kept / kept.mean().clamp(min=1 / count)
     if weights is not None and batch.weights is not None:
         weights = weights * batch.weights
-    return replace(batch, weights=batch.weights if weights is None else weights, patches=num_patches)
+    return replace(batch, weights=batch.weights if weights is None else weights)
 
 
 def gather_batch(

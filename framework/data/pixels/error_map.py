@@ -7,6 +7,7 @@ from torch import Tensor
 
 from nerfloom.base.device import to_float64
 from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels.tiles import Tiles
 
 TILE = 8
 """Side of the square tiles that share one error, pixels."""
@@ -24,22 +25,9 @@ class ErrorMap:
     """
 
     def __init__(self, dataset: Dataset) -> None:
-        self.dataset = dataset
-        cameras = dataset.cameras
-        self.columns = (cameras.widths + TILE - 1) // TILE
-        """(M,) number of tiles in a row of each image."""
-        counts = self.columns * ((cameras.heights + TILE - 1) // TILE)
-        self.first = counts.cumsum(0) - counts
-        """(M,) index of each image's first tile."""
-        self.errors = torch.ones(int(counts.sum()), device=dataset.device)
+        self.tiles = Tiles(dataset.cameras, TILE)
+        self.errors = torch.ones(self.tiles.total, device=dataset.device)
         """(T,) mean over a pixel's channels; tiles without a sample have 1, the maximum."""
-
-    def squares(self, pixels: Tensor) -> Tensor:
-        """Return the index of the tile of each of the `pixels` (R,), counted over all images."""
-        dataset = self.dataset
-        images = torch.searchsorted(dataset.cameras.offsets, pixels, right=True) - 1
-        within, widths = pixels - dataset.cameras.offsets[images], dataset.cameras.widths[images]
-        return self.first[images] + within // widths // TILE * self.columns[images] + within % widths // TILE
 
     def draw(self, candidates: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Return `count` of the `candidates` (M,) and their loss weights (count,), selected by `choose`."""
@@ -60,7 +48,7 @@ class ErrorMap:
         Returns:
             Indices of the selected candidates (count,), and weights (count,), at most 1 / EVENLY.
         """
-        errors = self.errors[self.squares(candidates)]
+        errors = self.errors[self.tiles.of(candidates)]
         share = EVENLY + (1 - EVENLY) * errors / errors.mean().clamp(min=1e-12)
         ends = to_float64(share).cumsum(0) * (count / len(candidates))
         positions = torch.arange(count, device=ends.device) + torch.rand_like(ends[0])
@@ -69,7 +57,7 @@ class ErrorMap:
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:
         """Update the tiles of `pixels` (R,) with their squared `errors` (R,); non-finite errors are ignored."""
-        finite, squares = torch.isfinite(errors), self.squares(pixels)
+        finite, squares = torch.isfinite(errors), self.tiles.of(pixels)
         sums, counts = torch.zeros_like(self.errors), torch.zeros_like(self.errors)
         sums.index_add_(0, squares, torch.where(finite, errors, 0))
         counts.index_add_(0, squares, finite.to(errors))

@@ -120,7 +120,7 @@ class MeasurePanel:
         scene.add_line_segments(
             f"{ROOM}/line", line, np.array(COLOR, np.uint8), thickness=3.0, thickness_units="screen"
         )
-        scene.add_label(f"{ROOM}/length", length, position=tuple(ends.mean(0).tolist()))
+        scene.add_label(f"{ROOM}/length", length.partition(" (")[0], position=tuple(ends.mean(0).tolist()))
         self._tell(f"**{length}**")
 
     def _set_scale(self) -> None:

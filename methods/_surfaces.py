@@ -107,7 +107,7 @@ class SurfaceConfig(
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
-    """Fraction of the budget from which on that change has a weight: a surface has to find its place first."""
+    """Fraction of the budget after which that change has a weight: a surface has to find its place first."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""

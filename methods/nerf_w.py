@@ -1,9 +1,9 @@
 """NeRF in the Wild: light that differs between photographs, and people and things that are in one of them only.
 
 Martin-Brualla et al., "NeRF in the Wild: Neural Radiance Fields for Unconstrained Photo Collections", CVPR 2021. Each
-training image has an appearance vector, an input of the static colours, and a transient vector, from which a second
-head makes density, colour and uncertainty that exist in that image alone. Where an image disagrees with the others,
-to say so costs less than to change the scene. Views that are no training images show the static part alone.
+training image has an appearance vector, an input of the static colours, and a transient vector. A second head turns
+the latter into density, colour and uncertainty that exist in that image alone. Where an image disagrees with the
+others, to say so costs less than to change the scene. Views that are no training images show the static part alone.
 """
 
 from __future__ import annotations

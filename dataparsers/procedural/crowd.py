@@ -26,7 +26,7 @@ NUM_PEOPLE, NUM_THINGS = 8, 4
 PROBE = (64, 64)
 """Size of the images in which coverage is measured while placing, pixels."""
 _TRIES = 300  # of placing one more in an image
-_SLACK = 0.015  # by which the coverage of an image may differ from what is wanted; the next images make up for it
+_SLACK = 0.015  # largest difference of an image's coverage from the wanted one; the next images make up for it
 _NEAREST, _FURTHEST = 0.9, 6.0  # distance from the camera
 _PLINTH, _STEP = 1.15, 0.16  # radius and height of the plinth, on which people stand too
 _SKIN, _HAIR = (0.62, 0.40, 0.28), (0.06, 0.045, 0.035)

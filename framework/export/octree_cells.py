@@ -1,4 +1,4 @@
-"""The cells of a grid in which a trained model has matter, found octant by octant, so memory grows with surfaces."""
+"""The cells where a trained model has matter, found octant by octant, so memory grows with surfaces."""
 
 from __future__ import annotations
 

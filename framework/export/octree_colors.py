@@ -19,7 +19,7 @@ from nerfloom.kernels.octree.weights import raise_weights
 from nerfloom.ray_model import RayModel
 
 MAX_VIEWS = 48
-"""Maximum number of cameras from which colours are fitted."""
+"""Maximum number of cameras to fit colours from."""
 DIRECTIONS = {0: 4, 1: 8, 2: 14, 3: 24}
 """Number of directions in which a leaf's colour is evaluated, by the degree of its harmonics."""
 RIDGE = 0.03

@@ -1,4 +1,4 @@
-"""A job: commands that run one after the other and leave files, by which others see that it is finished."""
+"""A job: commands that run one after the other. The files that they leave show whether it is finished."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The gradient of an octree's leaves, of which a step sees few."""
+"""The gradient of an octree's leaves; a step sees few of them."""
 
 from __future__ import annotations
 

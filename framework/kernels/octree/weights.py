@@ -1,4 +1,4 @@
-"""The largest weight of each leaf of an octree, by which leaves that no image shows are known."""
+"""The largest weight of each leaf of an octree; it is 0 for leaves that no image shows."""
 
 from __future__ import annotations
 

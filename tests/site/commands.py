@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import nerfloom.training.load  # noqa: F401  modules that name find_data must have the true one, if a check comes first
 from nerfloom.registry import load_dataparser, registered
 from nerfloom.training.run import Run
 from tests.site.pages import ROOT

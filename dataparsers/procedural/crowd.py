@@ -24,11 +24,11 @@ from nerfloom.dataparsers.procedural.views import visible_parts
 NUM_PEOPLE, NUM_THINGS = 8, 4
 """Number of people and of things that appear in the images of a data set."""
 PROBE = (64, 64)
-"""Size of the images in which coverage is measured while placing, pixels."""
+"""Size of the images that measure coverage while placing, pixels."""
 _TRIES = 300  # of placing one more in an image
 _SLACK = 0.015  # largest difference of an image's coverage from the wanted one; the next images make up for it
 _NEAREST, _FURTHEST = 0.9, 6.0  # distance from the camera
-_PLINTH, _STEP = 1.15, 0.16  # radius and height of the plinth, on which people stand too
+_PLINTH, _STEP = 1.15, 0.16  # radius and height of the plinth; people stand on it too
 _SKIN, _HAIR = (0.62, 0.40, 0.28), (0.06, 0.045, 0.035)
 
 

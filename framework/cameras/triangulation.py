@@ -1,4 +1,4 @@
-"""Covariance of triangulation: the error with which cameras locate a point, and that of a length between two points.
+"""Covariance of triangulation: how well cameras locate a point, and the error of a length between two points.
 
 A camera that sees a point at a pixel with an error of sigma pixels knows the point up to J dx = sigma, where J is the
 derivative of its projection. N cameras with independent errors know it with the covariance

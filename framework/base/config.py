@@ -314,19 +314,28 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
         if dataclasses.is_dataclass(current) and isinstance(value, dict):
             changes[key] = from_plain(current, value, f"{where}: {key}")
         else:
-            changes[key] = _convert(value, hints[key], f"{where}: '{key}'")
+            changes[key] = converted(value, hints[key], f"{where}: '{key}'")
     return dataclasses.replace(default, **changes)  # type: ignore[type-var]
 
 
-def _convert(value: Any, hint: Any, where: str) -> Any:
-    """Convert a plain value to the type `hint`."""
+def converted(value: Any, hint: Any, where: str) -> Any:
+    """Convert a plain value, such as one read from YAML, to an annotated type.
+
+    Args:
+        value: the value.
+        hint: the type: a class, `Path`, or a union, `Literal` or tuple of types.
+        where: name of the value in error messages.
+
+    Raises:
+        ConfigError: if the value is not of this type.
+    """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
         if Literal["auto"] in arguments and (value == AUTO or value is None):  # null in files of older runs
             return AUTO
-        return _convert(value, next(a for a in arguments if a not in (type(None), Literal["auto"])), where)
+        return converted(value, next(a for a in arguments if a not in (type(None), Literal["auto"])), where)
     if origin is Literal:
         if value in arguments:
             return value
@@ -334,7 +343,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if origin is tuple and isinstance(value, (list, tuple)):
         inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
         if len(inner) == len(value):
-            return tuple(_convert(item, kind, where) for item, kind in zip(value, inner, strict=True))
+            return tuple(converted(item, kind, where) for item, kind in zip(value, inner, strict=True))
     if hint is Path and isinstance(value, str) and "\0" not in value:
         return Path(value)
     if hint is float and isinstance(value, (str, int, float)) and not isinstance(value, bool):

@@ -217,13 +217,9 @@ def _occupancy(flags: OccupancyFlags, loaded: Loaded, path: Path) -> None:
 def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
-    from nerfloom.cameras.scale import write_scale
-    from nerfloom.data.offsets import write_offset
     from nerfloom.export.run_page import moment_of
-    from nerfloom.geometry.local_origin import local_origin
-    from nerfloom.splats.files import write_gaussians
     from nerfloom.splats.gaussians import HasGaussians
-    from nerfloom.splats.transform import transformed
+    from nerfloom.splats.placed_files import in_input, write_placed
 
     if not isinstance(loaded.model, HasGaussians):
         raise ConfigError(
@@ -236,14 +232,10 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
         raise ConfigError("this run has no Gaussians left; train it again")
-    # Programs read float32 from these files.
-    origin = local_origin(loaded.placement.original_points(good.means), good.typical_size / loaded.placement.scale)
-    about, look = loaded.placement if origin is None else loaded.placement.about(origin), loaded.model.look()
-    for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes, look):
-        say(cost)
-    if sentence := write_offset(path, origin):
+    look = loaded.model.look()
+    placed = in_input(good, loaded.placement)
+    for sentence in write_placed(path, placed, look, loaded.scale, flags.max_megabytes):
         say(sentence)
-    write_scale(path, loaded.scale)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, DataError, FlagError, nearest, shown
+from nerfloom.base.errors import ConfigError, FlagError, shown
 from nerfloom.cli.common import run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.run_flags import OPENS, RunFlags
@@ -15,7 +15,6 @@ from nerfloom.cli.run_flags import OPENS, RunFlags
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nerfloom.cameras.view import View
     from nerfloom.training.loaded import Loaded
 
 
@@ -80,7 +79,7 @@ def _points(flags: MeasureFlags, loaded: Loaded, words: tuple[str, str]) -> list
     numbers = [_numbers(word, 3 if flags.image is None else 2) for word in words]
     if flags.image is None:
         return [torch.tensor(each, dtype=torch.float64) for each in numbers]
-    view = _photograph(loaded, flags.image)
+    view = loaded.photograph(flags.image)
     found = [loaded.pick(view, column, row) for column, row in numbers]
     for word, point in zip(words, found, strict=True):
         say(f"{word} of {flags.image}: {','.join(f'{value:.6g}' for value in point.tolist())}")
@@ -99,26 +98,6 @@ def _numbers(word: str, count: int) -> list[float]:
         )
         raise FlagError(f"a point is {shown(word)}; it must be {what}")
     return found
-
-
-def _photograph(loaded: Loaded, name: str) -> View:
-    """Return the view of the photograph with a file name."""
-    from nerfloom.cameras.view import View
-    from nerfloom.export.cameras import SPLITS
-
-    known: list[str] = []
-    for split in SPLITS:
-        try:
-            parsed = loaded.run.parse(split)
-        except DataError:
-            if split == "train":
-                raise
-            continue
-        names = [path.name for path in parsed.image_paths]
-        if name in names:
-            return View.of(parsed.cameras.to(loaded.model.device), names.index(name), parsed.times)
-        known += names
-    raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ OPENS = "RUN_FOLDER or FILE"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFlags:
-    """The trained run, the file of Gaussians, or the octree."""
+class OpenFlags:
+    """The trained run or file, and the device that opens it."""
 
     load_config: Path
     """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
@@ -26,13 +26,8 @@ class RunFlags:
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None
     """Folder of the data, if it has moved since training; optional data for a file."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
-    eval_rendering: Literal["volume", "surface"] | None = None
-    """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
-    the surface. Default: the run's setting."""
 
     def check(self) -> Path:
         """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
@@ -41,6 +36,17 @@ class RunFlags:
             ConfigError, CheckpointError, DataError: if something is missing.
         """
         return trained_run(self.load_config, self.load_checkpoint, self.data)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags(OpenFlags):
+    """The trained run, the file of Gaussians, or the octree, and how it is shown."""
+
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
+    eval_rendering: Literal["volume", "surface"] | None = None
+    """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
+    the surface. Default: the run's setting."""
 
     def load(self, found: Path, **others: Any) -> Loaded:
         """Load the run or the file that `check` has found.

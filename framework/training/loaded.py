@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.errors import ConfigError, DataError, nearest
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
@@ -101,6 +101,30 @@ class Loaded:
         """Return a view for each image of `split`: train, val or test."""
         dataset = self.dataset(split)
         return [dataset.view(index) for index in range(len(dataset))]
+
+    def photograph(self, name: str) -> View:
+        """Return the view of a photograph, of any split. Photographs are not decoded.
+
+        Args:
+            name: its file name, without folders.
+
+        Raises:
+            ConfigError: if no photograph has this name, or for Gaussians without data.
+            DataError: if the data cannot be read.
+        """
+        known: list[str] = []
+        for split in get_args(Split):
+            try:
+                parsed = self.run.parse(split)
+            except DataError:
+                if split == "train":
+                    raise
+                continue
+            names = [path.name for path in parsed.image_paths]
+            if name in names:
+                return View.of(parsed.cameras.to(self.model.device), names.index(name), parsed.times)
+            known += names
+        raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
 
     def render(self, camera: View | Cameras, time: float | None = None) -> Picture:
         """Render an image, with colour, depth and opacity.

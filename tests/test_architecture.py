@@ -160,6 +160,7 @@ LAYERS = (
     ("training",),
     ("viewer",),
     ("export",),
+    ("edit",),
     ("processing", "comparison", "downloads", "stress", "testing", "integrations", "benchmarks"),
     ("cli",),
     ("runs",),
@@ -202,7 +203,7 @@ def test_nothing_is_at_the_root_of_the_framework_but_what_joins_the_rooms() -> N
     assert found - rooms <= {"__init__", "py", "templates"}
 
 
-FRONTS = ("nerfloom", "nerfloom.testing")
+FRONTS = ("nerfloom", "nerfloom.edit", "nerfloom.testing")
 """Packages that gather names from elsewhere, for notebooks and authors of plugins."""
 
 

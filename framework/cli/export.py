@@ -13,6 +13,7 @@ from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format
 from nerfloom.cli.export_flags import ExportFlags
 from nerfloom.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
 from nerfloom.cli.flags import read_flags
+from nerfloom.cli.region_flags import RegionFlags
 from nerfloom.cli.run_flags import OPENS
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ has set.
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointFlags(ExportFlags):
+class PointFlags(RegionFlags, ExportFlags):
     """Write point_cloud.ply: points at the median depth of random training rays."""
 
     num_points: int = 1_000_000
@@ -75,7 +76,7 @@ class OccupancyFlags(ExportFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatFlags(ExportFlags):
+class SplatFlags(RegionFlags, ExportFlags):
     """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
     format: Literal["ply", "spz"] = "ply"
@@ -87,7 +88,7 @@ class SplatFlags(ExportFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WebFlags(ExportFlags):
+class WebFlags(RegionFlags, ExportFlags):
     """Write scene.html: a page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field."""
 
     max_megabytes: float = 30.0
@@ -130,6 +131,7 @@ def _points(flags: PointFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.data.ply import write_points
     from nerfloom.export.neighbors import inliers, plane_normals
     from nerfloom.export.points import joined, num_views, picture_points, surface_points
+    from nerfloom.geometry.regions import inside_all
     from nerfloom.renderable import RendersRays
 
     model, dataset = loaded.model, loaded.dataset("train")
@@ -143,6 +145,8 @@ def _points(flags: PointFlags, loaded: Loaded, path: Path) -> None:
     found = joined(track(parts, "Looking for surfaces", total=chunks))
     if not len(found.positions):
         raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
+    if regions := flags.regions():
+        found = found[inside_all(loaded.placement.original_points(found.positions), regions)]
     if flags.remove_outliers:
         kept = inliers(found.positions, flags.std_ratio)
         say(f"{len(kept) - int(kept.sum()):,} of {len(kept):,} points are outliers and left out (--remove-outliers)")
@@ -218,6 +222,7 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
     from nerfloom.export.run_page import moment_of
+    from nerfloom.geometry.regions import inside_all
     from nerfloom.splats.gaussians import HasGaussians
     from nerfloom.splats.placed_files import in_input, write_placed
 
@@ -234,6 +239,8 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         raise ConfigError("this run has no Gaussians left; train it again")
     look = loaded.model.look()
     placed = in_input(good, loaded.placement)
+    if regions := flags.regions():
+        placed = placed[inside_all(placed.means, regions)]
     for sentence in write_placed(path, placed, look, loaded.scale, flags.max_megabytes):
         say(sentence)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
@@ -244,7 +251,7 @@ def _web(flags: WebFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.registry import load_method
 
     splatting = load_method("gaussian-splatting")
-    export_page(loaded, path, flags.max_megabytes, flags.fit_seconds, flags.time, splatting)
+    export_page(loaded, path, flags.max_megabytes, flags.fit_seconds, flags.time, splatting, flags.regions())
 
 
 KINDS: dict[str, tuple[type[Any], str, Any]] = {

@@ -9,10 +9,12 @@ A file of a region is YAML or JSON with a box or a sphere, in the frame and unit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
+import torch
 from torch import Tensor
 
 from nerfloom.base.arguments import arguments_of
@@ -38,7 +40,9 @@ class Box:
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise ConfigError(f"the box from {self.low} to {self.high} is empty: each of low must be below that of high")
+            raise ConfigError(
+                f"the box from {self.low} to {self.high} is empty: each of low must be below that of high"
+            )
 
     def contains(self, points: Tensor) -> Tensor:
         """Return whether `points` (N, 3) are in the box, (N,) bool; its faces belong to it."""
@@ -89,3 +93,21 @@ def read_region(file: Path) -> Region:
         )
     ((name, values),) = content.items()
     return KINDS[name](**arguments_of(KINDS[name], values, f"{file}: {name}"))
+
+
+def inside_all(points: Tensor, regions: Sequence[Region]) -> Tensor:
+    """Return which points are in all of some regions, (N,) bool.
+
+    Args:
+        points: (N, 3) positions, in the frame and unit of the regions.
+        regions: the regions; none for all of space.
+
+    Raises:
+        ConfigError: if no point is.
+    """
+    inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    for region in regions:
+        inside &= region.contains(points)
+    if not bool(inside.any()):
+        raise ConfigError("nothing is in the region that is kept; it is in the frame and unit of exports")
+    return inside

@@ -16,6 +16,7 @@ COMMANDS = {
     "ns-bench": ["kernels"],
     "ns-compare": [],
     "ns-download-data": ["blender"],
+    "ns-edit": [],
     "ns-eval": [],
     "ns-export": ["pointcloud"],
     "ns-measure": [],

@@ -33,8 +33,7 @@ def arguments_of(function: Callable[..., Any], values: Any, where: str, given: i
     names = [parameter.name for parameter in parameters]
     for name in values:
         if name not in names:
-            hint = nearest(str(name), names) if names else "It has no settings."
-            raise ConfigError(f"{where}: unknown key {shown(name)}. {hint}")
+            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(shown(name), names)}")
     needed = [parameter.name for parameter in parameters if parameter.default is inspect.Parameter.empty]
     if missing := [name for name in needed if name not in values]:
         raise ConfigError(f"{where} needs {' and '.join(missing)}")

@@ -98,7 +98,7 @@ def step_of(name: Any, values: Any, where: str) -> Step:
         ConfigError: if there is no such step, or a setting is unknown, missing or cannot be used.
     """
     if name not in STEPS:
-        raise ConfigError(f"{where}: there is no step {shown(name)}. {nearest(str(name), STEPS)}")
+        raise ConfigError(f"{where}: there is no step {shown(name)}. {nearest(shown(name), STEPS)}")
     settings = arguments_of(STEPS[name], values, where, given=1)
     for key in settings.keys() & RANGES.keys():
         low, high = RANGES[key]
@@ -129,7 +129,7 @@ def read_recipe(file: Path) -> list[Step]:
         if not isinstance(step, dict) or len(step) != 1:
             raise ConfigError(f"{where} is {shown(step)}; it must be one name with settings, such as '- move: {{...}}'")
         ((name, values),) = step.items()
-        found.append(step_of(name, values, f"{where} ({name})"))
+        found.append(step_of(name, values, f"{where} ({name})" if isinstance(name, str) else where))
     return found
 
 

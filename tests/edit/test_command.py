@@ -52,7 +52,7 @@ def test_a_file_is_cropped_in_its_frame_and_keeps_how_it_is_drawn(suffix: str, f
 
 def test_flags_are_saved_as_a_recipe_that_repeats(file: Path, tmp_path: Path) -> None:
     first, second, recipe = tmp_path / "a.ply", tmp_path / "b.ply", tmp_path / "steps.yml"
-    words = ("--crop-sphere", "0,0,0,2.5", "--drop-isolated", True, "--reduce-to", 150, "--degree", 1, "--up", "-y")
+    words = ("--crop-sphere", "0,0,0,2.5", "--drop-isolated", True, "--reduce-to", 150, "--degree", 1, "--up=-y")
     edited(file, "--output-path", first, *words, "--scale", 0.5, "--save-recipe", recipe)
     edited(file, "--output-path", second, "--recipe", recipe)
     assert first.read_bytes() == second.read_bytes()
@@ -133,7 +133,7 @@ def test_what_cannot_be_edited(file: Path, tmp_path: Path, refused: Refused) -> 
 def test_a_run_is_edited_and_what_it_costs_is_said(shared_tiny: Path, tmp_path: Path) -> None:
     """PSNR on held-out photographs is that of ns-eval, before and after."""
     run, output = trained(shared_tiny, tmp_path / "out"), tmp_path / "half.ply"
-    said = edited(run, "--output-path", output, "--reduce-to", 100, "--drop-floaters", True, "--max-images", 3)
+    said = edited(run, "--output-path", output, "--reduce-to", 100, "--max-images", 3)
     assert len(read_gaussians(output).gaussians) == 100
     called("ns-eval", run)
     before = json.loads((run / "eval.json").read_text())["results"]["psnr"]

@@ -38,6 +38,9 @@ from nerfloom.dataparsers.polycam import Polycam
 from nerfloom.dataparsers.record3d import Record3D
 from nerfloom.dataparsers.sdfstudio import SdfStudio
 from nerfloom.downloads import unpack as downloads
+from nerfloom.edit.recipe import STEPS, step_of
+from nerfloom.edit.recipe import read_recipe as read_steps
+from nerfloom.edit.recipe import write_recipe as write_steps
 from nerfloom.evaluation.lpips import SHAPES, read_weights
 from nerfloom.evaluation.surface_files import read_mesh
 from nerfloom.evaluation.surface_files import read_points as read_surface_points
@@ -45,6 +48,7 @@ from nerfloom.evaluation.surfaces import drawn
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.regions import read_region
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import polycam, record3d
@@ -453,6 +457,25 @@ def read_run_scale(folder: Path, scratch: Path) -> None:
     require(0 < scale.factor < math.inf and 0 <= scale.relative_error < math.inf, "a scale that is no number")
 
 
+def write_edits(folder: Path) -> None:
+    """A recipe of ns-edit with settings of every type, and a region."""
+    steps = [
+        step_of("crop_box", {"low": [-1, -1, 0], "high": [1, 1.5, 2], "keep": False}, "here"),
+        step_of("crop_polygon", {"image": "a.png", "corners": [[0, 0], [3, 0], [0, 3]]}, "here"),
+        step_of("scale", {"factor": 0.5, "unit": "m"}, "here"),
+        step_of("align_floor", {"tolerance": None, "seed": 3}, "here"),
+        step_of("merge", {"files": ["a.ply"]}, "here"),
+    ]
+    write_steps(folder / "edit.yml", steps)
+    (folder / "region.yml").write_text("sphere: {center: [0, 0, 1], radius: 2.5}\n", encoding="utf-8")
+
+
+def read_edits(folder: Path, scratch: Path) -> None:
+    for step in read_steps(folder / "edit.yml"):
+        require(step.name in STEPS, "a step that does not exist")
+    require(read_region(folder / "region.yml").contains(torch.zeros(1, 3)).shape == (1,), "another shape")
+
+
 READERS: dict[str, Reader] = {
     "blender": Reader(write_blender, partial(parse, Blender()), ("transforms_train.json",), ("camera_angle_x", "time")),
     "dnerf": Reader(write_dnerf, partial(parse, DNeRF()), ("transforms_train.json",), ("camera_angle_x", "time")),
@@ -487,6 +510,7 @@ READERS: dict[str, Reader] = {
     ),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
+    "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius")),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),

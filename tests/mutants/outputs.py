@@ -35,6 +35,21 @@ MUTANTS = {
             "errors of lengths are too large by the root of two",
             "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
     ],
+    "nerfloom.edit.drop": [
+        Mutant("floaters-however-opaque", "drop_floaters", "A & (seen.opacity_in_front <= max_opacity)", "A",
+            "what is seen before other things is dropped, even if it is opaque",
+            "edit/test_drop.py::test_floaters_of_a_capture_are_dropped"),
+    ],
+    "nerfloom.edit.edited": [
+        Mutant("edited-out-of-the-photographs", "Edited.moved", "self.placement.after(A, B)", "self.placement",
+            "after a move, photographs show other Gaussians in a polygon than those that it was drawn around",
+            "edit/test_place.py::test_what_has_been_moved_stays_where_it_was_in_the_scene"),
+    ],
+    "nerfloom.edit.floor": [
+        Mutant("wall-as-floor", "_best", "A & (normals @ up >= min_cosine)", "A",
+            "a wall that is larger than the floor is taken for it",
+            "edit/test_place.py::test_a_tilted_floor_becomes_the_plane_z_is_0"),
+    ],
     "nerfloom.evaluation.appearance": [
         Mutant("appearance-of-judged-half", "_left_pixels", "A.view(-1, B)[:, :C]", "A.view(-1, B)[:, C:]",
             "appearance is fitted on the half that is judged",

@@ -36,6 +36,7 @@ ELSEWHERE = {
     ),
     r"python -m nerfloom.cli.bench gpu": "tests/benchmarks/test_gpu.py",
     r"ns-bake": "tests/export/test_bake.py",
+    r"ns-edit": "tests/edit/test_command.py",
     r"ns-download-data": "tests/downloads/test_install.py",
     r"ns-measure": "tests/test_scale.py",
     r"ns-stress": "tests/stress_command/test_runs.py",

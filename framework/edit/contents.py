@@ -1,4 +1,4 @@
-"""What is in the scene: merged files, the number of Gaussians, and the degree of their harmonics."""
+"""The contents of a scene: merged files, the number of Gaussians, and the degree of their harmonics."""
 
 from __future__ import annotations
 

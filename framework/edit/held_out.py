@@ -1,4 +1,4 @@
-"""What an edit costs: PSNR of the edited Gaussians on held-out photographs."""
+"""The cost of an edit: PSNR of the edited Gaussians on held-out photographs."""
 
 from __future__ import annotations
 

@@ -28,15 +28,14 @@ from nerfloom.edit.drop import drop_faint, drop_floaters, drop_isolated, drop_la
 from nerfloom.edit.edited import Edited
 from nerfloom.edit.place import align_floor, align_points, move, rotate, scale, set_up
 
-STEPS: dict[str, Callable[..., Edited]] = {
-    step.__name__: step
-    for step in (
-        *(crop_box, crop_sphere, crop_region, crop_polygon, crop_mask),
-        *(drop_faint, drop_large, drop_needles, drop_isolated, drop_floaters),
-        *(move, rotate, scale, set_up, align_points, align_floor),
-        *(merge, reduce_to, set_degree),
-    )
-}
+FUNCTIONS: tuple[Callable[..., Edited], ...] = (
+    crop_box, crop_sphere, crop_region, crop_polygon, crop_mask,
+    drop_faint, drop_large, drop_needles, drop_isolated, drop_floaters,
+    move, rotate, scale, set_up, align_points, align_floor,
+    merge, reduce_to, set_degree,
+)  # fmt: skip
+"""All steps."""
+STEPS = {step.__name__: step for step in FUNCTIONS}
 """Steps by name."""
 TINY = 1e-12
 """Smallest length or factor that is positive."""

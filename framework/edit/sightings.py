@@ -1,4 +1,4 @@
-"""How photographs see each Gaussian: its weight in their pixels, and whether it floats in front of surfaces."""
+"""Sightings of Gaussians: their weight in the pixels of photographs, and whether they float in front of surfaces."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CLEAR_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Sightings:
-    """How V images see each of N Gaussians."""
+    """Sightings of N Gaussians in V images."""
 
     weights: Tensor
     """(N,) float64 sum of its blending weights over all pixels of all images."""

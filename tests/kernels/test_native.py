@@ -56,7 +56,15 @@ def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path: Path, forks:
     done = forks.run(code, NERFLOOM_KERNELS="auto")
     assert done.returncode == 0
     said = done.stdout + done.stderr
-    assert said.count("without its compiled kernels") == 1
+    assert said.count("without its compiled kernels (they were not built)") == 1
+    assert "[[3.0], [3.0]]" in said
+    (tmp_path / f"avx2{native.SUFFIX}").touch()
+    (tmp_path / f"amx_bf16{native.SUFFIX}").touch()
+    done = forks.run(
+        code.replace("import torch\n", "import torch\nnative.cpu_features = set\n"), NERFLOOM_KERNELS="auto"
+    )
+    said = done.stdout + done.stderr
+    assert "(they were built for another processor: amx_bf16, avx2)" in said
     assert "[[3.0], [3.0]]" in said
     broken = forks.run(code, NERFLOOM_KERNELS="avx2")
     assert broken.returncode == 1

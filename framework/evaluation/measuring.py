@@ -69,12 +69,18 @@ def surface_point(model: Renderable, view: View, column: float, row: float) -> T
         column, row: the pixel; (0, 0) is the centre of the top left one, and fractions are allowed.
 
     Raises:
-        ConfigError: if the pixel shows no surface.
+        ConfigError: if the pixel is outside of the image, has no ray through the lens, or shows no surface.
     """
-    here = torch.tensor([[column, row]], dtype=torch.float64).to(view.camera.fx)
-    rays, depth, opacity = _first_surfaces(model, view.camera, here, view.time)
+    camera, place = view.camera, f"column {column:.1f}, row {row:.1f}"
+    height, width = camera.sizes[0]
+    if not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5):
+        raise ConfigError(f"{place} is outside of the image, which has {width} x {height} pixels")
+    here = torch.tensor([[column, row]], dtype=torch.float64).to(camera.fx)
+    if not bool(camera.look(torch.zeros_like(camera.widths), here[:, 0], here[:, 1])[2].valid[0]):
+        raise ConfigError(f"the {camera.model} lens has no ray at {place}")
+    rays, depth, opacity = _first_surfaces(model, camera, here, view.time)
     if not bool(opacity[0] >= OPAQUE) or not bool(depth[0] < rays.fars[0]):
-        raise ConfigError(f"there is no surface at column {column:.1f}, row {row:.1f}: opacity {float(opacity[0]):.2f}")
+        raise ConfigError(f"there is no surface at {place}: opacity {float(opacity[0]):.2f}")
     if isinstance(model, HasSignedDistance):
         depth = _onto_level(model, rays, depth)
     return _along(rays, depth)[0].double().cpu()
@@ -116,8 +122,8 @@ def located(model: Renderable, cameras: Cameras, point: Tensor, time: float | No
     """
     seeing = seeing_cameras(model, cameras, point, time)
     jacobians = projection_jacobians(cameras[seeing], point)
-    covariance = point_covariance(jacobians, PIXEL_ERROR)
-    return covariance + reading_error(jacobians, PIXEL_ERROR) ** 2 * torch.eye(3, dtype=torch.float64)
+    reading = torch.full((3,), reading_error(jacobians, PIXEL_ERROR) ** 2, dtype=torch.float64)
+    return point_covariance(jacobians, PIXEL_ERROR) + reading.diag()
 
 
 def measured(
@@ -180,6 +186,7 @@ def _first_surfaces(
     moment = 0.0 if time is None and scene.moving else time
     times = None if moment is None else torch.full((count,), moment, device=cameras.fx.device)
     rays = single.pixel_rays(torch.arange(count, device=cameras.fx.device), scene.near, scene.far, times)
+    rays = replace(rays, camera_indices=None)  # their numbers must not stand for training cameras
     if isinstance(model, RendersRays):
         with model.rendering():
             shown = model.render(rays, model.background)

@@ -47,14 +47,16 @@ class Length:
     value: float
     """The length, in `unit`."""
     error: float | None
-    """Standard deviation, in `unit`; None if fewer than two photographs see one of the points."""
+    """Standard deviation, in `unit`; None if fewer than two photographs see one of the points, of this length or of the
+    one that has set the scale."""
     unit: str
     """Name of the unit; empty for the unit of the input."""
 
     def __str__(self) -> str:
         name = f" {self.unit}" if self.unit else ""
         if self.error is None:
-            return f"{self.value:.4g}{name} (error unknown: fewer than two photographs see an end)"
+            reason = "fewer than two photographs see an end, of it or of the length that set the scale"
+            return f"{self.value:.4g}{name} (error unknown: {reason})"
         digits = max(1 - math.floor(math.log10(self.error)), 0) if self.error > 0 else 6
         return f"{self.value:.{digits}f}{name} ± {self.error:.{digits}f}{name}"
 
@@ -152,17 +154,18 @@ def measured(
     if not length > 0:
         raise ConfigError("the two points are the same: choose two different ones")
     error = math.inf
-    if cameras is not None:
-        error = length_error(start, end, (located(model, cameras, start, time), located(model, cameras, end, time)))
-    total = unit * math.hypot(error, length * scale.relative_error)
-    return Length(unit * length, total if math.isfinite(total) else None, scale.unit)
+    if cameras is not None and scale.relative_error is not None:
+        places = located(model, cameras, start, time), located(model, cameras, end, time)
+        error = unit * math.hypot(length_error(start, end, places), length * scale.relative_error)
+    return Length(unit * length, error if math.isfinite(error) else None, scale.unit)
 
 
 def scale_of(found: Length, scale: Scale, distance: float, unit: str) -> Scale:
     """Return the scale in which a measured length is the true one.
 
     Args:
-        found: the measured length in the present scale, whose own error is left out.
+        found: the measured length in the present scale, whose own error is left out; the new scale has the error of
+            the length.
         scale: the present scale.
         distance: the true length.
         unit: name of its unit.
@@ -170,7 +173,7 @@ def scale_of(found: Length, scale: Scale, distance: float, unit: str) -> Scale:
     Raises:
         FlagError: if the length or the name cannot be used.
     """
-    error = 0.0 if found.error is None else found.error / found.value
+    error = None if found.error is None else found.error / found.value
     return checked(Scale(scale.factor * distance / found.value, unit, error), f"a length of {distance:g}")
 
 

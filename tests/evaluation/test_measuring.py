@@ -175,6 +175,13 @@ def test_errors_that_are_not_known() -> None:
         assert measured(Ball(), given, ends, 1.0, Scale()).error is None
     for few in (cameras[:0], cameras[:1]):
         assert bool(located(Ball(), few, ends[0]).isinf().all())
+    unknown = scale_of(measured(Ball(), None, ends, 1.0, Scale()), Scale(), 2.0, "m")
+    assert unknown.relative_error is None
+    assert "unknown error" in unknown.words()
+    seen = tuple(RADIUS * torch.nn.functional.normalize(torch.tensor(each).double(), dim=0)
+                 for each in ([1.0, 0.4, -0.2], [0.8, -0.3, 0.4]))  # fmt: skip
+    assert measured(Ball(), cameras, (seen[0], seen[1]), 1.0, Scale()).error is not None
+    assert measured(Ball(), cameras, (seen[0], seen[1]), 1.0, unknown).error is None
     with pytest.raises(ConfigError, match="same"):
         measured(Ball(), cameras, (ends[0], ends[0]), 1.0, Scale())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
@@ -30,7 +31,8 @@ class MeasureFlags(RunFlags):
     unit: str = "m"
     """Name of the unit of DISTANCE."""
     image: str | None = None
-    """Photograph for points column,row: its file name. (0, 0) is the centre of its top left pixel."""
+    """Photograph for points column,row: its file name, or the end of its path. (0, 0) is the centre of its top left
+    pixel."""
     forget_scale: bool = False
     """Remove the scale, so that lengths are in the unit of the input again."""
 
@@ -41,11 +43,13 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    words, named = with_format("ns-measure", with_run(arguments))
+    words, named = with_format("ns-measure", with_run(arguments, ("--between", "--scale-points")))
     flags = read_flags(MeasureFlags, "ns-measure", words, takes=OPENS)
     given = [flags.between, flags.scale_points, flags.forget_scale or None]
     if sum(each is not None for each in given) > 1:
         raise FlagError("--between, --scale-points and --forget-scale exclude each other: give one at a time")
+    if flags.image is not None and flags.between is None and flags.scale_points is None:
+        raise FlagError("--image is the photograph of points: give --between or --scale-points with it")
     loaded = flags.load(flags.check(), data_format=named)
     if flags.between is not None:
         start, end = _points(flags, loaded, flags.between)
@@ -102,11 +106,11 @@ def _numbers(word: str, count: int) -> list[float]:
 
 
 def _photograph(loaded: Loaded, name: str) -> View:
-    """Return the view of the photograph with a file name."""
+    """Return the view of the only photograph whose path ends with a name."""
     from nerfloom.cameras.view import View
     from nerfloom.export.cameras import SPLITS
 
-    known: list[str] = []
+    ending, known, found = Path(name).parts, set[str](), dict[Path, View]()
     for split in SPLITS:
         try:
             parsed = loaded.run.parse(split)
@@ -114,11 +118,16 @@ def _photograph(loaded: Loaded, name: str) -> View:
             if split == "train":
                 raise
             continue
-        names = [path.name for path in parsed.image_paths]
-        if name in names:
-            return View.of(parsed.cameras.to(loaded.model.device), names.index(name), parsed.times)
-        known += names
-    raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
+        for index, path in enumerate(parsed.image_paths):
+            known.add(path.name)
+            if path.parts[-len(ending) :] == ending:
+                found[path] = View.of(parsed.cameras.to(loaded.model.device), index, parsed.times)
+    if not found:
+        raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
+    if len(found) > 1:
+        longer = "/".join(next(iter(found)).parts[-len(ending) - 1 :])
+        raise ConfigError(f"{len(found)} photographs are named {name}: give more of the path, such as {longer}")
+    return next(iter(found.values()))
 
 
 if __name__ == "__main__":

@@ -112,13 +112,8 @@ class Loaded:
         Raises:
             ValueError: if there are several cameras.
         """
-        if isinstance(camera, Cameras):
-            if len(camera) != 1:
-                raise ValueError(f"render() takes one camera, not {len(camera)}: choose one, as in cameras[0:1]")
-            camera = View(camera.to(self.model.device), time)
-        elif time is not None:
-            camera = View(camera.camera, time, camera.rays_per_pixel, camera.stride)
-        return self.model.render_view(camera, self.model.background)
+        view = self._view(camera)
+        return self.model.render_view(view if time is None else replace(view, time=time), self.model.background)
 
     def evaluate(
         self, split: Split = "test", max_images: int | None = None, lpips_weights: str | Path | None = None
@@ -143,10 +138,12 @@ class Loaded:
             column, row: the pixel; (0, 0) is the centre of the top left one, and fractions are allowed.
 
         Raises:
-            ConfigError: if the pixel shows no surface.
+            ConfigError: if the pixel is outside of the image or shows no surface, or the run has no lengths
+                (`measure`).
+            ValueError: if there are several cameras.
         """
-        view = camera if isinstance(camera, View) else View(camera.to(self.model.device))
-        return self.placement.original_points(surface_point(self.model, view, column, row)[None])[0]
+        self._check_lengths()
+        return self.placement.original_points(surface_point(self.model, self._view(camera), column, row)[None])[0]
 
     def measure(
         self, start: Tensor | Sequence[float], end: Tensor | Sequence[float], time: float | None = None
@@ -158,7 +155,8 @@ class Loaded:
             time: time in [0, 1] of a moving scene; None for 0.
 
         Raises:
-            ConfigError: if the points are the same, or the scene has no scale (normalised device coordinates).
+            ConfigError: if the points are the same, or the run has no lengths: normalised device coordinates, or
+                several scenes.
         """
         return self._measured(start, end, self.scale, time)
 
@@ -213,17 +211,35 @@ class Loaded:
         scale: Scale,
         time: float | None,
     ) -> Length:
-        if self.model.scene.warped:
-            raise ConfigError("this run is in normalised device coordinates (--ndc), which have no lengths to measure")
+        self._check_lengths()
         ends = self.placement.points(torch.stack([torch.as_tensor(p, dtype=torch.float64) for p in (start, end)]))
         return measured(self.model, self._photographs(), (ends[0], ends[1]), self.unit, scale, time)
 
+    def _check_lengths(self) -> None:
+        """Raise ConfigError if there are no lengths in the scene, or no single scene."""
+        if self.model.scene.warped:
+            raise ConfigError("this run is in normalised device coordinates (--ndc), which have no lengths to measure")
+        if self.model.scene.num_scenes > 1:
+            raise ConfigError(f"this run is of {self.model.scene.num_scenes} scenes; lengths are measured in one")
+
     def _photographs(self) -> Cameras | None:
-        """Return the cameras of the training images, which are not decoded; None if they are not known."""
+        """Return the cameras of the training images, in the sizes that were learnt from; None if they are not known.
+
+        The images are not decoded.
+        """
         if "train" not in self._cameras:
             try:
-                self._cameras["train"] = None if self.source is None else self.source.parse("train").cameras
+                parsed = None if self.source is None else self.source.parse("train")
             except DataError as error:
                 say(f"the errors of lengths are not known: {error}")
-                self._cameras["train"] = None
+                parsed = None
+            self._cameras["train"] = None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
         return self._cameras["train"]
+
+    def _view(self, camera: View | Cameras) -> View:
+        """Return a view as it is, or that of one camera on the model's device."""
+        if isinstance(camera, View):
+            return camera
+        if len(camera) != 1:
+            raise ValueError(f"a view is of one camera, not of {len(camera)}: choose one, as in cameras[0:1]")
+        return View(camera.to(self.model.device))

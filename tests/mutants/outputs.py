@@ -81,6 +81,11 @@ MUTANTS = {
             "LPIPS by a file of weights is of images in another range than everyone's",
             "evaluation/test_lpips.py::test_lpips_is_the_papers"),
     ],
+    "nerfloom.evaluation.measuring": [
+        Mutant("picked-by-a-training-camera", "_first_surfaces", "replace(A, camera_indices=None)", "A",
+            "with refined poses, points at pixels are moved as the first training camera was",
+            "evaluation/test_measuring.py::test_the_camera_of_a_picture_is_no_training_camera"),
+    ],
     "nerfloom.evaluation.metrics": [
         Mutant("masked-windows-of-finest-scale", "windows_of_scales", "A == 1", "A > 0",
             "coarse pixels that are partly of ignored ones count as perfect in SSIM at five scales",
@@ -229,6 +234,9 @@ MUTANTS = {
         Mutant("depth-in-scene-units", "Loaded.unit", "1 / self.placement.scale", "1.0",
             "depth files of a capture are in units of the scene, not of the input",
             "cli/test_render_outputs.py::test_depth_is_in_units_of_the_input"),
+        Mutant("error-of-stored-photographs", "Loaded._photographs", "A.scaled(B)", "A",
+            "after training on reduced images, errors of lengths are too small by that factor",
+            "evaluation/test_measuring.py::test_half_a_pixel_is_one_of_the_images_that_were_learnt_from"),
     ],
     "nerfloom.model": [
         Mutant("background-of-photographs", "Model.background",

@@ -46,7 +46,7 @@ def _command(arguments: list[str]) -> None:
     given = [flags.between, flags.scale_points, flags.forget_scale or None]
     if sum(each is not None for each in given) > 1:
         raise FlagError("--between, --scale-points and --forget-scale exclude each other: give one at a time")
-    loaded = flags.load(flags.check(), data_format=named)
+    loaded = flags.load(flags.check(), named)
     if flags.between is not None:
         start, end = _points(flags, loaded, flags.between)
         say(str(loaded.measure(start, end)))

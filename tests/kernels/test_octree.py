@@ -118,8 +118,9 @@ def test_the_reference_is_the_integral_over_every_leaf(degree: int) -> None:
     same(pick(found), pick(truth), 1e-6)
 
 
-def test_leaves_and_their_cells() -> None:
+def test_leaves_and_their_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
+    monkeypatch.setattr("nerfloom.kernels.octree.layout.BRICKS_AT_ONCE", 5)
     cells = scattered(0.2)
     cells = cells[torch.randperm(len(cells))]
     layout, rows = OctreeLayout.build(ORIGIN, CELL, SIZE, torch.cat([cells, cells[:50]]))

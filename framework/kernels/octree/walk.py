@@ -47,7 +47,6 @@ def leaf_samples(layout: OctreeLayout, rays: Rays) -> tuple[Samples, Tensor]:
         cell[walking], t[walking] = here, reach
         inside = ((here >= 0) & (here < top)).all(-1)
         walking = walking[inside & (reach < far[walking])]
-        cell[walking] = cell[walking].clamp(min=0)
     return _in_order(found, count, place)
 
 

@@ -50,7 +50,7 @@ def _command(arguments: list[str]) -> None:
         raise FlagError("--between, --scale-points and --forget-scale exclude each other: give one at a time")
     if flags.image is not None and flags.between is None and flags.scale_points is None:
         raise FlagError("--image is the photograph of points: give --between or --scale-points with it")
-    loaded = flags.load(flags.check(), data_format=named)
+    loaded = flags.load(flags.check(), named)
     if flags.between is not None:
         start, end = _points(flags, loaded, flags.between)
         say(str(loaded.measure(start, end)))

@@ -1,4 +1,4 @@
-"""A loaded run or file of Gaussians, for rendering and evaluation."""
+"""A loaded run, file of Gaussians or octree, for rendering and evaluation."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class Loaded:
     """A renderable and its origin: the result of `nerfloom.load`."""
 
     model: Renderable
-    """The renderable, on its device: a `nerfloom.Model` in evaluation mode, or Gaussians."""
+    """The renderable, on its device: a `nerfloom.Model` in evaluation mode, Gaussians, or an octree."""
     placement: Placement
     """Placement of the input, in the unit of `scale`, in the scene of `model`. All that is exported has this frame."""
     method: str
     """Name of the method that made it."""
     origin: Path
-    """The run's folder, or the file of Gaussians, for commands that load it again."""
+    """The run's folder, or the file, for commands that load it again."""
     checkpoint: Path
     """File of the parameters."""
     step: int = 0
     """Number of training steps done; 0 if unknown."""
     source: Run | None = None
-    """Method, settings, data and folder; None for Gaussians without data."""
+    """Method, settings, data and folder; None for a file without data."""
     scale: Scale = field(default_factory=Scale)
     """The unit of lengths (docs/guides/measure.md)."""
     _datasets: dict[Split, Dataset] = field(default_factory=dict)
@@ -54,7 +54,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file of Gaussians."""
+        """True for a run, False for a file."""
         return self.origin != self.checkpoint
 
     @property
@@ -74,10 +74,10 @@ class Loaded:
 
     @property
     def run(self) -> Run:
-        """The run. For Gaussians with data it is a placeholder that holds the data.
+        """The run. For a file with data it is a placeholder that holds the data.
 
         Raises:
-            ConfigError: for Gaussians without data.
+            ConfigError: for a file without data.
         """
         if self.source is None:
             raise ConfigError(f"{self.origin} is not a run, so that its photographs are unknown: give --data DIR")
@@ -90,7 +90,7 @@ class Loaded:
             split: train, val or test.
 
         Raises:
-            ConfigError: for Gaussians without data.
+            ConfigError: for a file without data.
             DataError: if the data cannot be read.
         """
         if split not in self._datasets:
@@ -194,13 +194,13 @@ class Loaded:
         """Write the scale to the run's folder, where whatever loads the run finds it.
 
         Raises:
-            ConfigError: for a file of Gaussians, whose coordinates are in a unit already.
+            ConfigError: for a file, whose coordinates are in a unit already.
             OSError: if it cannot be written.
         """
         if not self.is_run:
             raise ConfigError(
-                f"{self.origin} is a file of Gaussians, and keeps its coordinates: set the scale of the run that it is "
-                "from, and export it again"
+                f"{self.origin} is not a run, and keeps its coordinates: set the scale of the run that it is from, and "
+                "export or bake that again"
             )
         write_scale(self.folder, self.scale)
 

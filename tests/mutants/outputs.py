@@ -129,6 +129,11 @@ MUTANTS = {
             "meshes show density where the renderer never looks",
             "export/test_density.py::test_cells_that_the_renderer_skips_are_empty_and_not_evaluated"),
     ],
+    "nerfloom.export.octree_cells": [
+        Mutant("octants-by-their-corners", "MatterSearch._in_occupied", "max(math.ceil(A), 2)", "2",
+            "an octree of few cells has holes where the occupancy grid has finer ones",
+            "export/test_bake.py::test_octants_are_those_that_an_occupied_cell_overlaps"),
+    ],
     "nerfloom.export.octree_colors": [
         Mutant("octree-colours-unweighted", "fitted", "weights / A", "torch.ones_like(weights) / weights.shape[-1]",
             "an octree's leaves have the colours that hardly any camera sees",

@@ -23,8 +23,15 @@ from nerfloom.training.trainer import Trainer
 
 METHOD = "nerfacto"
 """The method that looks for what moves."""
-SETTINGS: dict[str, Any] = {"max_num_iterations": None, "robust": True, "gradient_scaling": True, "vis": "none"}
-"""Its settings. Without scaled gradients people become fog before their camera, which nothing contradicts."""
+SETTINGS: dict[str, Any] = {
+    "max_num_iterations": None,
+    "robust": True,
+    "gradient_scaling": True,
+    "mean_appearance_share": 0.0,
+    "vis": "none",
+}
+"""Its settings. Without scaled gradients people become fog before their camera, which nothing contradicts. In a step
+with the mean appearance, all of an image that is lit otherwise would be wrong in one direction."""
 LONGER_SIDE = 400
 """Longer side of the images that it learns from, pixels, at least; images are reduced by 2, 4 or 8."""
 

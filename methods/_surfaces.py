@@ -116,7 +116,7 @@ class SurfaceConfig(
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
     step_widths: float = 2.0
-    """Length of a training step, in inverse widths of the surface; from one to four steps of --num-steps. 0: one."""
+    """Length of a training step, in widths of the surface; from one to four steps of --num-steps. 0: one."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
     sharpen_until: float = 0.8

@@ -63,6 +63,8 @@ class Procedural(DataParser):
             raise DataError(f"the embedded scene reads no data; leave out --data {path}")
         if self.size < 1 or self.num_train < 1:
             raise DataError("--size and --num-train must be at least 1")
+        if self.scene_seed < 0:
+            raise DataError(f"--scene-seed is {self.scene_seed}; it must be at least 0")
         if self.num_scenes < 1 or self.views_per_scene < 4:
             raise DataError("--num-scenes must be at least 1, and --views-per-scene at least 4")
         if self.num_scenes > 1 and self.moving:

@@ -77,9 +77,7 @@ def _command(arguments: list[str]) -> None:
     from nerfloom.training.report import write_evaluation
 
     reference = read_reference(flags)
-    loaded = flags.load(
-        found, rays_per_pixel=flags.rays_per_pixel, eval_appearance=flags.eval_appearance, data_format=named
-    )
+    loaded = flags.load(found, named, rays_per_pixel=flags.rays_per_pixel, eval_appearance=flags.eval_appearance)
     model, dataset = loaded.model, loaded.dataset(flags.split)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
     with nullcontext() if bound is None else limited_error(model, bound):

@@ -113,7 +113,7 @@ def _command(arguments: list[str]) -> None:
     found = flags.check()
     path = flags.output_dir / file.format_map(vars(flags))
     make_room(path)
-    loaded = flags.load(found, data_format=named)
+    loaded = flags.load(found, named)
     if loaded.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
     if loaded.scale.is_known:

@@ -29,7 +29,8 @@ class MeasureFlags(RunFlags):
     unit: str = "m"
     """Name of the unit of DISTANCE."""
     image: str | None = None
-    """Photograph for points column,row: its file name. (0, 0) is the centre of its top left pixel."""
+    """Photograph for points column,row: its file name, or the end of its path. (0, 0) is the centre of its top left
+    pixel."""
     forget_scale: bool = False
     """Remove the scale, so that lengths are in the unit of the input again."""
 
@@ -40,12 +41,14 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    words, named = with_format("ns-measure", with_run(arguments))
+    words, named = with_format("ns-measure", with_run(arguments, ("--between", "--scale-points")))
     flags = read_flags(MeasureFlags, "ns-measure", words, takes=OPENS)
     given = [flags.between, flags.scale_points, flags.forget_scale or None]
     if sum(each is not None for each in given) > 1:
         raise FlagError("--between, --scale-points and --forget-scale exclude each other: give one at a time")
-    loaded = flags.load(flags.check(), data_format=named)
+    if flags.image is not None and flags.between is None and flags.scale_points is None:
+        raise FlagError("--image is the photograph of points: give --between or --scale-points with it")
+    loaded = flags.load(flags.check(), named)
     if flags.between is not None:
         start, end = _points(flags, loaded, flags.between)
         say(str(loaded.measure(start, end)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from nerfloom.training.run_path import trained_run
 
 if TYPE_CHECKING:
+    from nerfloom.training.file_data import DataFormat
     from nerfloom.training.loaded import Loaded
 
 OPENS = "RUN_FOLDER or FILE"
@@ -48,17 +49,18 @@ class RunFlags(OpenFlags):
     """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
     the surface. Default: the run's setting."""
 
-    def load(self, found: Path, **others: Any) -> Loaded:
+    def load(self, found: Path, data_format: DataFormat | None = None, **settings: Any) -> Loaded:
         """Load the run or the file that `check` has found.
 
         Args:
             found: the result of `check`.
-            others: further arguments of `nerfloom.training.load.load`.
+            data_format: data format for a file, with its flags; None to detect it.
+            settings: further changed settings of a run, by name; None for the run's own value.
 
         Raises:
             ConfigError, CheckpointError, DataError: if it cannot be used.
         """
         from nerfloom.training.load import load
 
-        given = self.load_checkpoint, self.device_type, self.data
-        return load(found, *given, eval_rendering=self.eval_rendering, up=self.up, **others)
+        given = self.load_checkpoint, self.device_type, self.data, data_format, self.up
+        return load(found, *given, eval_rendering=self.eval_rendering, **settings)

@@ -253,7 +253,8 @@ def _title(loaded: Loaded) -> str:
 
 def _about(loaded: Loaded, moment: float | None) -> str:
     method = loaded.method
-    parts = [f"Made by Nerfloom with {method}." if loaded.is_run else "Made by Nerfloom from a file of Gaussians."]
+    made = f"with {method}" if loaded.is_run else f"from {printable(loaded.origin.name)}"
+    parts = [f"Made by Nerfloom {made}."]
     if not isinstance(loaded.model, HasGaussians):
         parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
     if moment is not None:

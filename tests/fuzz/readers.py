@@ -454,7 +454,7 @@ def read_lpips(folder: Path, scratch: Path) -> None:
 
 def read_run_scale(folder: Path, scratch: Path) -> None:
     scale = read_scale(folder)
-    require(0 < scale.factor < math.inf and 0 <= scale.relative_error < math.inf, "a scale that is no number")
+    require(0 < scale.factor < math.inf and 0 <= (scale.relative_error or 0) < math.inf, "a scale that is no number")
 
 
 def write_edits(folder: Path) -> None:

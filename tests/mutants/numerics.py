@@ -297,6 +297,11 @@ MUTANTS = {
             "far away light is punished a thousand times more than near light",
             "truth/test_training.py::test_light_is_gathered_in_normalised_distance"),
     ],
+    "nerfloom.losses.surfaces": [
+        Mutant("silhouettes-of-all-pixels", "Silhouette.__call__", "batch.weights", "None",
+            "pixels that --robust leaves out still pull at silhouettes",
+            "test_surfaces.py::test_silhouettes_are_weighted_as_the_pixels_are"),
+    ],
     "nerfloom.losses.terms": [
         Mutant("coarse-not-taught", "CoarseColorError.__call__", "A.rgb", "A.rgb.detach()",
             "the coarse network learns nothing, and the fine one is sampled at random",

@@ -96,6 +96,11 @@ MUTANTS = {
             "LPIPS by a file of weights is of images in another range than everyone's",
             "evaluation/test_lpips.py::test_lpips_is_the_papers"),
     ],
+    "nerfloom.evaluation.measuring": [
+        Mutant("picked-by-a-training-camera", "_first_surfaces", "replace(A, camera_indices=None)", "A",
+            "with refined poses, points at pixels are moved as the first training camera was",
+            "evaluation/test_measuring.py::test_the_camera_of_a_picture_is_no_training_camera"),
+    ],
     "nerfloom.evaluation.metrics": [
         Mutant("masked-windows-of-finest-scale", "windows_of_scales", "A == 1", "A > 0",
             "coarse pixels that are partly of ignored ones count as perfect in SSIM at five scales",
@@ -138,6 +143,11 @@ MUTANTS = {
         Mutant("mesh-of-skipped-cells", "LatticeDensity.kept", "inside & A", "inside | A",
             "meshes show density where the renderer never looks",
             "export/test_density.py::test_cells_that_the_renderer_skips_are_empty_and_not_evaluated"),
+    ],
+    "nerfloom.export.octree_cells": [
+        Mutant("octants-by-their-corners", "MatterSearch._in_occupied", "max(math.ceil(A), 2)", "2",
+            "an octree of few cells has holes where the occupancy grid has finer ones",
+            "export/test_bake.py::test_octants_are_those_that_an_occupied_cell_overlaps"),
     ],
     "nerfloom.export.octree_colors": [
         Mutant("octree-colours-unweighted", "fitted", "weights / A", "torch.ones_like(weights) / weights.shape[-1]",
@@ -244,6 +254,9 @@ MUTANTS = {
         Mutant("depth-in-scene-units", "Loaded.unit", "1 / self.placement.scale", "1.0",
             "depth files of a capture are in units of the scene, not of the input",
             "cli/test_render_outputs.py::test_depth_is_in_units_of_the_input"),
+        Mutant("error-of-stored-photographs", "Loaded._photographs", "A.scaled(B)", "A",
+            "after training on reduced images, errors of lengths are too small by that factor",
+            "evaluation/test_measuring.py::test_half_a_pixel_is_one_of_the_images_that_were_learnt_from"),
     ],
     "nerfloom.model": [
         Mutant("background-of-photographs", "Model.background",

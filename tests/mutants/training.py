@@ -144,7 +144,7 @@ MUTANTS = {
             "training/test_operations.py::test_a_loss_is_found_bad_together_with_its_gradients"),
     ],
     "nerfloom.training.trained": [
-        Mutant("eval-flags-lost", "load_trained", "rays_per_pixel", "None",
+        Mutant("eval-flags-lost", "load_trained", "_changed(A, B, settings)", "A",
             "ns-eval --rays-per-pixel changes nothing",
             "cli/test_eval_command.py::test_rays_per_pixel_are_as_the_run_says_or_as_asked"),
     ],

@@ -21,6 +21,7 @@ from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, nearest, shown
 from nerfloom.base.json_files import read_json
 from nerfloom.cameras.cameras import Cameras, check_pose
+from nerfloom.cameras.framing import perspective, size_of
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.lenses import panorama
 
@@ -96,14 +97,25 @@ class CameraPath:
 
     def cameras(self) -> Cameras:
         """Return the F cameras."""
-        count, half = len(self), self.height / 2
-        if self.camera_type == "equirectangular":
-            fx, fy, cx, cy = (torch.full((count,), value) for value in panorama(self.width, self.height))
-        else:
-            fx = fy = (half / torch.tan(torch.deg2rad(self.fovs) / 2)).float()
-            cx, cy = torch.full((count,), self.width / 2), torch.full((count,), half)
-        sizes = torch.full((count,), self.width), torch.full((count,), self.height)
-        return Cameras(self.poses.float(), fx, fy, cx, cy, *sizes, CAMERA_TYPES[self.camera_type])
+        found = replace(
+            perspective(self.poses, self.width, self.height, self.fovs), model=CAMERA_TYPES[self.camera_type]
+        )
+        if self.camera_type != "equirectangular":
+            return found
+        fx, fy, cx, cy = (torch.full((len(self),), value) for value in panorama(self.width, self.height))
+        return replace(found, fx=fx, fy=fy, cx=cx, cy=cy)
+
+    def framed(self, width: int | None = None, height: int | None = None, fov: float | None = None) -> CameraPath:
+        """Return the path with images of another size, or with one field of view.
+
+        Args:
+            width: width of the images, pixels; None to keep it, or the aspect ratio if `height` is given.
+            height: height of the images, pixels; None likewise.
+            fov: vertical field of view of all frames, degrees; None for those of the path.
+        """
+        new_width, new_height = size_of((self.width, self.height), width, height)
+        fovs = self.fovs if fov is None else torch.full_like(self.fovs, fov)
+        return replace(self, width=new_width, height=new_height, fovs=fovs)
 
     def placed(self, placement: Placement) -> CameraPath:
         """Return the path in a scene with another `placement` of the same input; unchanged if its own is unknown."""

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.framing import perspective
 from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
+from nerfloom.evaluation.tour import tour
 from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.renderable import Renderable
 
 MIN_JUMP = 5.0
-"""A walk counts as jumping if a step reaches this multiple of the median step."""
-AROUND, ABOVE, OPENING = 1.0, math.radians(20), math.radians(50)
-"""Of cameras around a scene: distance from its middle in edges of its box, elevation and field of view, radians."""
+"""A walk counts as jumping if a step exceeds this multiple of the median step."""
+AROUND, ABOVE, OPENING = 1.0, math.radians(20), 50.0
+"""Of cameras around a scene: distance from its middle in edges of its box, elevation in radians, field of view in
+degrees."""
 MIN_CAMERAS = 3
 """Minimum number of cameras between two jumps; shorter stretches are left out of an interpolated path."""
 MAX_GAP = 60.0
@@ -28,6 +33,10 @@ MIN_HORIZONTAL = 0.2
 """Cameras closer to the vertical axis than this, relative to the mean horizontal distance, count as above or below."""
 SMOOTHING = 24
 """Number of cameras divided by the standard deviation, in cameras, of the weights of an interpolated path."""
+MIN_WIDTH = 0.5
+"""Minimum of that standard deviation, cameras."""
+MEASURED = 1000
+"""Number of positions by which the length of a stretch of a path is measured."""
 MIN_MEAN_DIRECTION = 0.7
 """Cameras look the same way if the mean of their unit viewing directions is at least this long."""
 SMALL_RADIUS = 0.1
@@ -36,17 +45,25 @@ FOCUS_PIXELS = 64
 """Number of pixels along the longer side of the image used to measure that distance."""
 
 
-def look_at(position: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Return the camera-to-world pose (3, 4) of a camera at `position` (3,) that looks at `target` (3,).
+def look_at(
+    position: Tensor | Sequence[float], target: Tensor | Sequence[float], up: Tensor | Sequence[float] = (0.0, 0.0, 1.0)
+) -> Tensor:
+    """Return the camera-to-world pose (3, 4) of a camera that looks at a point, OpenGL axes.
 
-    `up` (3,) is the upward direction in the image; if the camera looks along it, +y is used instead.
+    Its columns are the camera's right, its up, its backwards and its position.
+
+    Args:
+        position: (3,) position of the camera.
+        target: (3,) point that is in the middle of the image.
+        up: (3,) upward direction in the image; if the camera looks along it, +y is used instead.
     """
-    back = safe_normalize(position - target)
-    right = torch.linalg.cross(up, back)
+    eye, point, above = (torch.as_tensor(each) * 1.0 for each in (position, target, up))  # whole numbers, too
+    back = safe_normalize(eye - point)
+    right = torch.linalg.cross(above.to(back), back)
     if right.norm() < 1e-6:
-        right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), back)
+        right = torch.linalg.cross(back.new_tensor([0.0, 1.0, 0.0]), back)
     right = safe_normalize(right)
-    return torch.stack([right, torch.linalg.cross(back, right), back, position], dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back, eye.to(back)], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -83,7 +100,23 @@ def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
     return Arc(float(angles[(largest + 1) % len(angles)]) + width / 2, width)
 
 
-def orbit(cameras: Cameras, center: Tensor, num_frames: int, arc: Arc | None = None) -> Cameras:
+def fractions(count: int, closed: bool = True, ease: bool = False) -> Tensor:
+    """Return how far along a path each of its frames is, (F,) float64 from 0 to 1.
+
+    Args:
+        count: number of frames.
+        closed: whether the path returns to its start, where the first frame follows the last; otherwise the last frame
+            is at its end.
+        ease: whether the path starts and ends at rest: at 3 u^2 - 2 u^3 after a share u of the time. Otherwise its
+            speed is constant.
+    """
+    shares = torch.arange(count, dtype=torch.float64) / (count if closed else max(count - 1, 1))
+    return shares.square() * (3 - 2 * shares) if ease else shares
+
+
+def orbit(
+    cameras: Cameras, center: Tensor, along: Tensor, arc: Arc | None = None, radius: float | None = None
+) -> Cameras:
     """Return cameras on a horizontal circle, looking at its centre; the path is closed.
 
     Height and radius are the means over the given cameras, and intrinsics are those of the first camera.
@@ -91,18 +124,20 @@ def orbit(cameras: Cameras, center: Tensor, num_frames: int, arc: Arc | None = N
     Args:
         cameras: M cameras.
         center: (3,) centre, scene units.
-        num_frames: number of cameras on the circle.
+        along: (F,) fraction of the path at each frame, from `fractions`.
         arc: part of the circle on which the cameras swing once back and forth, slowly at its ends; None for the whole
             circle.
+        radius: another radius of the circle, scene units. The height changes alike, so that the elevation stays.
     """
     offsets = cameras.camera_to_worlds[:, :, 3] - center
-    height, radius = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
-    angles = torch.arange(num_frames) * (2 * torch.pi / num_frames)
+    height, distance = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
+    if radius is not None:
+        height, distance = height * (radius / distance.clamp(min=1e-6)), torch.tensor(radius)
+    angles = (2 * torch.pi * along).float()
     if arc is not None:
         angles = arc.middle + arc.width / 2 * angles.sin()
-    circle = torch.stack([radius * angles.cos(), radius * angles.sin(), height.expand(num_frames)], dim=-1)
-    up = torch.tensor([0.0, 0.0, 1.0])
-    poses = torch.stack([look_at(center + offset, center, up) for offset in circle])
+    circle = torch.stack([distance * angles.cos(), distance * angles.sin(), height.expand(len(angles))], dim=-1)
+    poses = torch.stack([look_at(center + offset, center) for offset in circle])
     return replace_poses(cameras, poses)
 
 
@@ -114,54 +149,120 @@ def around(scene: Scene, count: int = 8) -> Cameras:
         count: number of cameras.
     """
     middle, reach = scene.box.mean(0).cpu(), AROUND * float((scene.box[1] - scene.box[0]).max())
-    angles, side = torch.arange(count) * (2 * torch.pi / count), scene.image_size
+    angles = torch.arange(count) * (2 * torch.pi / count)
     height = torch.full((count,), math.sin(ABOVE))
     places = torch.stack([math.cos(ABOVE) * angles.cos(), math.cos(ABOVE) * angles.sin(), height], dim=-1)
-    up = torch.tensor([0.0, 0.0, 1.0])
-    poses = torch.stack([look_at(middle + reach * place, middle, up) for place in places])
-    focal, half = torch.full((count,), 0.5 * side / math.tan(OPENING / 2)), torch.full((count,), 0.5 * side)
-    sides = torch.full((count,), side)
-    return Cameras(poses, focal, focal, half, half, sides, sides)
+    poses = torch.stack([look_at(middle + reach * place, middle) for place in places])
+    return perspective(poses, scene.image_size, scene.image_size, OPENING)
 
 
-def interpolate(cameras: Cameras, num_frames: int) -> Cameras:
-    """Return cameras along a smooth path past given cameras, in their order, without hand shake.
+# -- a walk past cameras ------------------------------------------------------------------------------------------
 
-    A pose is the mean of nearby poses in that order, weighted by a Gaussian; its rotation is the one closest to the
-    mean matrix. No mean is taken across a jump of the walk, because the mean could lie inside the subject: the path
-    jumps there too. Intrinsics are those of the first camera.
+
+@dataclass(frozen=True)
+class Walk:
+    """A way past cameras, in stretches between jumps."""
+
+    stretches: tuple[Tensor, ...]
+    """Indices (K,) int64 of the cameras in each stretch, in their order."""
+    closed: bool = False
+    """Whether the first camera follows the last; there is then one stretch."""
+
+
+def shortest_order(cameras: Cameras, closed: bool = True) -> Tensor:
+    """Return the order (M,) int64 of a short tour past cameras, each once (`tour`).
+
+    Both ways and turns count: a turn by a radian is as long as the cameras' distance from their mean position.
 
     Args:
         cameras: M cameras.
-        num_frames: number of cameras on the path.
+        closed: whether the tour returns to its first camera.
     """
-    parts = stretches(cameras)
-    kept = torch.cat(parts)
-    part = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(each) for each in parts]))
-    width = max(len(kept) / SMOOTHING, 0.5)
-    positions = torch.linspace(0, len(kept) - 1, num_frames, dtype=torch.float64)
-    weights = torch.exp(-0.5 * ((positions[:, None] - torch.arange(len(kept))) / width).square())
-    weights = weights * (part == part[positions.round().long(), None])
-    weights = weights / weights.sum(-1, keepdim=True)
-    means = torch.einsum("fm,mij->fij", weights, cameras.camera_to_worlds[kept].double())
-    return replace_poses(cameras, torch.cat([nearest_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1).float())
+    return tour(_stations(cameras.camera_to_worlds), closed)
 
 
-def stretches(cameras: Cameras) -> list[Tensor]:
-    """Return the indices of the cameras in each stretch of a walk between jumps; short stretches are left out.
+def walk_of(cameras: Cameras, closed: bool = False) -> Walk:
+    """Return a walk past cameras in their order. It leaves out short stretches, and is cut where it jumps.
 
     Args:
         cameras: M cameras, in the order of the walk.
+        closed: whether the walk returns to the first camera. It does not if it jumps anywhere.
     """
-    centers = cameras.camera_to_worlds[:, :, 3].double().cpu()
-    steps = (centers[1:] - centers[:-1]).norm(dim=-1)
-    usual = float(steps.median()) if len(steps) else 0.0
-    jumps = (steps > MIN_JUMP * usual).nonzero()[:, 0] + 1 if usual > 0 else torch.zeros(0, dtype=torch.long)
-    parts = torch.tensor_split(torch.arange(len(cameras)), jumps)
-    return [part for part in parts if len(part) >= MIN_CAMERAS] or [torch.arange(len(cameras))]
+    count, stations = len(cameras), _stations(cameras.camera_to_worlds)
+    steps = (stations.roll(-1, 0) - stations).norm(dim=-1)
+    usual = float(steps[:-1].median()) if count > 1 else 0.0
+    cut = steps > MIN_JUMP * usual if usual > 0 else torch.zeros(count, dtype=torch.bool)
+    if closed and not bool(cut.any()):
+        return Walk((torch.arange(count),), closed=True)
+    # An open walk ends with the last camera; one that was to be closed begins anew behind its last jump.
+    end = int(cut.nonzero()[-1]) if closed else count - 1
+    order = torch.arange(count).roll(-(end + 1))
+    cuts = cut[order][:-1].nonzero()[:, 0] + 1
+    parts = tuple(part for part in torch.tensor_split(order, cuts) if len(part) >= MIN_CAMERAS)
+    return Walk(parts or (order,))
 
 
-def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None = None) -> Cameras:
+def interpolate(cameras: Cameras, along: Tensor, walk: Walk) -> Cameras:
+    """Return cameras along a smooth path past given cameras, without hand shake, and at equal lengths for equal shares.
+
+    A pose is the mean of nearby poses of the walk, weighted by a Gaussian; its rotation is the one closest to the mean
+    matrix. No mean is taken across a jump of the walk, because the mean could lie inside the subject: the path jumps
+    there too. Intrinsics are those of the first camera.
+
+    Args:
+        cameras: M cameras.
+        along: (F,) fraction of the path's length at each frame, from `fractions`.
+        walk: the order of the cameras.
+    """
+    poses = cameras.camera_to_worlds.double().cpu()
+    reach, width = _reach(poses), max(sum(map(len, walk.stretches)) / SMOOTHING, MIN_WIDTH)
+    parts = [poses[part] for part in walk.stretches]
+    lengths = [_lengths(part, width, reach, walk.closed) for part in parts]
+    starts = np.cumsum([0.0, *(length[-1] for length in lengths)])
+    wanted = along.double().numpy() * starts[-1]
+    chosen = np.searchsorted(starts[1:-1], wanted, side="right")
+    found = torch.empty(len(wanted), 3, 4, dtype=torch.float64)
+    for index, (part, length) in enumerate(zip(parts, lengths, strict=True)):
+        here = np.flatnonzero(chosen == index)
+        places = np.interp(wanted[here] - starts[index], length, _places(part, walk.closed))
+        found[torch.from_numpy(here)] = _smoothed(part, torch.from_numpy(places), width, walk.closed)
+    return replace_poses(cameras, found.float())
+
+
+def _places(poses: Tensor, closed: bool) -> np.ndarray:
+    """Return the places along a stretch (M, 3, 4) where its length is measured: 0 at the first camera, 1 at the next."""
+    return np.linspace(0, len(poses) - (not closed), MEASURED)
+
+
+def _lengths(poses: Tensor, width: float, reach: float, closed: bool) -> np.ndarray:
+    """Return the length of the smoothed path through a stretch (M, 3, 4) up to each of its `_places`."""
+    stations = _stations(_smoothed(poses, torch.from_numpy(_places(poses, closed)), width, closed), reach)
+    return np.concatenate([[0.0], (stations[1:] - stations[:-1]).norm(dim=-1).cumsum(0).numpy()])
+
+
+def _smoothed(poses: Tensor, places: Tensor, width: float, closed: bool) -> Tensor:
+    """Return the means (F, 3, 4) of poses (M, 3, 4) with Gaussian weights around places (F,), in cameras."""
+    apart = places[:, None] - torch.arange(len(poses))
+    if closed:
+        apart = torch.remainder(apart + len(poses) / 2, len(poses)) - len(poses) / 2
+    weights = torch.exp(-0.5 * (apart / width).square())
+    means = torch.einsum("fm,mij->fij", weights / weights.sum(-1, keepdim=True), poses)
+    return torch.cat([nearest_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1)
+
+
+def _stations(poses: Tensor, reach: float | None = None) -> Tensor:
+    """Return positions and viewing directions of poses (M, 3, 4) in one space (M, 6), directions times `reach`."""
+    precise = poses.double().cpu()
+    return torch.cat([precise[:, :, 3], -(_reach(precise) if reach is None else reach) * precise[:, :, 2]], dim=-1)
+
+
+def _reach(poses: Tensor) -> float:
+    """Return the root mean square of the distances of poses (M, 3, 4) from their mean position."""
+    centers = poses[:, :, 3].double()
+    return float((centers - centers.mean(0)).square().sum(-1).mean().sqrt())
+
+
+def spiral(cameras: Cameras, along: Tensor, focus: float, radius: float | None = None) -> Cameras:
     """Return cameras on a spiral around the mean camera, looking at a point in front of it.
 
     The path is LLFF's (Mildenhall et al. 2019): two turns in the mean camera's image plane, while it moves once back
@@ -170,7 +271,7 @@ def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None
 
     Args:
         cameras: M cameras.
-        num_frames: number of cameras on the spiral.
+        along: (F,) fraction of the path at each frame, from `fractions`.
         focus: distance of the target point from the mean camera, scene units.
         radius: radius along each of its axes, scene units. If None, it is the 90th percentile of the cameras' distances
             from the mean camera along each axis, or `SMALL_RADIUS` times `focus` if they do not look the same way.
@@ -184,7 +285,7 @@ def spiral(cameras: Cameras, num_frames: int, focus: float, radius: float | None
         radii = torch.quantile(offsets.abs(), 0.9, dim=0)
     else:
         radii = torch.full((3,), SMALL_RADIUS * focus)
-    angles = torch.arange(num_frames) * (4 * torch.pi / num_frames)
+    angles = (4 * torch.pi * along).float()
     local = torch.stack([angles.cos(), -angles.sin(), -(angles / 2).sin()], dim=-1) * radii
     target = position - focus * rotation[:, 2]
     poses = [look_at(position + offset, target, rotation[:, 1]) for offset in local @ rotation.T]

@@ -1,0 +1,76 @@
+"""Image size and field of view of cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras
+
+
+def perspective(poses: Tensor, width: int, height: int, fov: Tensor | float) -> Cameras:
+    """Return pinhole cameras with square pixels, whose axes meet the images in the middle.
+
+    Args:
+        poses: (M, 3, 4) camera-to-scene, OpenGL axes.
+        width: width of the images, pixels.
+        height: height of the images, pixels.
+        fov: vertical field of view, degrees; of all cameras, or (M,) of each.
+    """
+    count, device = len(poses), poses.device
+    half = torch.deg2rad(torch.as_tensor(fov, dtype=torch.float64)) / 2
+    focal = (height / 2 / half.tan()).float().expand(count).to(device)
+    cx, cy = (torch.full((count,), side / 2, device=device) for side in (width, height))
+    widths, heights = (torch.full((count,), side, device=device) for side in (width, height))
+    return Cameras(poses.float(), focal, focal, cx, cy, widths, heights)
+
+
+def size_of(size: tuple[int, int], width: int | None, height: int | None) -> tuple[int, int]:
+    """Return width and height of resized images; what is None follows from the other one and the aspect ratio.
+
+    Args:
+        size: width and height before, pixels.
+        width: new width, pixels.
+        height: new height, pixels.
+    """
+    before_width, before_height = size
+    if width is None:
+        width = before_width if height is None else max(round(before_width * height / before_height), 1)
+    return width, max(round(before_height * width / before_width), 1) if height is None else height
+
+
+def framed(cameras: Cameras, width: int | None = None, height: int | None = None, fov: float | None = None) -> Cameras:
+    """Return cameras with images of another size, and another field of view.
+
+    An image of another aspect ratio shows a part of the image plane of the same area, so that neither wide nor tall
+    images show much that the first ones did not. With `fov`, cameras become pinhole cameras.
+
+    Args:
+        cameras: M cameras whose images have one size.
+        width: width of the images, pixels; None to keep it, or the aspect ratio if `height` is given.
+        height: height of the images, pixels; None likewise.
+        fov: vertical field of view, degrees; None for that of the cameras.
+
+    Raises:
+        ConfigError: if a panorama was to have another aspect ratio.
+    """
+    before_width, before_height = int(cameras.widths[0]), int(cameras.heights[0])
+    width, height = size_of((before_width, before_height), width, height)
+    sizes = {"widths": torch.full_like(cameras.widths, width), "heights": torch.full_like(cameras.heights, height)}
+    if fov is not None:
+        found = perspective(cameras.camera_to_worlds, width, height, fov)
+        numbers = {name: getattr(found, name) for name in ("fx", "fy", "cx", "cy")}
+        return replace(cameras, **numbers, **sizes, model="pinhole", lens=None)
+    scale = (width * height / (before_width * before_height)) ** 0.5
+    if cameras.model == "equirectangular" and round(before_width * scale) != width:
+        raise ConfigError(
+            f"panoramas of {before_width}x{before_height} keep their aspect ratio: give --width or --height alone, or "
+            "--fov for a perspective"
+        )
+    focal = {name: getattr(cameras, name) * scale for name in ("fx", "fy")}
+    cx = width / 2 + (cameras.cx - before_width / 2) * scale
+    cy = height / 2 + (cameras.cy - before_height / 2) * scale
+    return replace(cameras, **focal, cx=cx, cy=cy, **sizes)

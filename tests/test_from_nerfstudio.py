@@ -20,9 +20,9 @@ from nerfloom.base.from_nerfstudio import (
 )
 from nerfloom.cli.export import KINDS as EXPORTS
 from nerfloom.cli.process_data import KINDS as INPUTS
-from nerfloom.cli.render_flags import PATHS
 from nerfloom.cli.train import _flag_names, main, run_of
 from nerfloom.registry import load_dataparser, load_method, registered
+from nerfloom.video.settings import PATHS
 from tests.conftest import Refused
 
 

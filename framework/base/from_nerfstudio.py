@@ -117,11 +117,10 @@ KINDS = {
 RENDERING = {
     "output-format": "the extension of --output-path sets the format; without one, images are written to a folder",
     "jpeg-quality": "leave it out; JPEG images have quality 95",
-    "seconds": "here they are --num-frames and --fps",
     "frame-rate": "here it is --fps",
-    "interpolation-steps": "here it is --num-frames, for the whole path",
+    "interpolation-steps": "here it is --seconds or --num-frames, for the whole path",
     "pose-source": "leave it out; the path follows the training cameras",
-    "order-poses": "leave it out; the path passes cameras in the order of their images' names",
+    "order-poses": "leave it out; the path passes cameras along a short tour",
     "camera-idx": "leave it out; the mean appearance of all images is shown",
     "render-nearest-camera": "there is no equivalent; 'ns-render dataset' shows views beside their true images",
     "check-occlusions": "there is no equivalent; 'ns-render dataset' shows views beside their true images",

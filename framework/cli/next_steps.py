@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from nerfloom.base.extras import install_command
 from nerfloom.data.scene import Scene
+from nerfloom.evaluation.video_suffixes import default_video
 
 
 def after_training(scene: Scene, folder: Path) -> list[str]:
@@ -18,10 +18,11 @@ def after_training(scene: Scene, folder: Path) -> list[str]:
     """
     run = shlex.quote(str(folder))
     path = "spiral" if scene.warped else "interpolate" if scene.unbounded else "orbit"
-    video = f"{path}.gif" if install_command("video") else f"{path}.mp4"
     lines = ["next:"]
     if scene.num_scenes == 1:
         lines.append(f"  look at it in a browser:  ns-viewer {run}")
-        lines.append(f"  make a video:             ns-render {path} {run} --output-path {video}")
+        lines.append(f"  make a video:             ns-render {path} {run} --output-path {default_video(path)}")
+    if scene.num_scenes == 1 and not scene.warped:
+        lines.append(f"  make a web page of it:    ns-export web {run} --output-dir exports")
     lines.append(f"  evaluate it again:        ns-eval {run}")
     return lines

@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import shutil
+import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -23,12 +24,15 @@ from torch import Tensor
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.meter import time_text
 from nerfloom.evaluation.outputs import Arrays
 
 FACTS = "render.json"
 """Name of the file that describes the render."""
 SUFFIX = ".frames"
 """Suffix of the folder of frames, appended to the name of the rendered file."""
+TIMED = 2
+"""The frame by whose time that of the others is foretold. The first also prepares what all of them use."""
 PIECE = 2**24
 """Number of bytes of a file hashed at a time."""
 
@@ -62,7 +66,7 @@ class Frames:
             yield kept
 
     def render(self, render: Callable[[int], Arrays]) -> None:
-        """Render the missing frames.
+        """Render the missing frames, and say after the second one how long the others will take.
 
         Args:
             render: function from a frame's index to its arrays.
@@ -75,12 +79,15 @@ class Frames:
         if done:
             say(f"{done} of {self.count} frames already exist in {self.folder}; rendering the others")
         try:
-            for index in track(missing, "Rendering", total=len(missing)):
+            for number, index in enumerate(track(missing, "Rendering", total=len(missing)), 1):
+                start = time.monotonic()
                 content = io.BytesIO()
                 arrays: dict[str, Any] = dict(render(index))
                 np.savez_compressed(content, **arrays)
                 write_file(self.path(index), content.getvalue())
                 done += 1
+                if number == TIMED and (left := len(missing) - number):
+                    say(f"the other {left:,} frames take about {time_text((time.monotonic() - start) * left)}")
         except BaseException as error:
             if not done:  # nothing to continue
                 self.remove()

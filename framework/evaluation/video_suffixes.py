@@ -11,6 +11,11 @@ VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
 """Suffixes of files with several pictures."""
 
 
+def default_video(stem: str) -> Path:
+    """Return the name of a video: `stem`.mp4 if MP4 can be written, else `stem`.gif."""
+    return Path(f"{stem}{VIDEO}" if install_command("video") is None else f"{stem}.gif")
+
+
 def check_suffix(path: Path) -> None:
     """Refuse, before rendering, an output file that cannot be written.
 

@@ -8,7 +8,6 @@ import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from nerfloom.base.child import python_command
 from nerfloom.base.console import say
 from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
+from nerfloom.evaluation.video_suffixes import default_video
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.camera_panel import move_camera
 from nerfloom.viewer.keyframes import MAX_KEYFRAMES, Editor, listed, path_file
@@ -175,7 +175,7 @@ class PathPanel:
             return None
         words = map(shlex.quote, (str(self._loaded().origin), "--camera-path-filename", str(file)))
         command = f"ns-render camera-path {' '.join(words)}"
-        say(f"viewer: saved {file}; render it with: {command} --output-path {video_suffix(file.stem)}")
+        say(f"viewer: saved {file}; render it with: {command} --output-path {default_video(file.stem)}")
         self._note.content = f"Saved {file.name}, {len(path)} frames."
         return file
 
@@ -188,7 +188,7 @@ class PathPanel:
         file = self._save()
         if file is None:
             return
-        output = file.with_name(video_suffix(file.stem))
+        output = file.with_name(default_video(file.stem).name)
         words = ["--camera-path-filename", file, "--output-path", output]
         command = python_command("nerfloom.cli.render", "camera-path", self._loaded().origin, *words)
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
@@ -196,11 +196,6 @@ class PathPanel:
         self._note.content = f"Rendering {output.name} ..."
         status = process.wait()
         self._note.content = f"Rendered {output.name}." if status == 0 else "Rendering failed; see the terminal."
-
-
-def video_suffix(stem: str) -> str:
-    """Return a video's file name with the `stem`: MP4 if it can be written, otherwise GIF."""
-    return f"{stem}.mp4" if find_spec("imageio_ffmpeg") is not None else f"{stem}.gif"
 
 
 def _or_zero(value: Any) -> int:

@@ -19,8 +19,8 @@ from nerfloom.base.from_nerfstudio import (
     taken,
 )
 from nerfloom.cli.export import KINDS as EXPORTS
-from nerfloom.cli.process_data import KINDS as INPUTS
 from nerfloom.cli.train import _flag_names, main, run_of
+from nerfloom.processing.kinds import KINDS as INPUTS
 from nerfloom.registry import load_dataparser, load_method, registered
 from nerfloom.video.settings import PATHS
 from tests.conftest import Refused

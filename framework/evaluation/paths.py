@@ -230,7 +230,7 @@ def interpolate(cameras: Cameras, along: Tensor, walk: Walk) -> Cameras:
 
 
 def _places(poses: Tensor, closed: bool) -> np.ndarray:
-    """Return the places along a stretch (M, 3, 4) where its length is measured: 0 at the first camera, 1 at the next."""
+    """Return the places on a stretch (M, 3, 4) where its length is measured: 0 at the first camera, 1 at the next."""
     return np.linspace(0, len(poses) - (not closed), MEASURED)
 
 

@@ -39,10 +39,10 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
 
 
 def kind_of(kind: str, data: Path) -> tuple[str, Path]:
-    """Detect whether a path has images or a video, if the user named the wrong kind; this is reported.
+    """Detect whether a path has images or a video, if the user named the wrong one of them; this is reported.
 
     Args:
-        kind: "images" or "video", as the user named it; returned if it fits, or if neither fits.
+        kind: kind of input as the user named it; returned if it fits, if neither fits, or for other kinds.
         data: the path.
 
     Returns:
@@ -51,6 +51,8 @@ def kind_of(kind: str, data: Path) -> tuple[str, Path]:
     Raises:
         DataError: if a folder without images has several videos.
     """
+    if kind not in ("images", "video"):
+        return kind, data
     if data.is_file():
         if kind == "images" and data.suffix.lower() in VIDEO_SUFFIXES:
             say(f"{data} is a video: using its frames, as in ns-process-data video")

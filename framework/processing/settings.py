@@ -1,7 +1,8 @@
-"""Flags of the estimation of poses with COLMAP; without heavy imports, so that the command line starts quickly."""
+"""Flags of each kind of input; without heavy imports, so that the command line starts quickly."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -95,3 +96,71 @@ class ColmapFlags(OutputFlags):
             raise FlagError(f"--mask-seconds is {self.mask_seconds}; it must be more than 0")
         if self.num_threads < 1 and self.num_threads != -1:
             raise FlagError(f"--num-threads is {self.num_threads}; it must be at least 1, or -1 for all")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesFlags(ColmapFlags):
+    """Estimate the poses of the images in a folder and its subfolders."""
+
+    masks_dir: Path | None = None
+    """Folder of masks with the images' names; black pixels are ignored for poses and training."""
+
+    def check(self) -> None:
+        super().check()
+        if self.masks_dir is not None and self.undistort:
+            raise ConfigError("--masks-dir with --undistort: masks are not undistorted; leave one of them out")
+        if self.masks_dir is not None and self.mask_moving:
+            raise ConfigError("--masks-dir with --mask-moving: an image has one mask; leave one of them out")
+        if self.masks_dir is not None and not self.masks_dir.is_dir():
+            raise ConfigError(f"--masks-dir {self.masks_dir}: there is no such folder")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VideoFlags(ColmapFlags):
+    """Estimate the poses of the sharpest frames of a video."""
+
+    num_frames_target: int = 300
+    """Number of frames to take. The video is split into this many equal intervals; each gives its sharpest frame."""
+
+    def check(self) -> None:
+        super().check()
+        if self.num_frames_target < 3:
+            raise FlagError(f"--num-frames-target is {self.num_frames_target}; it must be at least 3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhoneFlags(OutputFlags):
+    """Flags of captures with poses."""
+
+    max_dataset_size: int = 300
+    """Maximum number of images to take, evenly spaced; -1 for all."""
+
+    def check(self) -> None:
+        super().check()
+        if self.max_dataset_size < 2 and self.max_dataset_size != -1:
+            raise FlagError(f"--max-dataset-size is {self.max_dataset_size}; it must be at least 2, or -1 for all")
+
+    @property
+    def most(self) -> int:
+        """Maximum number of images to take."""
+        return sys.maxsize if self.max_dataset_size == -1 else self.max_dataset_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolycamFlags(PhoneFlags):
+    """Convert Polycam's raw export."""
+
+    min_blur_score: float = 25.0
+    """Minimum score of sharpness, from Polycam; images with a lower score are omitted."""
+    crop_border_pixels: int = 15
+    """Pixels to crop at each side, since Polycam's images may have a black border."""
+
+    def check(self) -> None:
+        super().check()
+        if self.crop_border_pixels < 0:
+            raise FlagError(f"--crop-border-pixels is {self.crop_border_pixels}; it must be at least 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record3DFlags(PhoneFlags):
+    """Convert Record3D's export with EXR and RGBD."""

@@ -259,7 +259,7 @@ class DatasetSettings(PathSettings):
     """Each camera of a split, in a folder OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png."""
 
     rendered_output_names: tuple[str, ...] = ("rgb", "gt-rgb")
-    """Outputs, from left to right, as of other paths; also gt-rgb: the photograph, and error: the difference from it."""
+    """Outputs, each in a folder: those of other paths, gt-rgb: the photograph, and error: the difference from it."""
     fps: float = 4.0
     """Frames per second of a video."""
     split: Literal["train", "val", "test"] = "test"

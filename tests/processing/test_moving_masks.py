@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.cli import process_data
-from nerfloom.cli.process_data import ImagesFlags
 from nerfloom.data.dataset import load_dataset
+from nerfloom.processing.kinds import KINDS
 from nerfloom.processing.moving_masks import mask_moving
+from nerfloom.processing.settings import ImagesFlags
 from nerfloom.registry import load_dataparser
 from tests.processing.scene import FOCAL, HEIGHT, WIDTH, photograph, pose_at, texture
 
@@ -69,12 +69,12 @@ def test_a_run_that_was_stopped_before_its_masks_goes_on_with_them(
     finished.write_text(json.dumps({"frames": [{"file_path": "images/a.png"}]}))
     flags = ImagesFlags(data=tmp_path, output_dir=tmp_path / "out", resume=True, mask_seconds=7, num_downscales=2)
     with_masks = dataclasses.replace(flags, mask_moving=True)
-    process_data._process_images(flags)
+    KINDS["images"].write(flags)
     assert made == []
-    process_data._process_images(with_masks)
+    KINDS["images"].write(with_masks)
     assert made == [(tmp_path / "out", 2, {"max_seconds": 7})]
     finished.write_text(json.dumps({"frames": [{"file_path": "images/a.png", "mask_path": "masks/a.png.png"}]}))
-    process_data._process_images(with_masks)
+    KINDS["images"].write(with_masks)
     assert len(made) == 1
 
 

@@ -66,7 +66,7 @@ class Checker:
             "nerfloom.cli.session.resume": begin,
             "nerfloom.training.load.load": begin,
             "nerfloom.cli.evaluate_geometry.read_reference": lambda flags: None,
-            "nerfloom.cli.process_data._check_input": begin,
+            "nerfloom.processing.kinds._check_input": begin,
             "nerfloom.cli.compare.compare": begin,
             "nerfloom.cli.stress.stress": stress,
             "nerfloom.downloads.install.announce": begin,

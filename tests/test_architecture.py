@@ -158,10 +158,12 @@ LAYERS = (
     ("registry",),
     ("evaluation",),
     ("training",),
+    ("video",),
     ("viewer",),
     ("export",),
     ("edit",),
     ("processing", "comparison", "downloads", "stress", "testing", "integrations", "benchmarks"),
+    ("opened",),
     ("cli",),
     ("runs",),
 )

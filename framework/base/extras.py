@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+from nerfloom.base.errors import ConfigError
+
 EXTRAS: dict[str, dict[str, str]] = {
     "video": {"imageio_ffmpeg": "'imageio[ffmpeg]'"},
     "plots": {"matplotlib": "matplotlib"},
@@ -28,6 +30,21 @@ def install_command(extra: str) -> str | None:
     """
     absent = [package for module, package in EXTRAS[extra].items() if find_spec(module) is None]
     return f"pip install {' '.join(absent)}" if absent else None
+
+
+def require(extra: str, what: str, otherwise: str = "") -> None:
+    """Refuse to go on if packages of an extra are missing.
+
+    Args:
+        extra: a key of `EXTRAS`.
+        what: beginning of the message, such as "a mesh needs".
+        otherwise: end of the message, such as "; or take another format".
+
+    Raises:
+        ConfigError: with the command that installs them.
+    """
+    if (advice := install_command(extra)) is not None:
+        raise ConfigError(f"{what} packages that are not installed: {advice}{otherwise}")
 
 
 def reinstall_command() -> str:

@@ -1,11 +1,26 @@
-"""Flags of every `ns-export`."""
+"""Flags of `ns-export`: a run, where to write, and the settings of an export."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
+from nerfloom.cli.region_flags import RegionFlags
 from nerfloom.cli.run_flags import RunFlags
+from nerfloom.export.settings import (
+    CameraSettings,
+    MarchingCubesSettings,
+    MeshSettings,
+    OccupancySettings,
+    PointSettings,
+    SplatSettings,
+    TsdfSettings,
+    WebSettings,
+)
+
+if TYPE_CHECKING:
+    from nerfloom.geometry.regions import Region
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,3 +29,59 @@ class ExportFlags(RunFlags):
 
     output_dir: Path
     """Folder to write to."""
+
+    def regions(self) -> list[Region]:
+        """Return the regions that are kept; none for everything."""
+        return []
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointFlags(PointSettings, RegionFlags, ExportFlags):
+    """Write point_cloud.ply: points at the median depth of random training rays."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraFlags(CameraSettings, ExportFlags):
+    """Write cameras as nerfstudio/transforms.json, colmap/sparse/0/*.txt, and transforms_train.json."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancyFlags(OccupancySettings, ExportFlags):
+    """Write occupancy.npz, the occupancy grid, and occupancy.ply, its occupied cells."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatFlags(SplatSettings, RegionFlags, ExportFlags):
+    """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
+
+    format: Literal["ply", "spz"] = "ply"
+    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebFlags(WebSettings, RegionFlags, ExportFlags):
+    """Write scene.html: a page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field.
+
+    Beside it, scene.jpg is the start view, for link previews.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshFlags(MeshSettings, ExportFlags):
+    """Flags of every mesh."""
+
+    format: Literal["ply", "obj", "glb"] = "ply"
+    """File format; ply is the smallest and fastest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarchingCubesFlags(MarchingCubesSettings, MeshFlags):
+    """Write a mesh of the surface of a field, with colours and normals.
+
+    The surface is where the density passes a level, or where a signed distance is zero.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class TsdfFlags(TsdfSettings, MeshFlags):
+    """Write a mesh of what the training cameras see, from their fused depth images; works with every method."""

@@ -8,20 +8,26 @@ from pathlib import Path
 from statistics import fmean
 
 import torch
+from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say, track
-from nerfloom.base.errors import ConfigError, FlagError, printable
+from nerfloom.base.errors import ConfigError, FlagError, nearest, printable, shown
 from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.framing import framed
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import measure, spread, views_to_judge
+from nerfloom.evaluation.images import to_uint8
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.evaluation.paths import around
+from nerfloom.evaluation.videos import write_images
 from nerfloom.export.cameras import refined_cameras
+from nerfloom.export.settings import WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
+    PICTURE,
     PageFacts,
     camera_rows,
     check_size,
@@ -29,9 +35,11 @@ from nerfloom.export.web import (
     gaussians_of,
     make_page,
     pinhole,
+    shown_cameras,
     upright,
 )
 from nerfloom.geometry.regions import Region, inside_all
+from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.method import Method
 from nerfloom.renderable import Renderable, RendersRays
 from nerfloom.scene.folded_poses import in_order
@@ -42,6 +50,8 @@ from nerfloom.splats.transform import transformed
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
 
+PICTURE_SUFFIX = ".jpg"
+"""Suffix of the picture of link previews, beside the page."""
 MAX_VIEWS = 5
 """Maximum number of views for comparing a page with the model."""
 
@@ -71,56 +81,57 @@ class Closeness:
 def export_page(
     loaded: Loaded,
     path: Path,
-    max_megabytes: float,
-    fit_seconds: float,
-    moment: float | None,
+    settings: WebSettings,
     splatting: Method,
     regions: Sequence[Region] = (),
 ) -> None:
     """Write the web page of a run or a file of Gaussians, and say its size and how close it comes.
 
+    A JPEG file of the start view, for link previews, is written beside it.
+
     Args:
         loaded: the run or file.
         path: file to write.
-        max_megabytes: maximum size of the page, in millions of bytes.
-        fit_seconds: time for fitting Gaussians to a field, seconds.
-        moment: time that the page shows of a scene that moves, 0 to 1; 0 if None.
-        splatting: the method that fits them.
+        settings: settings of the page.
+        splatting: the method that fits Gaussians to a field.
         regions: the page shows what is in all of these, in the frame of exports; it is then not compared.
 
     Raises:
-        ConfigError: if the flags do not fit the run, or there is nothing to show.
+        ConfigError: if the settings do not fit the run, or there is nothing to show.
     """
-    check_size(max_megabytes)
+    check_size(settings.max_megabytes)
+    check_url(settings.url)
     model = loaded.model
-    moment = moment_of(model.scene.moving, moment)
+    moment = moment_of(model.scene.moving, settings.time)
     dataset = None if loaded.source is None else _at(loaded.dataset("train"), moment)
-    if dataset is None:
-        cameras = around(model.scene)
-        names = [f"view {number + 1}" for number in range(len(cameras))]
-    else:
-        cameras, names = pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
+    cameras, names = _cameras(model, dataset)
+    order = in_order(names)  # data formats sort 10.jpg before 2.jpg
+    start = start_of([names[index] for index in order], settings.start_view)
+    ranks = shown_cameras(len(order), start)
+    chosen = torch.tensor([order[rank] for rank in ranks])
     near = smallest_depth(model.scene)
-    found, look = _gaussians(loaded, dataset, cameras, fit_seconds, moment, splatting)
+    found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment, splatting)
     good = _finite(found)
     good = good[inside_all(loaded.placement.original_points(good.means), regions)]
     turn = upright(cameras)
-    order = in_order(names)  # data formats sort 10.jpg before 2.jpg
     red, green, blue = model.background.tolist()
     facts = PageFacts(
-        title=_title(loaded),
+        title=_title(loaded) if settings.title is None else printable(settings.title),
         about=_about(loaded, moment),
         background=(red, green, blue),
         near=near,
         look=look,
         focus=focus_of(cameras, turn),
-        cameras=camera_rows(cameras[torch.tensor(order)], [printable(names[i]) for i in order], turn),
+        cameras=camera_rows(cameras[chosen], [printable(names[i]) for i in chosen.tolist()], turn),
         unit_length=loaded.unit,
         unit=loaded.scale.unit,
         relative_error=loaded.scale.relative_error,
         photographed=dataset is not None,
+        start=ranks.index(start),
+        url=settings.url or "",
+        picture=path.with_suffix(PICTURE_SUFFIX).name,
     )
-    text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, max_megabytes)
+    text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, settings.max_megabytes)
     for cost in costs:
         say(cost)
     content = text.encode("utf-8", "replace")
@@ -129,9 +140,55 @@ def export_page(
     say(f"{len(content) / 1e6:.2f} MB, {len(drawn):,} Gaussians of degree {drawn.degree}: {path}")
     if moment is not None:
         say(f"the scene moves, and the page shows it at time {moment:g}, still")
+    back = transformed(drawn, turn.T, 1.0, torch.zeros(3)).map(lambda values: values.to(model.device))
+    camera = framed(cameras[order[start] : order[start] + 1], *PICTURE).to(model.device)
+    _write_picture(path.with_suffix(PICTURE_SUFFIX), back, splat_camera(camera, near, look), model.background)
     if not regions:
-        back = transformed(drawn, turn.T, 1.0, torch.zeros(3))
         say(_closeness_to(loaded, back, dataset, cameras, near, look, moment).line())
+
+
+def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
+    """Return the cameras of a page and their names: those of the photographs, or some around a scene without."""
+    if dataset is None:
+        cameras = around(model.scene)
+        return cameras, [f"view {number + 1}" for number in range(len(cameras))]
+    return pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
+
+
+def _write_picture(path: Path, gaussians: Gaussians, camera: SplatCamera, background: Tensor) -> None:
+    """Write the picture of link previews."""
+    with torch.no_grad():
+        picture = draw_colors(gaussians, camera, 1, background)
+    write_images([path], [to_uint8(picture)])
+
+
+def start_of(names: Sequence[str], wanted: str | None) -> int:
+    """Return the number of the camera from which a page starts.
+
+    Args:
+        names: names of the cameras' images, in the page's order.
+        wanted: name of one, with or without folder and extension; None for the first.
+
+    Raises:
+        ConfigError: if no camera or several have the name.
+    """
+    if wanted is None:
+        return 0
+    found = [index for index, name in enumerate(names) if wanted in (name, Path(name).name, Path(name).stem)]
+    if len(found) != 1:
+        how_many = f"{len(found)} training images have" if found else "no training image has"
+        raise ConfigError(f"--start-view {wanted}: {how_many} this name. {nearest(wanted, names)}")
+    return found[0]
+
+
+def check_url(url: str | None) -> None:
+    """Refuse an address, `url`, that is none of a page; None is accepted.
+
+    Raises:
+        FlagError: with what an address begins with.
+    """
+    if url is not None and not url.startswith(("https://", "http://")):
+        raise FlagError(f"--url is {shown(url)}; it must begin with https:// or http://")
 
 
 def _closeness_to(
@@ -143,12 +200,12 @@ def _closeness_to(
     look: Look,
     moment: float | None,
 ) -> Closeness:
-    """Compare Gaussians in the scene's frame with a run or file, on held-out views if there are any."""
+    """Compare Gaussians in the scene's frame, on the model's device, on held-out views if there are any."""
     model = loaded.model
     held_out = None if loaded.source is None else first_split(loaded.source, ("test", "val"))
     views = dataset if held_out is None else _at(held_out.to(model.device), moment)
     seen = cameras.to(model.device) if views is None else views.cameras
-    return closeness(model, drawn.map(lambda values: values.to(model.device)), seen, views, near, look, moment)
+    return closeness(model, drawn, seen, views, near, look, moment)
 
 
 def _gaussians(

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin
 
 import torch
 from torch import Tensor
@@ -36,6 +37,8 @@ BITS = (8, 8)
 """Bits of harmonics where there is room: the page looks like the Gaussians to 55 dB, with SPZ's usual 5 and 4 to 41."""
 MAX_CAMERAS = 300
 """Maximum number of the capture's cameras in a page, evenly spaced."""
+PICTURE = (1200, 630)
+"""Width and height of the picture of link previews, pixels, in the aspect ratio that most programs show."""
 SCRIPTS = ("spz.js", "splats.js", "measure.js", "viewer.js")
 """Files of the page's program, in their order."""
 LEVEL = 0.5
@@ -71,6 +74,12 @@ class PageFacts:
     """Standard deviation of `unit_length`, as a fraction of it; None if it is not known."""
     photographed: bool = True
     """Whether `cameras` are those of photographs, which say how precise a length is."""
+    start: int = 0
+    """Number of the camera, of `cameras`, from which the page starts."""
+    url: str = ""
+    """Address that the page will have; empty if unknown."""
+    picture: str = ""
+    """Name of a picture of PICTURE pixels beside the page, for link previews; empty for none."""
 
 
 def upright(cameras: Cameras) -> Tensor:
@@ -108,20 +117,33 @@ def pinhole(cameras: Cameras) -> Cameras:
     return replace(cameras, model="pinhole", lens=None)
 
 
+def shown_cameras(count: int, start: int) -> list[int]:
+    """Return the numbers of the cameras in a page: at most MAX_CAMERAS, evenly spaced, and `start` among them.
+
+    Args:
+        count: number of all cameras.
+        start: number of the camera from which the page starts.
+    """
+    if count <= MAX_CAMERAS:
+        return list(range(count))
+    chosen = [rank * count // MAX_CAMERAS for rank in range(MAX_CAMERAS)]
+    nearest = min(range(MAX_CAMERAS), key=lambda rank: abs(chosen[rank] - start))
+    chosen[nearest] = start
+    return chosen
+
+
 def camera_rows(cameras: Cameras, names: Sequence[str], turn: Tensor) -> list[list[Any]]:
-    """Return the rows of `PageFacts.cameras`, of at most MAX_CAMERAS cameras.
+    """Return the rows of `PageFacts.cameras`.
 
     Args:
         cameras: M pinhole cameras.
         names: M names of their images.
         turn: (3, 3) rotation of the scene.
     """
-    count = len(cameras)
-    chosen = [rank * count // MAX_CAMERAS for rank in range(MAX_CAMERAS)] if count > MAX_CAMERAS else range(count)
     poses = turn @ cameras.camera_to_worlds.double().cpu()
     lenses = torch.stack([getattr(cameras, k).double() for k in ("fx", "fy", "cx", "cy", "widths", "heights")], -1)
     rows = []
-    for index in chosen:
+    for index in range(len(cameras)):
         pose = [round(value, 7) for value in poses[index].flatten().tolist()]
         rows.append([names[index], pose, [round(value, 4) for value in lenses[index].tolist()]])
     return rows
@@ -193,6 +215,7 @@ def page(payload: bytes, facts: PageFacts) -> str:
         "title": html.escape(facts.title),
         "about": html.escape(facts.about),
         "lengths": html.escape(f"lengths are in {facts.unit or 'the unit of the input'}"),
+        "preview": preview_tags(facts),
         "version": html.escape(nerfloom.__version__),
         "style": (folder / "viewer.css").read_text(encoding="utf-8"),
         "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS),
@@ -201,6 +224,24 @@ def page(payload: bytes, facts: PageFacts) -> str:
     }
     template = (folder / "viewer.html").read_text(encoding="utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)
+
+
+def preview_tags(facts: PageFacts) -> str:
+    """Return the elements of a page's head that link previews read, in the Open Graph protocol (https://ogp.me).
+
+    Args:
+        facts: data of the page. Without `url`, the picture's address is relative, which some programs do not follow.
+    """
+    width, height = PICTURE
+    tags = {"og:type": "website", "og:title": facts.title, "og:description": facts.about}
+    if facts.url:
+        tags["og:url"] = facts.url
+    if facts.picture:
+        tags |= {"og:image": urljoin(facts.url, facts.picture), "og:image:width": str(width)}
+        tags |= {"og:image:height": str(height), "og:image:alt": facts.title}
+    lines = [f'<meta property="{name}" content="{html.escape(value)}">' for name, value in tags.items()]
+    card = "summary_large_image" if facts.picture else "summary"
+    return "\n".join([*lines, f'<meta name="twitter:card" content="{card}">'])
 
 
 def payload_of(text: str) -> bytes:

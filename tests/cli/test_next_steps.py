@@ -26,7 +26,8 @@ def test_the_path_suits_the_scene() -> None:
     assert commands(OBJECT)[1][:3] == ["ns-render", "orbit", "outputs/mine/nerfacto/1"]
     assert commands(replace(OBJECT, unbounded=True))[1][1] == "interpolate"
     assert commands(replace(OBJECT, unbounded=True, warped=True))[1][1] == "spiral"
-    assert [words[0] for words in commands(OBJECT)] == ["ns-viewer", "ns-render", "ns-eval"]
+    assert [words[0] for words in commands(OBJECT)] == ["ns-viewer", "ns-render", "ns-export", "ns-eval"]
+    assert [words[0] for words in commands(replace(OBJECT, warped=True))] == ["ns-viewer", "ns-render", "ns-eval"]
     assert [words[0] for words in commands(replace(OBJECT, num_scenes=3))] == ["ns-eval"]
 
 

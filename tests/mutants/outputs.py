@@ -4,21 +4,23 @@ from tests.mutants.mutant import Mutant
 
 # fmt: off
 MUTANTS = {
-    "nerfloom.cli.export": [
-        Mutant("normals-in-scene-frame", "_points", "loaded.placement.original_directions(A)", "A.double()",
+    "nerfloom.export.point_cloud": [
+        Mutant("normals-in-scene-frame", "point_cloud", "loaded.placement.original_directions(A)", "A.double()",
             "normals are in another frame than their points",
             "truth/test_export.py::test_exported_points_normals_and_colours_are_in_the_captures_frame"),
-        Mutant("exported-poses-unrefined", "_cameras", "refined_cameras(loaded.model, A)", "A",
+    ],
+    "nerfloom.export.run_cameras": [
+        Mutant("exported-poses-unrefined", "export_cameras", "refined_cameras(loaded.model, A)", "A",
             "ns-export cameras writes the poses that came in",
             "truth/test_export.py::test_refined_cameras_are_exported_where_they_are_believed_to_be"),
     ],
-    "nerfloom.cli.render": [
+    "nerfloom.video.render": [
         Mutant("frames-of-other-cameras", "_facts", "hash_of_tensors(*A, B)", '""',
             "a render of another camera path goes on with frames of the one that was stopped",
             "cli/test_render_outputs.py::test_pictures_of_another_camera_path_are_left_alone"),
     ],
-    "nerfloom.cli.render_paths": [
-        Mutant("render-not-reduced", "path_views", "A * parsed.downscale_factor", "A",
+    "nerfloom.video.views": [
+        Mutant("render-not-reduced", "learnt_cameras", "A.scaled(1 / parsed.downscale_factor)", "A",
             "animations of large photographs are larger than what was learnt from",
             "truth/test_paths.py::test_pictures_have_the_size_that_was_learnt_from_reduced_as_asked_and_the_speed"),
         Mutant("time-stands", "path_views", "torch.linspace(0, 1, A)", "torch.zeros(A)",
@@ -124,6 +126,9 @@ MUTANTS = {
             "(A[:, 1].mean(), A[:, ::2].norm(dim=-1).mean())",
             "orbits are at the wrong height",
             "evaluation/test_paths.py::test_orbit_keeps_height_and_distance_and_looks_at_the_centre"),
+        Mutant("walk-at-even-cameras", "interpolate", "np.interp(A, B, C)", "A / starts[-1] * (len(part) - 1)",
+            "a video hurries where photographs are far apart, and lingers where they are dense",
+            "evaluation/test_paths.py::test_a_walk_goes_at_even_speed_past_uneven_cameras"),
         Mutant("orbit-direction", "look_at", "A - B", "B - A",
             "orbits look away from the scene", "evaluation/test_paths.py::test_look_at_from_the_x_axis"),
     ],

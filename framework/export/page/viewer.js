@@ -1,12 +1,14 @@
 // The page: a camera that mouse, fingers and keys move, and what stands around the picture.
 //
 // In the address, behind a #: camera=N starts at the Nth camera; plain=1 shows nothing but that camera's picture, pixel
-// by pixel; spin=1 turns around the scene; sort=here and inflate=here do without worker and DecompressionStream.
+// by pixel; spin=1 turns around the scene; quality=full draws every pixel and quality=fast a quarter of them; sort=here
+// and inflate=here do without worker and DecompressionStream.
 
 const element = (id) => document.getElementById(id);
 const canvas = element("canvas"), options = new URLSearchParams(location.hash.slice(1));
 const plain = options.get("plain") === "1", state = document.documentElement.dataset;
 const BACKGROUNDS = [[0, 0, 0], [0.5, 0.5, 0.5], [1, 1, 1]];
+const QUALITIES = ["automatic", "full", "fast"]; // automatic: coarser while it moves on a slow device
 const STEEPEST = 1.55; // radians
 const SLOW = 50, QUICK = 22; // milliseconds a frame
 
@@ -101,9 +103,10 @@ function show(gl, gaussians, facts) {
   let drawn = drawer(gl, gaussians, facts), lost = false, needsOrder = true, measuring = false;
   const measure = ruler(gaussians, facts);
   const sort = sortingElsewhere(gaussians.centers, plain || options.get("sort") === "here");
-  const cameras = facts.cameras, start = Math.max(chosen(options.get("camera")), 0);
+  const cameras = facts.cameras, asked = chosen(options.get("camera")), start = asked >= 0 ? asked : facts.start;
   let camera = start, view = viewOf(cameras[start], facts.focus), background = facts.background;
   let spinning = options.get("spin") === "1" && !plain, dirty = true, order = null, sortedFor = null, sorting = false;
+  let quality = Math.max(QUALITIES.indexOf(options.get("quality")), 0);
   const keys = new Set();
 
   function chosen(text) {
@@ -117,7 +120,7 @@ function show(gl, gaussians, facts) {
     const ratio = window.devicePixelRatio || 1;
     let width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
     if (plain) [width, height] = view.lens.slice(4);
-    const factor = plain || !moving ? 1 : coarse;
+    const factor = plain ? 1 : [moving ? coarse : 1, 1, 0.5][quality];
     width = Math.max(Math.round(width * factor), 1);
     height = Math.max(Math.round(height * factor), 1);
     if (plain) canvas.style.cssText = `width:${width / ratio}px;height:${height / ratio}px;right:auto;bottom:auto`;
@@ -313,6 +316,11 @@ function show(gl, gaussians, facts) {
     background = BACKGROUNDS[(at + 1) % BACKGROUNDS.length];
     dirty = true;
   };
+  const draw = (index) => {
+    quality = index % QUALITIES.length;
+    element("quality").textContent = state.quality = QUALITIES[quality];
+    dirty = true;
+  };
   const full = () => {
     const root = document.documentElement;
     if (document.fullscreenElement) document.exitFullscreen();
@@ -350,7 +358,7 @@ function show(gl, gaussians, facts) {
   slider.addEventListener("input", () => { spin(false); jump(Number(slider.value)); });
   for (const [id, action] of Object.entries({
     previous: () => jump(camera - 1), next: () => jump(camera + 1), reset, spin: () => spin(!spinning),
-    measure: () => setMeasuring(!measuring), behind, full,
+    measure: () => setMeasuring(!measuring), behind, full, quality: () => draw(quality + 1),
     ask: () => help(), close: () => help(false),
   })) element(id).addEventListener("click", action);
   if (!document.documentElement.requestFullscreen) element("full").hidden = true;
@@ -374,6 +382,7 @@ function show(gl, gaussians, facts) {
     }
   });
   jump(start);
+  draw(quality);
   spin(spinning);
   requestAnimationFrame(frame);
 }

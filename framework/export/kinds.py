@@ -1,0 +1,135 @@
+"""Exports by name, in the frame and units of the input: what `ns-export` and `run.export` write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, nearest
+from nerfloom.export.settings import (
+    CameraSettings,
+    MarchingCubesSettings,
+    OccupancySettings,
+    PointSettings,
+    SplatSettings,
+    TsdfSettings,
+    WebSettings,
+)
+
+if TYPE_CHECKING:
+    from nerfloom.geometry.regions import Region
+    from nerfloom.training.loaded import Loaded
+
+MESHES = (".ply", ".obj", ".glb")
+"""Suffixes of meshes."""
+
+
+class Kind(NamedTuple):
+    """A kind of export."""
+
+    settings: type[Any]
+    """Class of its settings."""
+    suffixes: tuple[str, ...]
+    """Suffixes that its file may have."""
+    write: Callable[[Loaded, Path, Any, Sequence[Region]], None]
+    """Function of what is exported, the file, settings and regions that writes the file."""
+    is_cropped: bool = False
+    """Whether it takes regions."""
+
+
+def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequence[Region] = ()) -> None:
+    """Write an export of a run or a file, and say what was written.
+
+    Args:
+        loaded: what is exported.
+        name: kind of export, a key of `KINDS`.
+        path: file to write.
+        settings: settings of that kind.
+        regions: what is in all of these is kept, in the frame and unit of exports; none for everything.
+
+    Raises:
+        ConfigError: if the kind, the file's suffix or a setting does not fit, or there is nothing to write.
+        DataError: if data that the export needs cannot be read.
+    """
+    kind = kind_named(name)
+    if path.suffix.lower() not in kind.suffixes:
+        raise ConfigError(f"{path}: {name} is written to {' or '.join(kind.suffixes)} files")
+    if regions and not kind.is_cropped:
+        croppable = ", ".join(other for other, one in KINDS.items() if one.is_cropped)
+        raise ConfigError(f"{name} takes no region; {croppable} do")
+    if loaded.model.scene.warped:
+        raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
+    if loaded.scale.is_known:
+        say(loaded.scale.words())
+    kind.write(loaded, path, settings, regions)
+
+
+def kind_named(name: str) -> Kind:
+    """Return the kind of export of a `name`.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    if name not in KINDS:
+        raise ConfigError(f"nothing is exported as '{name}'. {nearest(name, list(KINDS))}")
+    return KINDS[name]
+
+
+# Each imports on use, so that the help of the command is fast.
+
+
+def _points(loaded: Loaded, path: Path, settings: PointSettings, regions: Sequence[Region]) -> None:
+    from nerfloom.export.point_cloud import export_points
+
+    export_points(loaded, path, settings, regions)
+
+
+def _level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings, _: Sequence[Region]) -> None:
+    from nerfloom.export.run_mesh import export_level_set
+
+    export_level_set(loaded, path, settings)
+
+
+def _fused(loaded: Loaded, path: Path, settings: TsdfSettings, _: Sequence[Region]) -> None:
+    from nerfloom.export.run_mesh import export_fused
+
+    export_fused(loaded, path, settings)
+
+
+def _gaussians(loaded: Loaded, path: Path, settings: SplatSettings, regions: Sequence[Region]) -> None:
+    from nerfloom.export.run_gaussians import export_gaussians
+
+    export_gaussians(loaded, path, settings, regions)
+
+
+def _cameras(loaded: Loaded, path: Path, settings: CameraSettings, _: Sequence[Region]) -> None:
+    from nerfloom.export.run_cameras import export_cameras
+
+    export_cameras(loaded, path, settings)
+
+
+def _occupancy(loaded: Loaded, path: Path, settings: OccupancySettings, _: Sequence[Region]) -> None:
+    from nerfloom.export.run_occupancy import export_occupancy
+
+    export_occupancy(loaded, path, settings)
+
+
+def _page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[Region]) -> None:
+    from nerfloom.export.run_page import export_page
+    from nerfloom.registry import load_method
+
+    export_page(loaded, path, settings, load_method("gaussian-splatting"), regions)
+
+
+KINDS: dict[str, Kind] = {
+    "pointcloud": Kind(PointSettings, (".ply",), _points, is_cropped=True),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set),
+    "tsdf": Kind(TsdfSettings, MESHES, _fused),
+    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz"), _gaussians, is_cropped=True),
+    "cameras": Kind(CameraSettings, (".json",), _cameras),
+    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
+    "web": Kind(WebSettings, (".html",), _page, is_cropped=True),
+}
+"""Kinds of export by name."""

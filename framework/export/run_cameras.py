@@ -1,0 +1,54 @@
+"""Cameras of a run as files: nerfstudio's transforms.json, COLMAP's text model, and a list of the training cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.data.parsed_scene import ParsedScene
+from nerfloom.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
+from nerfloom.export.colmap_text import images_folder, write_model
+from nerfloom.export.settings import CameraSettings
+from nerfloom.export.transforms import write_transforms
+from nerfloom.training.loaded import Loaded
+from nerfloom.training.run import write_json
+
+
+def export_cameras(loaded: Loaded, path: Path, settings: CameraSettings) -> None:
+    """Write the cameras of all photographs, refined if the run refined them, and say where they are.
+
+    Beside the file are nerfstudio/transforms.json and colmap/sparse/0.
+
+    Args:
+        loaded: the run, or a file with photographs.
+        path: JSON file of the training cameras to write.
+        settings: settings of the cameras.
+
+    Raises:
+        ConfigError: for a file without photographs.
+        DataError: if they cannot be read.
+    """
+    # Load the images too: cameras of unreadable images are not in the model.
+    dataset = loaded.dataset("train")
+    refined = refined_cameras(loaded.model, dataset.cameras)
+    write_json(path, camera_list(refined, dataset.names, loaded.placement))
+    say(f"{len(refined)} training cameras: {path}")
+    scenes: dict[str, ParsedScene] = {}
+    for split in SPLITS:
+        try:
+            scenes[split] = loaded.run.parse(split)
+        except DataError as error:
+            say(f"no '{split}' cameras: {error}")
+    posed = posed_files(scenes, all_cameras(scenes, dataset.cameras, refined), loaded.placement)
+    file = path.parent / "nerfstudio" / "transforms.json"
+    write_transforms(file, posed, settings.relative_paths)
+    counts = ", ".join(f"{len(members)} {split}" for split, members in posed.splits.items())
+    say(f"{len(posed.files)} cameras ({counts}): {file}; train on it: ns-train METHOD --data {file.parent}")
+    model = path.parent / "colmap" / "sparse" / "0"
+    try:
+        write_model(model, posed)
+    except ConfigError as error:
+        say(f"no COLMAP model: {error}")
+    else:
+        say(f"COLMAP model: {model}; its images are in {images_folder(posed)}")

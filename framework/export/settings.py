@@ -1,0 +1,113 @@
+"""Settings of each export. This module does not import torch, so that help is fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointSettings:
+    """Points at the median depth of random training rays."""
+
+    num_points: int = 1_000_000
+    """Number of rays; rays without a surface, or with one beyond --reach, give no point."""
+    reach: float = 2.0
+    """Maximum distance of a point from the box's centre along each axis, in half edges of the box; 0: no limit."""
+    remove_outliers: bool = True
+    """Remove points that are farther from their 20 nearest neighbours than --std-ratio allows."""
+    std_ratio: float = 2.0
+    """Distance of an outlier from its neighbours, in standard deviations above the mean over all points."""
+    estimate_normals: bool = True
+    """Estimate normals from each point's neighbours if the method has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """Cameras of all photographs."""
+
+    relative_paths: bool = False
+    """Write image paths relative to transforms.json instead of absolute paths."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OccupancySettings:
+    """The occupancy grid, and its occupied cells."""
+
+    cells: Literal["centers", "boxes"] = "centers"
+    """Content of occupancy.ply: the cells' centres, or the surface of their boxes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatSettings:
+    """Gaussians for viewers and the code of 3D Gaussian Splatting."""
+
+    max_megabytes: float | None = None
+    """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
+    time: float | None = None
+    """Time of a moving scene, 0 to 1. Default: 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebSettings:
+    """A page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field."""
+
+    max_megabytes: float = 30.0
+    """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians last."""
+    fit_seconds: float = 60.0
+    """Seconds for fitting Gaussians to a field: rendering pictures of it and training on them."""
+    time: float | None = None
+    """Time of a moving scene, 0 to 1. Default: 0."""
+    title: str | None = None
+    """Heading of the page and of its link previews. Default: the run's names."""
+    start_view: str | None = None
+    """Training photograph, by its file name, from whose camera the page starts. Default: the first one."""
+    url: str | None = None
+    """Address that the page will have, as in https://example.org/cup/scene.html; link previews need it to find their
+    picture."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshSettings:
+    """Settings of every mesh."""
+
+    resolution: int = 256
+    """Number of cells along the longest edge of the box, up to 1024."""
+    bounding_box_min: tuple[float, float, float] | None = None
+    """Minimum corner x y z of the searched box, in the frame and units of the input. Default: the scene's box."""
+    bounding_box_max: tuple[float, float, float] | None = None
+    """Maximum corner x y z of that box."""
+    num_components: int = 0
+    """Maximum number of separate pieces to keep, largest first; 0: all."""
+    min_component_share: float = 0.001
+    """Remove pieces with fewer faces than this fraction of the largest piece's."""
+    target_num_faces: int | None = None
+    """Simplify the mesh to this number of faces. Default: no simplification."""
+    texture_size: int | None = None
+    """Edge length of a texture for obj and glb, texels, such as 4096. Default: no texture, colours at vertices."""
+    texture_seconds: float = 300.0
+    """Maximum seconds for the texture; the rest of it gets the vertices' colours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarchingCubesSettings(MeshSettings):
+    """A mesh of the surface of a field, with colours and normals.
+
+    The surface is where the density passes a level, or where a signed distance is zero.
+    """
+
+    isosurface_threshold: float | None = None
+    """Density of the surface, per scene unit. Default: the density at which 1/32 of the scene's box is half opaque."""
+    time: float = 0.0
+    """Time of a moving scene, 0 to 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TsdfSettings(MeshSettings):
+    """A mesh of what the training cameras see, from their fused depth images; works with every method."""
+
+    truncation: float = 4.0
+    """Depth images count up to this distance from the surface, cells; larger is smoother, smaller keeps thin
+    parts."""
+    max_num_views: int = 200
+    """Maximum number of rendered training views, evenly spaced."""

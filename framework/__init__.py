@@ -1,20 +1,19 @@
 """Neural radiance fields: the names for notebooks, scripts, methods and data formats.
 
-`load` loads a run for rendering and evaluation, and `train` trains a method (docs/notebooks). Use the occupancy grid,
-sampling and compositing with your own radiance field and training loop (docs/plug-and-play.md). A plugin declares a
-`Method` or a `DataParser` (docs/plugins.md).
+`process` finds the poses of photographs, `train` trains a method, and `load` loads a run, which renders, evaluates,
+measures, and writes videos and exports (docs/notebooks). `edit` has the steps that edit Gaussians. Use the occupancy
+grid, sampling and compositing with your own radiance field and training loop (docs/plug-and-play.md). A plugin declares
+a `Method` or a `DataParser` (docs/plugins.md).
 
 Names are imported on first use, so that `import nerfloom` is fast.
 """
 
-from __future__ import annotations
+import importlib as _importlib
+import os as _os
+import sys as _sys
+import typing as _typing
 
-import os
-import sys
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from nerfloom import edit as edit
     from nerfloom.base.config import RayConfig as RayConfig
     from nerfloom.base.config import TrainConfig as TrainConfig
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from nerfloom.data.pixels.batch import PixelBatch as PixelBatch
     from nerfloom.data.pixels.batch import ViewBatch as ViewBatch
     from nerfloom.data.scene import Scene as Scene
+    from nerfloom.evaluation.paths import look_at as look_at
     from nerfloom.fields.base import Field as Field
     from nerfloom.gaussian_model import GaussianModel as GaussianModel
     from nerfloom.geometry.bounds import contract as contract
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from nerfloom.model import LearnsMotion as LearnsMotion
     from nerfloom.model import Loss as Loss
     from nerfloom.model import Model as Model
+    from nerfloom.opened import Opened as Opened
     from nerfloom.plug_and_play.rendering import Rendering as Rendering
     from nerfloom.plug_and_play.rendering import accumulate as accumulate
     from nerfloom.plug_and_play.rendering import render as render
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
     from nerfloom.runs import image as image
     from nerfloom.runs import list_methods as list_methods
     from nerfloom.runs import load as load
+    from nerfloom.runs import process as process
     from nerfloom.runs import train as train
     from nerfloom.samplers.base import Sampler as Sampler
     from nerfloom.samplers.proposal import interlevel_loss as interlevel_loss
@@ -87,6 +89,7 @@ _HOMES = {
     "Model": "model",
     "NerfloomError": "base.errors",
     "OccupancyGrid": "plug_and_play.skipping",
+    "Opened": "opened",
     "Optimised": "base.optimised",
     "ParsedScene": "data.parsed_scene",
     "Picture": "rendering.rendered",
@@ -120,6 +123,8 @@ _HOMES = {
     "inverse_cdf": "kernels.histograms.inverse_cdf",
     "list_methods": "runs",
     "load": "runs",
+    "look_at": "evaluation.paths",
+    "process": "runs",
     "render": "plug_and_play.rendering",
     "sample": "plug_and_play.skipping",
     "sample_inverse_cdf": "plug_and_play.sampling",
@@ -132,21 +137,21 @@ _HOMES = {
 # By default torch's idle threads spin for milliseconds. On a busy machine that makes training up to four times slower
 # than its share of the cores would. GNU's OpenMP reads the first variable (in iterations, about 20 microseconds), those
 # of LLVM and Intel the second (in milliseconds). Both are read when torch is loaded.
-if "torch" not in sys.modules and "OMP_WAIT_POLICY" not in os.environ:
-    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-    os.environ.setdefault("KMP_BLOCKTIME", "1")
+if "torch" not in _sys.modules and "OMP_WAIT_POLICY" not in _os.environ:
+    _os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    _os.environ.setdefault("KMP_BLOCKTIME", "1")
 
 __version__ = "0.1.0"
 __all__ = sorted(_HOMES)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> _typing.Any:
     if name in _HOMES:
-        return getattr(import_module(f"nerfloom.{_HOMES[name]}"), name)
+        return getattr(_importlib.import_module(f"nerfloom.{_HOMES[name]}"), name)
     if name == "edit":
-        return import_module("nerfloom.edit")
+        return _importlib.import_module("nerfloom.edit")
     raise AttributeError(f"module 'nerfloom' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return sorted([*__all__, "edit", *(name for name in globals() if name.startswith("__"))])

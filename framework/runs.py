@@ -1,17 +1,19 @@
-"""Functions for notebooks and scripts: train a method, load a run, show an image."""
+"""Functions for notebooks and scripts: find poses of photographs, train a method, load a run, show an image."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from nerfloom.base.arguments import arguments_of
 from nerfloom.base.config import from_plain, to_plain
+from nerfloom.base.errors import ConfigError, nearest
 from nerfloom.base.step_limit import limited_as_given
+from nerfloom.opened import Opened
 from nerfloom.registry import load_dataparser, load_method, registered, summary
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.data_folder import find_data
-from nerfloom.training.load import load as opened
-from nerfloom.training.loaded import Loaded
+from nerfloom.training.load import load as loaded
 from nerfloom.training.run import Run, run_folder
 from nerfloom.training.run_path import config_file
 
@@ -27,7 +29,7 @@ def list_methods() -> dict[str, str]:
     return {name: summary(entry) for name, entry in registered("methods").items()}
 
 
-def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Loaded:
+def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Opened:
     """Load a trained run, a file of Gaussians, or an octree.
 
     Args:
@@ -41,10 +43,36 @@ def load(path: str | Path, data: str | Path | None = None, device: Device = "aut
         CheckpointError: if the checkpoint is missing or does not fit the settings.
         DataError: if the file cannot be read.
     """
-    return opened(config_file(Path(path)), device_type=device, data=None if data is None else Path(data))
+    return Opened.of(loaded(config_file(Path(path)), device_type=device, data=None if data is None else Path(data)))
 
 
-def train(method: str, data: str | Path | None = None, format: str | None = None, **settings: Any) -> Loaded:
+def process(photographs: str | Path, output_dir: str | Path, kind: str = "images", **settings: Any) -> Path:
+    """Find the poses of photographs, as `ns-process-data` does, and return the data folder.
+
+    Args:
+        photographs: folder of photographs, a video, or the export of a phone's app.
+        output_dir: folder to write; new or empty.
+        kind: images, video (each takes the other's input, too), polycam or record3d.
+        settings: flags of `ns-process-data` by name, with underscores, as in `matching_method="sequential"`.
+
+    Raises:
+        ConfigError: if the kind or a setting is unknown or out of range, or COLMAP is missing.
+        DataError: if the photographs cannot be used.
+    """
+    from nerfloom.processing.kinds import KINDS
+    from nerfloom.processing.kinds import process as processed
+    from nerfloom.processing.listing import kind_of
+
+    if kind not in KINDS:
+        raise ConfigError(f"unknown kind '{kind}'. {nearest(kind, list(KINDS))}")
+    kind, data = kind_of(kind, Path(photographs))
+    flags = KINDS[kind].flags
+    given = {**settings, "data": data, "output_dir": Path(output_dir)}
+    processed(kind, flags(**arguments_of(flags, given, "process()")))
+    return Path(output_dir)
+
+
+def train(method: str, data: str | Path | None = None, format: str | None = None, **settings: Any) -> Opened:
     """Train a method as `ns-train` does, and load the result.
 
     Args:

@@ -35,6 +35,8 @@ SMOOTHING = 24
 """Number of cameras divided by the standard deviation, in cameras, of the weights of an interpolated path."""
 MIN_WIDTH = 0.5
 """Minimum of that standard deviation, cameras."""
+CONTINUED = 4.0
+"""Length, in such deviations, by which a stretch is continued beyond its ends for the means there."""
 MEASURED = 1000
 """Number of positions by which the length of a stretch of a path is measured."""
 MIN_MEAN_DIRECTION = 0.7
@@ -241,12 +243,22 @@ def _lengths(poses: Tensor, width: float, reach: float, closed: bool) -> np.ndar
 
 
 def _smoothed(poses: Tensor, places: Tensor, width: float, closed: bool) -> Tensor:
-    """Return the means (F, 3, 4) of poses (M, 3, 4) with Gaussian weights around places (F,), in cameras."""
-    apart = places[:, None] - torch.arange(len(poses))
+    """Return the means (F, 3, 4) of poses (M, 3, 4) with Gaussian weights around places (F,), in cameras.
+
+    Beyond an end that is not closed, the poses are continued by their reflection in the last one, so that the means
+    start and end with the first and the last pose.
+    """
+    last, margin = len(poses) - 1, math.ceil(CONTINUED * width)
     if closed:
-        apart = torch.remainder(apart + len(poses) / 2, len(poses)) - len(poses) / 2
-    weights = torch.exp(-0.5 * (apart / width).square())
-    means = torch.einsum("fm,mij->fij", weights / weights.sum(-1, keepdim=True), poses)
+        numbers = torch.arange(-margin, last + margin + 1)
+        known = poses[numbers % len(poses)]
+    else:
+        margin = min(margin, last)
+        numbers = torch.arange(-margin, last + margin + 1)
+        reflected = last - (last - numbers.abs()).abs()
+        known = 2 * poses[numbers.clamp(0, last)] - poses[reflected]
+    weights = torch.exp(-0.5 * ((places[:, None] - numbers) / width).square())
+    means = torch.einsum("fm,mij->fij", weights / weights.sum(-1, keepdim=True), known)
     return torch.cat([nearest_rotations(means[:, :, :3]), means[:, :, 3:]], dim=-1)
 
 

@@ -59,11 +59,23 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
     if regions and not kind.is_cropped:
         croppable = ", ".join(other for other, one in KINDS.items() if one.is_cropped)
         raise ConfigError(f"{name} takes no region; {croppable} do")
-    if loaded.model.scene.warped:
-        raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
+    check_scale(loaded)
     if loaded.scale.is_known:
         say(loaded.scale.words())
     kind.write(loaded, path, settings, regions)
+
+
+def check_scale(loaded: Loaded) -> None:
+    """Refuse a run whose scene has no scale.
+
+    Args:
+        loaded: what is exported.
+
+    Raises:
+        ConfigError: if it is in normalised device coordinates.
+    """
+    if loaded.model.scene.warped:
+        raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
 
 
 def kind_named(name: str) -> Kind:

@@ -1,16 +1,14 @@
 """ns-render of a scene that moves."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 from PIL import Image
 
-from nerfloom.cameras.cameras import Cameras
 from nerfloom.cli.render import main
-from nerfloom.cli.render_paths import walk_past
+from nerfloom.evaluation.paths import Walk
+from nerfloom.video.views import about
 from tests.conftest import EditJson, Refused
 from tests.training.helpers import tiny_trainer
 
@@ -58,15 +56,12 @@ def test_what_cannot_be_is_refused(moving_run: Path, shared_tiny: Path, tmp_path
     assert "has cameras 0 to" in refused(main, "time", "--load-config", moving_run, "--camera-index", 99, status=2)
 
 
-def test_a_walk_passes_photograph_2_before_photograph_10(capsys: pytest.CaptureFixture[str]) -> None:
-    names = sorted(f"{number}.jpg" for number in range(1, 31))  # 1, 10, 11, ..., 2, 20, ...: as data formats sort them
-    poses = torch.eye(4)[:3].repeat(len(names), 1, 1)
-    poses[:, 0, 3] = torch.tensor([float(Path(name).stem) for name in names])
-    ones = torch.ones(len(names))
-    cameras = Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
-    parsed: Any = SimpleNamespace(image_paths=[Path("images") / name for name in names], cameras=cameras)
-    assert bool((walk_past(parsed, 60).camera_to_worlds[:, 0, 3].diff() > 0).all())
-    assert capsys.readouterr().err == ""
-    poses[:, 0, 3] += 100.0 * (poses[:, 0, 3] > 12)
-    walk_past(parsed, 60)
-    assert "the photographs' walk jumps once" in capsys.readouterr().err
+def test_what_a_walk_leaves_out_and_where_it_jumps_is_said() -> None:
+    whole, first, second = torch.arange(9), torch.arange(3), torch.arange(4, 9)
+    assert about(Walk((whole,), closed=True), 9) == []
+    (jump,) = about(Walk((first, torch.arange(3, 9))), 9)
+    assert "jumps once" in jump
+    left, jump = about(Walk((first, second)), 9)
+    assert "1 of 9 photographs" in left
+    (jumps,) = about(Walk((first, torch.arange(3, 6), torch.arange(6, 9))), 9)
+    assert "jumps 2 times" in jumps

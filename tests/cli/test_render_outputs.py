@@ -108,7 +108,18 @@ def test_colours_of_depth_have_one_range_for_the_whole_video(
     capture_run: Path, shows_a_ball: float, tmp_path: Path
 ) -> None:
     pytest.importorskip("imageio_ffmpeg")
-    words = ("--rendered-output-names", "rgb", "depth", "accumulation", "--num-frames", 4, "--fps", 8)
+    words = (
+        "--rendered-output-names",
+        "rgb",
+        "depth",
+        "accumulation",
+        "--num-frames",
+        4,
+        "--fps",
+        8,
+        "--loop",
+        "False",
+    )
     done = called("ns-render", "interpolate", capture_run, "--output-path", tmp_path / "a.mp4", *words)
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("depth: ")]
@@ -312,6 +323,12 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     assert "near must be from 0 to far" in said("orbit", nowhere, "--depth-near-plane", 3, "--depth-far-plane", 2)
     assert "--fps more than 0" in said("orbit", nowhere, "--fps", 0)
     assert "--radius is -1; it must be above zero" in said("spiral", nowhere, "--radius", -1)
+    assert "--seconds is 0; it must be above zero" in said("interpolate", nowhere, "--seconds", 0)
+    assert "--width is 0" in said("time", nowhere, "--width", 0)
+    assert "--fov is 180" in said("camera-path", nowhere, "--fov", 180)
+    assert "'pink' is no colour" in said("orbit", nowhere, "--background", "pink")
+    words = ("--frame", "exports", "--dataparser-transforms", nowhere)
+    assert "--frame exports has none" in said("camera-path", nowhere, *words)
     avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi", status=2)
     assert avi.endswith("the extension must be .mp4, .gif, .webp, .png, or none for a folder of images")
     assert "no such output" in said("orbit", ball_run, names, "normals", "--num-frames", 1, status=1)
@@ -329,3 +346,50 @@ def test_the_bound_of_the_error_is_said(ball_run: Path, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "at most 0.0039" in done.stderr
+
+
+def test_a_video_has_the_size_the_opening_and_the_length_that_are_asked_for(
+    ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[View] = []
+
+    def render_view(model: Any, view: View, background: Tensor) -> Picture:
+        asked.append(view)
+        grey = background.expand(view.height, view.width, 3)
+        return Picture(grey, *[torch.ones(view.height, view.width)] * 3)
+
+    monkeypatch.setattr(RayModel, "render_view", render_view)
+    size = ("--seconds", 0.2, "--fps", 20, "--width", 32, "--height", 18, "--fov", 60, "--background", "#ff8000")
+    done = called("ns-render", "orbit", ball_run, *size, "--output-path", tmp_path / "frames")
+    assert done.returncode == 0, done.stderr
+    assert [(view.width, view.height) for view in asked] == [(32, 18)] * 4
+    for view in asked:
+        # Half of 60 degrees of the height; by the aspect ratio, the width shows 2 atan(32 / 18 tan 30 deg).
+        assert float(view.camera.fy[0]) == pytest.approx(9 / math.tan(math.radians(30)))
+        opening = 2 * math.atan(32 / 2 / float(view.camera.fx[0]))
+        assert opening == pytest.approx(2 * math.atan(32 / 18 * math.tan(math.radians(30))))
+    assert iio.imread(tmp_path / "frames" / "00003.png")[9, 16].tolist() == [255, 128, 0]
+    assert "the other 2 frames take about" in done.stderr
+
+
+def test_a_path_around_exports_is_in_their_frame(
+    capture_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera where a photograph's is in the frame of the input sees what the photograph does in the scene."""
+    asked: list[View] = []
+
+    def render_view(model: Any, view: View, background: Tensor) -> Picture:
+        asked.append(view)
+        return Picture(torch.zeros(view.height, view.width, 3), *[torch.ones(view.height, view.width)] * 3)
+
+    monkeypatch.setattr(RayModel, "render_view", render_view)
+    loaded = load_trained(capture_run)
+    camera = loaded.run.parse("train").cameras.camera_to_worlds[2]
+    pose = loaded.placement.original_poses(camera[None])[0]
+    frame = {"camera_to_world": [*pose.flatten().tolist(), 0, 0, 0, 1], "fov": 50}
+    path = {"render_height": 8, "render_width": 8, "fps": 4, "camera_path": [frame]}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    words = ("camera-path", capture_run, "--camera-path-filename", tmp_path / "path.json", "--frame", "exports")
+    done = called("ns-render", *words, "--output-path", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    torch.testing.assert_close(asked[0].camera.camera_to_worlds[0], camera, atol=1e-5, rtol=1e-5)

@@ -14,16 +14,19 @@ from nerfloom.cameras.ndc import Ndc, NdcCameras
 from nerfloom.cameras.poses import looked_at
 from nerfloom.evaluation.paths import (
     Arc,
+    Walk,
     arc_of,
     focus_distance,
+    fractions,
     interpolate,
     look_at,
     look_same_way,
     middle_pose,
     orbit,
     replace_poses,
+    shortest_order,
     spiral,
-    stretches,
+    walk_of,
 )
 
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -34,6 +37,7 @@ def test_look_at_from_the_x_axis() -> None:
     # Looking along -x: the camera's z is world x, its y is world z, so its x is y cross z = world y.
     expected = torch.tensor([[0.0, 0, 1, 3], [1, 0, 0, 0], [0, 1, 0, 0]])
     torch.testing.assert_close(pose, expected)
+    torch.testing.assert_close(look_at([3, 0, 0], [0, 0, 0]), expected)  # numbers will do, and z is up
 
 
 @pytest.mark.parametrize("position", [(0.0, 0.0, 2.0), (0.0, 0.0, -2.0), (1.0, 2.0, 3.0)])
@@ -50,7 +54,7 @@ def test_orbit_keeps_height_and_distance_and_looks_at_the_centre() -> None:
     poses[1, :, 3] = torch.tensor([0.0, 5, 3])
     ones = torch.ones(2)
     cameras = Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
-    path = orbit(cameras, torch.zeros(3), 8)
+    path = orbit(cameras, torch.zeros(3), fractions(8))
     centers = path.camera_to_worlds[:, :, 3]
     torch.testing.assert_close(centers[:, 2], torch.full((8,), 2.0))
     torch.testing.assert_close(centers[:, :2].norm(dim=-1), torch.full((8,), 4.0))
@@ -58,6 +62,22 @@ def test_orbit_keeps_height_and_distance_and_looks_at_the_centre() -> None:
     torch.testing.assert_close(torch.linalg.cross(ahead, centers), torch.zeros(8, 3), atol=1e-5, rtol=0)
     for pose in path.camera_to_worlds:
         check_pose(pose, "orbit")
+    # Half as far away, at the same elevation.
+    near = orbit(cameras, torch.zeros(3), fractions(8), radius=2.0).camera_to_worlds
+    torch.testing.assert_close(near[:, :, 3], centers / 2)
+    torch.testing.assert_close(near[:, :, :3], path.camera_to_worlds[:, :, :3])
+
+
+def test_frames_are_even_or_ease_in_and_out() -> None:
+    assert fractions(4).tolist() == [0, 0.25, 0.5, 0.75]  # the first frame follows the last
+    assert fractions(5, closed=False).tolist() == [0, 0.25, 0.5, 0.75, 1]
+    assert fractions(1, closed=False).tolist() == [0]
+    eased = fractions(5, closed=False, ease=True)
+    assert eased.tolist() == [0, 0.15625, 0.5, 0.84375, 1]  # 3 u^2 - 2 u^3
+    fine = fractions(1001, closed=False, ease=True)
+    shares = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    speed = fine.diff() * 1000
+    torch.testing.assert_close(speed, 6 * (shares * (1 - shares))[:-1], atol=0.01, rtol=0)
 
 
 def standing(degrees: Tensor, radius: float = 2.0, center: tuple[float, float] = (0.3, -0.2)) -> Cameras:
@@ -100,7 +120,7 @@ def test_cameras_above_the_centre_do_not_close_a_gap() -> None:
 
 def test_an_orbit_swings_over_its_arc_and_ends_where_it_begins() -> None:
     cameras = standing(torch.linspace(100, 260, 20))
-    path = orbit(cameras, CENTER, 48, arc_of(cameras, CENTER))
+    path = orbit(cameras, CENTER, fractions(48), arc_of(cameras, CENTER))
     offsets = path.camera_to_worlds[:, :, 3] - CENTER
     degrees = torch.rad2deg(torch.atan2(offsets[:, 1], offsets[:, 0])) % 360
     assert float(degrees.min()) == pytest.approx(100, abs=0.01)
@@ -109,7 +129,7 @@ def test_an_orbit_swings_over_its_arc_and_ends_where_it_begins() -> None:
     assert float(turns.sum()) == pytest.approx(0, abs=1e-3)
     assert float(turns.abs().max()) < 80 * 2 * math.pi / 48 + 0.1  # no jump, as a film of it runs on and on
     torch.testing.assert_close(offsets[:, :2].norm(dim=-1), torch.full((48,), 2.0))
-    still = orbit(cameras, CENTER, 48, Arc(middle=0.5, width=0.0)).camera_to_worlds
+    still = orbit(cameras, CENTER, fractions(48), Arc(middle=0.5, width=0.0)).camera_to_worlds
     assert torch.equal(still, still[:1].expand(48, 3, 4))
 
 
@@ -125,26 +145,30 @@ def test_other_poses_keep_the_lens() -> None:
 
 
 def test_an_interpolated_path_is_a_walk_without_the_shaking() -> None:
-    """Cameras that turn about z along a circle, each shaken: the path is rigid, near and steadier."""
+    """Cameras that turn about z along a circle, each shaken: the path is rigid, near, steadier, and ends as they do."""
     draws = torch.Generator().manual_seed(0)
     angles = torch.linspace(0, 3, 72) + 0.02 * torch.randn(72, generator=draws)
     zero, one = torch.zeros(72), torch.ones(72)
     rotations = torch.stack([angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one], -1)
     centres = torch.stack([4 * angles.cos(), 4 * angles.sin(), zero], dim=-1)
     poses = torch.cat([rotations.view(72, 3, 3), centres[..., None]], dim=-1)
-    path = interpolate(Cameras(poses, one, one, one, one, one.long(), one.long()), 72).camera_to_worlds
+    cameras = Cameras(poses, one, one, one, one, one.long(), one.long())
+    path = interpolate(cameras, fractions(72, closed=False), walk_of(cameras)).camera_to_worlds
     for pose in path:
         check_pose(pose, "path")
     found = torch.atan2(path[:, 1, 0], path[:, 0, 0])
-    assert (found - torch.linspace(0, 3, 72)).abs()[8:-8].max() < 0.03
+    assert (found - torch.linspace(float(angles[0]), float(angles[-1]), 72)).abs().max() < 0.03
     assert found.diff().std() < 0.25 * angles.diff().std()
     assert (path[:, :, 3].norm(dim=-1) - 4).abs().max() < 0.1
+    torch.testing.assert_close(path[[0, -1]], poses[[0, -1]], atol=1e-3, rtol=0)
 
 
 def test_a_path_past_one_camera_stands_still() -> None:
     one = torch.ones(1)
     cameras = Cameras(torch.eye(4)[None, :3], one, one, one, one, one.long(), one.long())
-    torch.testing.assert_close(interpolate(cameras, 3).camera_to_worlds, torch.eye(4)[:3].repeat(3, 1, 1))
+    for closed in (False, True):
+        found = interpolate(cameras, fractions(3, closed), walk_of(cameras, closed)).camera_to_worlds
+        torch.testing.assert_close(found, torch.eye(4)[:3].repeat(3, 1, 1))
 
 
 def grid_of_cameras() -> Cameras:
@@ -157,7 +181,7 @@ def grid_of_cameras() -> Cameras:
 
 
 def test_a_spiral_turns_around_the_mean_camera_and_looks_at_one_point() -> None:
-    path = spiral(grid_of_cameras(), 16, focus=4.0, radius=0.5).camera_to_worlds
+    path = spiral(grid_of_cameras(), fractions(16), focus=4.0, radius=0.5).camera_to_worlds
     middle = torch.tensor([5.0, 6.0, 7.0])
     angles = torch.arange(16) * 2 * math.pi * 2 / 16  # two turns, and half of one back and forth
     expected = middle + 0.5 * torch.stack([angles.cos(), -angles.sin(), -(angles / 2).sin()], dim=-1)
@@ -169,8 +193,9 @@ def test_a_spiral_turns_around_the_mean_camera_and_looks_at_one_point() -> None:
 
 
 def test_the_radius_of_a_spiral_is_the_spread_of_the_cameras() -> None:
-    path = spiral(grid_of_cameras(), 400, focus=4.0).camera_to_worlds[:, :, 3] - torch.tensor([5.0, 6.0, 7.0])
+    centers = spiral(grid_of_cameras(), fractions(400), focus=4.0).camera_to_worlds[:, :, 3]
     # The 90th percentile of |x| in {0, 1} and of |y| in {0, 2}, each three and six times; z does not vary.
+    path = centers - torch.tensor([5.0, 6.0, 7.0])
     torch.testing.assert_close(path.abs().amax(0), torch.tensor([1.0, 2.0, 0.0]), atol=1e-3, rtol=0)
 
 
@@ -183,7 +208,7 @@ def test_around_an_object_a_spiral_starts_from_the_first_camera() -> None:
     cameras = Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
     assert not look_same_way(cameras)
     assert torch.equal(middle_pose(cameras), poses[0])
-    offsets = spiral(cameras, 8, focus=3.0).camera_to_worlds[:, :, 3] - poses[0, :, 3]
+    offsets = spiral(cameras, fractions(8), focus=3.0).camera_to_worlds[:, :, 3] - poses[0, :, 3]
     torch.testing.assert_close(offsets[:, :2].norm(dim=-1), torch.full((8,), 0.3))
 
 
@@ -215,9 +240,14 @@ def along(places: list[float]) -> Cameras:
     return Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
 
 
+def parts_of(walk: Walk) -> list[list[int]]:
+    return [part.tolist() for part in walk.stretches]
+
+
 def test_a_path_does_not_fly_from_one_stretch_of_a_walk_to_the_next() -> None:
     near, far = [float(place) for place in range(10)], [50.0 + place for place in range(10)]
-    places = interpolate(along(near + far), 100).camera_to_worlds[:, 0, 3]
+    cameras = along(near + far)
+    places = interpolate(cameras, fractions(100, closed=False), walk_of(cameras)).camera_to_worlds[:, 0, 3]
     assert bool(((places < 9.01) | (places > 49.99)).all())
     assert float(places[0]) == pytest.approx(0, abs=1)
     assert float(places[-1]) == pytest.approx(59, abs=1)
@@ -226,12 +256,79 @@ def test_a_path_does_not_fly_from_one_stretch_of_a_walk_to_the_next() -> None:
 
 def test_what_stands_alone_between_two_jumps_is_not_passed() -> None:
     near, far = [float(place) for place in range(5)], [50.0 + place for place in range(5)]
-    assert [part.tolist() for part in stretches(along([*near, 30.0, *far]))] == [[0, 1, 2, 3, 4], [6, 7, 8, 9, 10]]
+    assert parts_of(walk_of(along([*near, 30.0, *far]))) == [[0, 1, 2, 3, 4], [6, 7, 8, 9, 10]]
 
 
 @pytest.mark.parametrize("places", [[0.0], [0.0, 7.0], [0.0, 100.0, 0.0, 200.0], [0.0, 0.0, 0.0, 1.0]])
 def test_few_cameras_are_one_stretch(places: list[float]) -> None:
-    assert [part.tolist() for part in stretches(along(places))] == [list(range(len(places)))]
+    assert parts_of(walk_of(along(places))) == [list(range(len(places)))]
+
+
+def test_a_walk_that_cannot_close_begins_behind_its_last_jump() -> None:
+    """From 4 back to 0 it would fly past everything; from the second stretch to the first one likewise."""
+    open_walk = walk_of(along([float(place) for place in range(10)]), closed=True)
+    assert (parts_of(open_walk), open_walk.closed) == ([list(range(10))], False)
+    ring = walk_of(standing(torch.arange(0, 360, 20)), closed=True)
+    assert (parts_of(ring), ring.closed) == ([list(range(18))], True)
+    arcs = walk_of(standing(torch.tensor([0, 5, 10, 15, 180, 185, 190, 195])), closed=True)
+    assert (parts_of(arcs), arcs.closed) == ([[0, 1, 2, 3], [4, 5, 6, 7]], False)
+    split = walk_of(standing(torch.tensor([10, 15, 180, 185, 190, 195, 0, 5])), closed=True)
+    assert parts_of(split) == [[6, 7, 0, 1], [2, 3, 4, 5]]
+
+
+def looking_in(degrees: Tensor, radius: float = 2.0) -> Cameras:
+    """Return cameras at angles (M,) on a circle around the z axis that look at the origin."""
+    angles = torch.deg2rad(degrees.float())
+    places = torch.stack([radius * angles.cos(), radius * angles.sin(), torch.zeros(len(angles))], -1)
+    poses = torch.stack([look_at(place, torch.zeros(3)) for place in places])
+    ones = torch.ones(len(poses))
+    return Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+
+
+def test_a_tour_of_a_ring_is_a_circle_at_even_speed_that_closes() -> None:
+    draws = torch.Generator().manual_seed(3)
+    cameras = looking_in(torch.randperm(48, generator=draws) * 7.5)
+    order = shortest_order(cameras)
+    assert sorted(order.tolist()) == list(range(48))
+    cameras = cameras[order]
+    walk = walk_of(cameras, closed=True)
+    assert walk.closed
+    path = interpolate(cameras, fractions(60), walk).camera_to_worlds
+    centers = path[:, :, 3]
+    radii = centers.norm(dim=-1)
+    assert float(radii.std()) < 1e-3  # smoothing draws the circle in a little, by the same everywhere
+    assert 1.8 < float(radii.mean()) < 2
+    steps = (centers.roll(-1, 0) - centers).norm(dim=-1)  # the last one leads back to the first frame
+    torch.testing.assert_close(steps, steps.mean().expand(60), rtol=5e-3, atol=0)
+    assert float(steps.mean()) == pytest.approx(2 * float(radii.mean()) * math.sin(math.pi / 60), rel=1e-3)
+    torch.testing.assert_close(-path[:, :, 2], -centers / radii[:, None], atol=1e-3, rtol=0)
+    for pose in path:
+        check_pose(pose, "tour")
+
+
+def test_a_walk_goes_at_even_speed_past_uneven_cameras() -> None:
+    """Cameras on a line, dense in its first half: a frame is as far from the next one there as elsewhere."""
+    cameras = along([0.1 * place for place in range(60)] + [6 + 0.4 * place for place in range(15)])
+    places = interpolate(cameras, fractions(50, closed=False), walk_of(cameras)).camera_to_worlds[:, 0, 3]
+    steps = places.diff()
+    torch.testing.assert_close(steps, steps.mean().expand(49), rtol=0.02, atol=0)
+    eased = interpolate(cameras, fractions(50, closed=False, ease=True), walk_of(cameras)).camera_to_worlds[:, 0, 3]
+    shares = (eased - places[0]) / (places[-1] - places[0])
+    torch.testing.assert_close(shares.double(), fractions(50, closed=False, ease=True), atol=2e-3, rtol=0)
+
+
+def test_turning_on_the_spot_takes_time_too() -> None:
+    """Eight cameras side by side, then as many that turn by a quarter: the turn is not done in one frame."""
+    forward = along([0.25 * place for place in range(8)]).camera_to_worlds
+    turned = forward[-1:].repeat(8, 1, 1)
+    angles = torch.linspace(0, math.pi / 2, 8)
+    turned[:, 0, 0], turned[:, 0, 2], turned[:, 2, 0], turned[:, 2, 2] = (
+        angles.cos(), angles.sin(), -angles.sin(), angles.cos()
+    )  # fmt: skip
+    cameras = replace_poses(along([0.0]), torch.cat([forward, turned]))
+    path = interpolate(cameras, fractions(40, closed=False), walk_of(cameras)).camera_to_worlds
+    turns = torch.rad2deg(torch.arccos((path[1:, :, 2] * path[:-1, :, 2]).sum(-1).clamp(-1, 1)))
+    assert float(turns.max()) < 8
 
 
 def test_cameras_look_at_one_point() -> None:

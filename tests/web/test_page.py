@@ -8,21 +8,26 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import imageio.v3 as iio
 import pytest
 import torch
 
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cli.export import main
+from nerfloom.export.run_page import start_of
 from nerfloom.export.splat_fit import between, cropped
 from nerfloom.export.web import (
     DATA,
+    MAX_CAMERAS,
+    PICTURE,
     focus_of,
     gaussians_of,
     make_page,
     page,
     payload_of,
     pinhole,
+    shown_cameras,
     upright,
 )
 from nerfloom.kernels.splats.project import rotation_matrices
@@ -37,11 +42,12 @@ ROOT = Path(__file__).parents[2]
 
 
 class Elements(HTMLParser):
-    """Scripts, their text, and the text of the title of a page."""
+    """Scripts, their text, the text of the title of a page, and what its meta elements say."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.scripts: list[str] = []
+        self.meta: dict[str, str] = {}
         self.title = ""
         self.inside = ""
         self.feed(text)
@@ -50,6 +56,9 @@ class Elements(HTMLParser):
         self.inside = tag
         if tag == "script":
             self.scripts.append("")
+        given = dict(attrs)
+        if tag == "meta" and (name := given.get("property") or given.get("name")):
+            self.meta[name] = given.get("content") or ""
 
     def handle_endtag(self, tag: str) -> None:
         self.inside = ""
@@ -110,6 +119,40 @@ def test_no_name_leaves_its_place() -> None:
     assert facts["title"] == title
     assert facts["cameras"][3][0] == "</script>"
     assert found.scripts[1] == "MTIz"
+
+
+def test_link_previews_are_told_title_and_picture() -> None:
+    """By the names of https://ogp.me, and an address that a program elsewhere can follow."""
+    plain = Elements(page(b"", some_facts('A "cup" & <saucer>'))).meta
+    assert (plain["og:title"], plain["og:type"]) == ('A "cup" & <saucer>', "website")
+    assert plain["og:description"] == "About."
+    assert not {"og:image", "og:url"} & plain.keys()
+    facts = replace(some_facts(), picture="scene.jpg")
+    assert Elements(page(b"", facts)).meta["og:image"] == "scene.jpg"
+    for url in ("https://example.org/cup/", "https://example.org/cup/scene.html"):
+        found = Elements(page(b"", replace(facts, url=url))).meta
+        assert (found["og:url"], found["og:image"]) == (url, "https://example.org/cup/scene.jpg")
+        assert (int(found["og:image:width"]), int(found["og:image:height"])) == PICTURE
+        assert found["twitter:card"] == "summary_large_image"
+
+
+def test_a_page_starts_from_the_view_that_is_named() -> None:
+    names = ["photographs/IMG_1.jpg", "photographs/IMG_2.jpg", "other/IMG_2.png"]
+    assert start_of(names, None) == 0
+    assert start_of(names, "IMG_1") == start_of(names, "IMG_1.jpg") == 0
+    assert start_of(names, "IMG_2.png") == start_of(names, "other/IMG_2.png") == 2
+    for wrong, message in (("IMG_2", "2 training images have"), ("IMG_3.jpg", "no training image has")):
+        with pytest.raises(ConfigError, match=message):
+            start_of(names, wrong)
+
+
+def test_the_view_that_a_page_starts_from_is_among_those_it_has() -> None:
+    assert shown_cameras(5, 3) == [0, 1, 2, 3, 4]
+    for start in (0, 1, 700, 999):
+        found = shown_cameras(1000, start)
+        assert len(found) == MAX_CAMERAS
+        assert start in found
+        assert found == sorted(set(found))
 
 
 def test_a_page_asks_no_host_and_runs_no_text() -> None:
@@ -226,12 +269,17 @@ def test_splats_go_to_the_page_as_they_are(
     print(f"PSNR of the page against the method's own pictures: {close} dB")
     assert close > 40
     assert sorted(file.name for file in tmp_path.iterdir()) == ["scene.html", "scene.jpg"]
+    picture = iio.imread(tmp_path / "scene.jpg")
+    assert picture.shape == (PICTURE[1], PICTURE[0], 3)
+    assert picture.std() > 5  # the ball is on it
 
 
 @pytest.mark.medium
 def test_what_the_page_cannot_be(splats: Path, tmp_path: Path, refused: Refused) -> None:
     assert "phones" in refused(main, "web", splats, "--output-dir", tmp_path, "--max-megabytes", 50, status=2)
     assert "no times" in refused(main, "web", splats, "--output-dir", tmp_path, "--time", 0.5)
+    assert "no training image" in refused(main, "web", splats, "--output-dir", tmp_path, "--start-view", "x.jpg")
+    assert "must begin with https" in refused(main, "web", splats, "--output-dir", tmp_path, "--url", "cup", status=2)
     assert list(tmp_path.iterdir()) == []
 
 

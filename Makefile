@@ -16,7 +16,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 demo: .venv/installed
 	@run=outputs/demo/instant-ngp/$$(date +%Y-%m-%d_%H%M%S); \
 	$(BIN)/ns-train instant-ngp --max-seconds 20 --experiment-name demo --timestamp $$(basename $$run) && \
-	$(BIN)/ns-render orbit --load-config $$run/config.yml --output-path $$run/orbit.gif && \
+	$(BIN)/ns-render orbit --load-config $$run/config.yml --output-path $$run/orbit.gif \
+		--num-frames 48 --fps 16 && \
 	echo "held-out views (photograph, render, error, depth, opacity):" && ls $$run/pictures/*_comparison.png && \
 	echo "turntable:" && ls $$run/orbit.gif
 

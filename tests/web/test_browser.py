@@ -133,6 +133,17 @@ def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: P
 
 
 @pytest.mark.medium
+def test_the_page_starts_from_its_start_view_and_in_the_quality_of_the_address(browser: str, tmp_path: Path) -> None:
+    file = tmp_path / "scene.html"
+    text, _ = make_page(some_gaussians(100), replace(some_facts(), start=2), 30)
+    file.write_text(text, encoding="utf-8")
+    dom = opened(browser, tmp_path, f"{file.as_uri()}#sort=here&quality=fast", "--dump-dom")
+    assert 'data-camera="2"' in dom
+    assert 'data-quality="fast"' in dom
+    assert 'data-camera="1"' in opened(browser, tmp_path, f"{file.as_uri()}#sort=here&camera=1", "--dump-dom")
+
+
+@pytest.mark.medium
 def test_damaged_data_are_named(browser: str, scene: Path, tmp_path: Path) -> None:
     text = scene.read_text(encoding="utf-8")
     start = text.index('id="data"') + 2000

@@ -393,3 +393,21 @@ def test_a_path_around_exports_is_in_their_frame(
     done = called("ns-render", *words, "--output-path", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     torch.testing.assert_close(asked[0].camera.camera_to_worlds[0], camera, atol=1e-5, rtol=1e-5)
+
+
+def test_the_radius_of_an_orbit_is_in_the_unit_of_exports(
+    capture_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places: list[Tensor] = []
+
+    def render_view(model: Any, view: View, background: Tensor) -> Picture:
+        places.append(view.camera.camera_to_worlds[0, :, 3])
+        return Picture(torch.zeros(view.height, view.width, 3), *[torch.ones(view.height, view.width)] * 3)
+
+    monkeypatch.setattr(RayModel, "render_view", render_view)
+    words = ("--num-frames", 4, "--full-circle", "True", "--radius", 2.5)
+    done = called("ns-render", "orbit", capture_run, *words, "--output-path", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    found = load_trained(capture_run).placement.original_points(torch.stack(places))
+    away = (found - found.mean(0)).norm(dim=-1)  # the middle of the circle is the mean of its quarters
+    torch.testing.assert_close(away, torch.full((4,), 2.5, dtype=torch.float64), atol=1e-4, rtol=0)

@@ -20,12 +20,20 @@ MUTANTS = {
             "cli/test_render_outputs.py::test_pictures_of_another_camera_path_are_left_alone"),
     ],
     "nerfloom.video.views": [
+        Mutant("radius-in-scene-units", "in_scene", "length / loaded.unit", "length",
+            "an orbit is as many times too near or too far as a scene unit differs from the input's",
+            "cli/test_render_outputs.py::test_the_radius_of_an_orbit_is_in_the_unit_of_exports"),
         Mutant("render-not-reduced", "learnt_cameras", "A.scaled(1 / parsed.downscale_factor)", "A",
             "animations of large photographs are larger than what was learnt from",
             "truth/test_paths.py::test_pictures_have_the_size_that_was_learnt_from_reduced_as_asked_and_the_speed"),
         Mutant("time-stands", "path_views", "torch.linspace(0, 1, A)", "torch.zeros(A)",
             "ns-render time shows the first moment all along",
             "cli/test_render_command.py::test_one_camera_while_time_runs"),
+    ],
+    "nerfloom.cameras.framing": [
+        Mutant("fov-across", "perspective", "height / 2 / A", "width / 2 / A",
+            "wide videos show less above and below than --fov says",
+            "test_framing.py::test_a_perspective_shows_its_field_of_view_in_the_height_and_more_in_a_wide_image"),
     ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
@@ -131,6 +139,11 @@ MUTANTS = {
             "evaluation/test_paths.py::test_a_walk_goes_at_even_speed_past_uneven_cameras"),
         Mutant("orbit-direction", "look_at", "A - B", "B - A",
             "orbits look away from the scene", "evaluation/test_paths.py::test_look_at_from_the_x_axis"),
+    ],
+    "nerfloom.evaluation.tour": [
+        Mutant("tour-not-improved", "_improved", "A < -least", "A < -1e9",
+            "a video crosses the scene where the nearest camera that was left was far away",
+            "evaluation/test_tour.py::test_three_points_are_visited_in_the_best_order"),
     ],
     "nerfloom.evaluation.videos": [
         Mutant("animation-speed", "_write_animation", "1000 / A", "1000 * A",

@@ -52,6 +52,7 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
     Raises:
         ConfigError: if the kind, the file's suffix or a setting does not fit, or there is nothing to write.
         DataError: if data that the export needs cannot be read.
+        OSError: if the file cannot be written.
     """
     kind = kind_named(name)
     if path.suffix.lower() not in kind.suffixes:
@@ -60,6 +61,7 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
         croppable = ", ".join(other for other, one in KINDS.items() if one.is_cropped)
         raise ConfigError(f"{name} takes no region; {croppable} do")
     check_scale(loaded)
+    path.parent.mkdir(parents=True, exist_ok=True)
     if loaded.scale.is_known:
         say(loaded.scale.words())
     kind.write(loaded, path, settings, regions)

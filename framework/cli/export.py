@@ -25,7 +25,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   tsdf            mesh.ply, .obj or .glb: a mesh of what the training cameras see; for captures, and every method
   marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
-  gaussian-splat  splat.ply or splat.spz: the Gaussians of gaussian-splatting, for other programs
+  gaussian-splat  splat.ply, .spz, .sog or .glb: the Gaussians of gaussian-splatting, for other programs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
                   refined them; transforms_train.json: the training cameras, in nerfstudio's format
@@ -33,12 +33,13 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): gaussian-splat and web need no data, others --data DIR.
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat and web need no data,
+others --data DIR.
 
   ns-export web splat.ply --output-dir exports
 
 ns-export WHAT --help shows its flags. All files use the frame and units of the input, or the unit that ns-measure
-has set.
+has set. In .glb files, y is up.
 """
 
 
@@ -76,10 +77,13 @@ class OccupancyFlags(ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFlags(ExportFlags):
-    """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
+    """Write splat.ply, .spz, .sog or .glb: Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
-    format: Literal["ply", "spz"] = "ply"
-    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth."""
+    format: Literal["ply", "spz", "sog", "glb"] = "ply"
+    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth; sog: images
+    in a zip file, for PlayCanvas; glb: glTF with KHR_gaussian_splatting, y up."""
+    spz_version: Literal[2, 3, 4] = 2
+    """Version of spz files. 2: read by most programs; 3: finer rotations; 4: the newest, needs the package zstandard."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None
@@ -236,10 +240,12 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
         raise ConfigError("this run has no Gaussians left; train it again")
+    placement, look = loaded.placement.y_up() if flags.format == "glb" else loaded.placement, loaded.model.look()
     # Programs read float32 from these files.
-    origin = local_origin(loaded.placement.original_points(good.means), good.typical_size / loaded.placement.scale)
-    about, look = loaded.placement if origin is None else loaded.placement.about(origin), loaded.model.look()
-    for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes, look):
+    origin = local_origin(placement.original_points(good.means), good.typical_size / placement.scale)
+    about = placement if origin is None else placement.about(origin)
+    moved = transformed(good, *about.original_similarity())
+    for cost in write_gaussians(path, moved, flags.max_megabytes, look, flags.spz_version):
         say(cost)
     if sentence := write_offset(path, origin):
         say(sentence)

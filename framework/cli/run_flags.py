@@ -20,8 +20,8 @@ class RunFlags:
     """The trained run, the file of Gaussians, or the octree."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
-    octree (.octree). The flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .sog, .splat,
+    .ksplat), or an octree (.octree). The flag's name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None

@@ -170,7 +170,7 @@ def _with_gzip(file: Path) -> Packed:
             raise DataError(f"{file} is truncated: copy or export it again")
         _, version, count, degree, fraction, flags, _ = HEADER.unpack(start)
         if version not in (1, 2, 3):
-            raise DataError(f"{file} is SPZ of version {version}; versions 1 to 4 can be read: convert it")
+            raise DataError(f"{file} is SPZ of version {version}; those in gzip files are 1 to 3: export it again")
         _check(file, version, count, degree, fraction, file.stat().st_size)
         needed = count * sum(widths(version, degree))
         content = stream.read(needed)

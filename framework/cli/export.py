@@ -83,7 +83,7 @@ class SplatFlags(ExportFlags):
     """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth; sog: images
     in a zip file, for PlayCanvas; glb: glTF with KHR_gaussian_splatting, y up."""
     spz_version: Literal[2, 3, 4] = 2
-    """Version of spz files. 2: read by most programs; 3: finer rotations; 4: the newest, needs the package zstandard."""
+    """Version of spz files. 2: read by most programs; 3: finer rotations; 4: newest, needs the package zstandard."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None

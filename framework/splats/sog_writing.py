@@ -124,7 +124,8 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 def _coded(values: Tensor) -> tuple[list[float], np.ndarray]:
     """Return a codebook and the indices of the values in it."""
     codes = codebook(values.numpy())
-    return codes.tolist(), nearest_codes(values.numpy(), codes)
+    # Nine digits tell float32 apart, and are shorter than those of the same numbers in float64.
+    return [float(f"{code:.9g}") for code in codes], nearest_codes(values.numpy(), codes)
 
 
 def _palette(harmonics: Tensor) -> tuple[np.ndarray, dict[str, Any], np.ndarray, float]:

@@ -23,7 +23,7 @@ from nerfloom.splats.spz_container import MAGIC, SpzVersion
 
 @dataclass(frozen=True)
 class Order:
-    """What is written to a file, and how."""
+    """A request to write Gaussians to a file."""
 
     gaussians: Gaussians
     """N Gaussians on the CPU."""

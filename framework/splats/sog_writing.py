@@ -72,7 +72,7 @@ def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
     codes, indices = _coded(given.colors)
     opacity = np.rint(255 * given.logits.double().sigmoid().numpy())[:, None]
     meta["sh0"] = {"codebook": codes, "files": image("sh0", np.concatenate([indices, opacity], -1))}
-    notes = []
+    notes: list[str] = []
     if given.degree:
         labels, part, entries, error = _palette(given.harmonics)
         terms, count = given.harmonics.shape[2], part.pop("count")

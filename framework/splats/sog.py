@@ -205,18 +205,37 @@ def _pixels(file: Path, content: bytes, count: int, width: int | None = None) ->
     Raises:
         DataError: if the image cannot be read, or has another size.
     """
+    wide, high = _stated_size(content)
+    if not wide:
+        raise DataError(f"{file}: one of its images is neither WebP without loss nor PNG; export it again")
+    if not count <= wide * high <= 4 * count + MARGIN or width not in (None, wide):
+        raise DataError(
+            f"{file} is damaged: an image of {wide}x{high} pixels cannot hold {count:,}, or is far too large;"
+            " export it again"
+        )
     try:
         with Image.open(io.BytesIO(content), formats=("WEBP", "PNG")) as image:
-            if not count <= image.width * image.height <= 4 * count + MARGIN or width not in (None, image.width):
-                raise DataError(
-                    f"{file} is damaged: an image of {image.width}x{image.height} pixels cannot hold {count:,};"
-                    " export it again"
-                )
-            return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
-    except DataError:
-        raise
+            pixels = np.asarray(image.convert("RGBA")).reshape(-1, 4)
+        if len(pixels) != wide * high:
+            raise ValueError("another size than its header states")
     except Exception as error:  # Pillow raises OSError, SyntaxError, EOFError, DecompressionBombError and more
         raise DataError(f"{file} is damaged: one of its images cannot be read; copy or export it again") from error
+    return pixels[:count]
+
+
+def _stated_size(content: bytes) -> tuple[int, int]:
+    """Return width and height in the header of a WebP (RFC 9649) or PNG image; 0 and 0 if it is neither.
+
+    Pillow allocates memory for a WebP image before anybody can ask for its size.
+    """
+    if content[:4] == b"RIFF" and content[8:16] == b"WEBPVP8L":
+        bits = int.from_bytes(content[21:25], "little")
+        return (bits & 16383) + 1, (bits >> 14 & 16383) + 1
+    if content[:4] == b"RIFF" and content[8:16] == b"WEBPVP8X":
+        return int.from_bytes(content[24:27], "little") + 1, int.from_bytes(content[27:30], "little") + 1
+    if content[:8] == b"\x89PNG\r\n\x1a\n":
+        return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
+    return 0, 0
 
 
 def _rotations(file: Path, pixels: np.ndarray) -> np.ndarray:

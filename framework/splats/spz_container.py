@@ -50,6 +50,8 @@ MAX_SURPLUS = 1 << 24
 """Maximum number of bytes behind the last array of a gzip file, for extensions."""
 MAX_WINDOW = 1 << 27
 """Maximum memory that a Zstandard frame may ask for, bytes."""
+PIECE = 1 << 20
+"""Number of bytes that are unpacked at once."""
 LEVEL = 12
 """Compression level of Zstandard, as in Niantic's library."""
 FCOMMENT, COMMENT_START, MAX_COMMENT_LENGTH = 16, 10, 1000
@@ -221,16 +223,19 @@ def _with_zstandard(file: Path, content: bytes) -> Packed:
 
 
 def _unpacked(file: Path, frame: bytes, size: int) -> bytes:
-    """Return the content of a Zstandard frame, which must have a size. No more is allocated, whatever it claims."""
+    """Return the content of a Zstandard frame, which must have a size; whatever it claims, it is read in pieces."""
     import zstandard
 
+    content = bytearray()
     try:
-        content = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(frame).read(size + 1)
+        with zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW).stream_reader(frame) as stream:
+            while len(content) <= size and (piece := stream.read(PIECE)):
+                content += piece
     except zstandard.ZstdError as error:
         raise DataError(f"{file} is damaged: one of its arrays cannot be unpacked; copy or export it again") from error
     if len(content) != size:
         raise DataError(f"{file} is damaged: one of its arrays unpacks to another size; copy or export it again")
-    return content
+    return bytes(content)
 
 
 def _check(file: Path, version: int, count: int, degree: int, fraction: int, size: int) -> None:

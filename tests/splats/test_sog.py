@@ -307,7 +307,11 @@ def test_damaged_images_are_refused(tmp_path: Path) -> None:
     assert "an image of 1500x1000 pixels" in refused(write(file, meta, large))
     bitmap = io.BytesIO()
     Image.new("RGB", (2, 1)).save(bitmap, format="BMP")
-    assert "one of its images cannot be read" in refused(write(file, meta, {**images, "sh0.webp": bitmap.getvalue()}))
+    assert "neither WebP without loss nor PNG" in refused(write(file, meta, {**images, "sh0.webp": bitmap.getvalue()}))
+    # A header of the largest size, in either kind of WebP file.
+    for kind, stated in ((b"VP8L", b"\x2f\xff\xff\xff\x0f"), (b"VP8X", bytes(4) + b"\xfe\x3f\0\xfe\x3f\0")):
+        head = b"RIFF" + bytes(4) + b"WEBP" + kind + bytes(4) + stated + bytes(20)
+        assert "an image of 1638" in refused(write(file, meta, {**images, "sh0.webp": head}))
 
 
 def test_damaged_archives_are_refused(tmp_path: Path) -> None:

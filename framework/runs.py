@@ -32,7 +32,7 @@ def load(path: str | Path, data: str | Path | None = None, device: Device = "aut
 
     Args:
         path: folder of the run, its config.yml, a folder above it (for its newest run), a file of Gaussians (.ply,
-            .spz, .splat), or an octree (.octree).
+            .spz, .sog, .splat, .ksplat), or an octree (.octree).
         data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
 

@@ -26,7 +26,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   tsdf            mesh.ply, .obj or .glb: a mesh of what the training cameras see; for captures, and every method
   marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
-  gaussian-splat  splat.ply or splat.spz: the Gaussians of gaussian-splatting, for other programs
+  gaussian-splat  splat.ply, .spz, .sog or .glb: the Gaussians of gaussian-splatting, for other programs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
                   refined them; transforms_train.json: the training cameras, in nerfstudio's format
@@ -34,12 +34,13 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): gaussian-splat and web need no data, others --data DIR.
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat and web need no data,
+others --data DIR.
 
   ns-export web splat.ply --output-dir exports
 
 ns-export WHAT --help shows its flags. All files use the frame and units of the input, or the unit that ns-measure
-has set.
+has set. In .glb files, y is up.
 """
 
 
@@ -77,10 +78,13 @@ class OccupancyFlags(ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFlags(RegionFlags, ExportFlags):
-    """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
+    """Write splat.ply, .spz, .sog or .glb: Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
-    format: Literal["ply", "spz"] = "ply"
-    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth."""
+    format: Literal["ply", "spz", "sog", "glb"] = "ply"
+    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth; sog: images
+    in a zip file, for PlayCanvas; glb: glTF with KHR_gaussian_splatting, y up."""
+    spz_version: Literal[2, 3, 4] = 2
+    """Version of spz files. 2: read by most programs; 3: finer rotations; 4: newest, needs the package zstandard."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None
@@ -237,11 +241,11 @@ def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
         raise ConfigError("this run has no Gaussians left; train it again")
-    look = loaded.model.look()
-    placed = in_input(good, loaded.placement)
+    look, placement = loaded.model.look(), loaded.placement
+    placed = in_input(good, placement)
     if regions := flags.regions():
         placed = placed[inside_all(placed.means, regions)]
-    for sentence in write_placed(path, placed, look, loaded.scale, flags.max_megabytes):
+    for sentence in write_placed(path, placed, look, loaded.scale, placement, flags.max_megabytes, flags.spz_version):
         say(sentence)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 

@@ -21,8 +21,8 @@ class OpenFlags:
     """The trained run or file, and the device that opens it."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
-    octree (.octree). The flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .sog, .splat,
+    .ksplat), or an octree (.octree). The flag's name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None

@@ -29,7 +29,7 @@ def load(
 
     Args:
         path: the run's folder, its config.yml, a folder above it (for its newest run), a file of Gaussians (.ply,
-            .spz, .splat) in the frame of the input, or an octree (.octree).
+            .spz, .sog, .splat, .ksplat) in the frame of the input, or an octree (.octree).
         checkpoint: checkpoint of a run; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.
         data: folder of the data, if a run's has moved; optional data for a file.

@@ -54,7 +54,7 @@ from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import polycam, record3d
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
-from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
+from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import MAX_BLUR, MIN_BLUR, Look
 from nerfloom.training.checkpoint import FOLDER, load_checkpoint, load_newest
@@ -76,7 +76,7 @@ from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
 from tests.octrees.balls import ball
-from tests.splats.foreign_files import write_compressed, write_splat
+from tests.splats.foreign_files import write_compressed, write_ksplat, write_splat
 from tests.training.helpers import tiny_run
 
 MEMORY = 20e6
@@ -196,14 +196,19 @@ def write_splats(folder: Path) -> None:
     random = torch.Generator().manual_seed(0)
     shapes = ((6, 3), (6, 3), (6, 4), (6,), (6, 3), (6, 3, 8))
     gaussians = Gaussians(*(torch.randn(shape, generator=random) for shape in shapes))
-    for suffix in SUFFIXES:
-        write_gaussians(folder / f"splat{suffix}", gaussians, look=Look(True, 0.1))
+    (folder / "sog").mkdir()
+    for name in ("splat.ply", "splat.spz", "splat.sog", "sog/meta.json"):
+        write_gaussians(folder / name, gaussians, look=Look(True, 0.1))
+    write_gaussians(folder / "splat3.spz", gaussians, look=Look(True, 0.1), spz_version=3)
+    write_gaussians(folder / "splat4.spz", gaussians, look=Look(True, 0.1), spz_version=4)
     write_splat(folder / "splat.splat", gaussians)
     write_compressed(folder / "splat.compressed.ply", gaussians)
+    for level in range(3):
+        write_ksplat(folder / f"splat{level}.ksplat", gaussians, level)
 
 
 def read_splats(folder: Path, scratch: Path) -> None:
-    for file in sorted(folder.glob("splat*")):
+    for file in [*sorted(folder.glob("splat*")), folder / "sog" / "meta.json"]:
         gaussians, look = read_gaussians(file)
         require(MIN_BLUR <= look.blur <= MAX_BLUR, "Gaussians that are drawn as none can be")
         require(len(gaussians), "no Gaussians")
@@ -491,7 +496,12 @@ READERS: dict[str, Reader] = {
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
     "surfaces": Reader(write_surfaces, read_surfaces, ("mesh.*",)),
-    "splats": Reader(write_splats, read_splats, ("splat.*",)),
+    "splats": Reader(
+        write_splats,
+        read_splats,
+        ("splat*", "sog/*"),
+        ("version", "count", "mins", "codebook", "files", "bands", "model"),
+    ),
     "octree": Reader(write_octrees, read_octrees, ("*.octree",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
     "scale": Reader(

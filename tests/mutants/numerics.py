@@ -438,6 +438,20 @@ MUTANTS = {
             "Gaussians of a compressed PLY file are somewhere else in the scene",
             "splats/test_foreign_files.py::test_compressed_ply"),
     ],
+    "nerfloom.splats.gltf": [
+        Mutant("splats-gltf-logarithms", "_attributes", "A.clamp(max=MAX_LOG_SCALE).exp()",
+            "A.clamp(max=MAX_LOG_SCALE)",
+            "other programs draw Gaussians of a glTF file with the logarithms of their sizes",
+            "splats/test_gltf.py::test_attributes_are_those_of_the_extension"),
+        Mutant("splats-gltf-quaternions", "_attributes", "rotations[:, [1, 2, 3, 0]]", "rotations",
+            "other programs turn Gaussians of a glTF file otherwise",
+            "splats/test_gltf.py::test_attributes_are_those_of_the_extension"),
+    ],
+    "nerfloom.splats.ksplat": [
+        Mutant("splats-ksplat-bucket", "_means", "'right'", "'left'",
+            "the first Gaussian of each bucket of a KSPLAT file is in the bucket before",
+            "splats/test_ksplat.py::test_what_is_in_a_ksplat_by_hand"),
+    ],
     "nerfloom.splats.look": [
         Mutant("splats-elsewhere-as-ours", "", "Look(sort='depth')", "Look()",
             "files of other programs are sorted by distance, which they were not trained with",
@@ -451,6 +465,17 @@ MUTANTS = {
         Mutant("splats-filter-brightens", "smoothed", "A * shares", "A",
             "Mip-Splatting's Gaussians are larger by their filter, and no fainter",
             "splats/test_foreign_files.py::test_the_filter_of_mip_splatting_is_a_part_of_the_gaussian"),
+    ],
+    "nerfloom.splats.sog": [
+        Mutant("splats-sog-palette", "_harmonics", "A.transpose(0, 2, 1)", "A.reshape(len(A), 3, terms)",
+            "the colours of harmonics in a SOG file are exchanged",
+            "splats/test_sog.py::test_what_is_in_a_file_by_hand"),
+    ],
+    "nerfloom.splats.sog_writing": [
+        Mutant("splats-sog-transparent", "_webp", "A.save(B, format='WEBP', lossless=True, exact=True)",
+            "A.save(B, format='WEBP', lossless=True)",
+            "transparent Gaussians in a SOG file lose their colour",
+            "splats/test_sog.py::test_opacity_0_keeps_its_colour"),
     ],
     "nerfloom.splats.splat": [
         Mutant("splats-quaternions-of-splat-files", "read_splat", "A - 128", "(A - 128)[:, [1, 2, 3, 0]]",

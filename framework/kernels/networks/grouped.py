@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -36,8 +37,8 @@ class Chunks(NamedTuple):
 def chunks_of(owners: Tensor, count: int) -> Chunks:
     """Return chunks for the rows of networks; the rows of a network keep their order.
 
-    The size is a power of two, about the mean number of rows of the networks that have some. Unless it is `MIN_CHUNK` or
-    `MAX_CHUNK`, there are at most two chunks for each of these networks, and at most three places for each row.
+    The size is a power of two, about the mean number of rows of the networks that have some. Unless it is `MIN_CHUNK`
+    or `MAX_CHUNK`, there are at most two chunks for each of these networks, and at most three places for each row.
 
     Args:
         owners: (N,) int64 network of each row.
@@ -117,7 +118,7 @@ def _check_shapes(
     inputs: Sequence[Tensor], owners: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
 ) -> None:
     count, widths = len(weights[0]), [sum(part.shape[1] for part in inputs), *(bias.shape[1] for bias in biases)]
-    expected = [(count, after, before) for before, after in zip(widths[:-1], widths[1:], strict=True)]
+    expected = [(count, after, before) for before, after in pairwise(widths)]
     found = [tuple(weight.shape) for weight in weights]
     if found != expected or any(len(bias) != count for bias in biases):
         shapes = ", ".join(map(str, found))

@@ -170,12 +170,11 @@ class TaughtViews(BatchSource):
     def _shot(self, number: int) -> Shot:
         """Render a picture; its view depends on the seed and its `number` only."""
         times = self.dataset.times
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=[]):  # whether a picture is new must not change what is drawn after it
             torch.default_generator.manual_seed(stream_seed(self.seed, number, PICTURE_STREAM))
             near = torch.randint(len(self.cameras), (1,))
-            camera = unseen_cameras(self.cameras, near)
-        view = View.of(camera, 0, None if times is None else times[near])
-        picture = self.teacher.picture(view, torch.zeros(3, device=self.dataset.device))
+            view = View.of(unseen_cameras(self.cameras, near), 0, None if times is None else times[near])
+            picture = self.teacher.picture(view, torch.zeros(3, device=self.dataset.device))
         return Shot(view, picture.rgb.half(), picture.accumulation.half(), known_depths(picture))
 
     def drawing_from(self, dataset: Dataset) -> TaughtViews:

@@ -21,7 +21,6 @@ from nerfloom.ray_model import RayModel
 from nerfloom.renderable import Renderable, RendersFromImages, parts
 from nerfloom.rendering.rendered import Picture
 from nerfloom.samplers.base import SkipsCells
-from nerfloom.training.load import load
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.run_path import config_file
 
@@ -143,6 +142,8 @@ def load_teacher(path: Path, dataset: Dataset) -> Teacher:
     Raises:
         ConfigError: if there is no such teacher, it cannot be read, or it cannot show the images' scene.
     """
+    from nerfloom.training.load import load  # here, because most trainings have no teacher
+
     threads = torch.get_num_threads()
     try:
         found = config_file(path)

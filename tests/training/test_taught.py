@@ -27,8 +27,8 @@ from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.look import OURS
 from nerfloom.splats.start import from_points
 from nerfloom.testing.scenes import ball_in_a_box, ball_under_a_sky
+from nerfloom.training import load as loading
 from nerfloom.training import taught as taught_file
-from nerfloom.training import teacher as teacher_file
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.run import read_run
 from nerfloom.training.taught import MixedSource, TaughtPixels, TaughtViews, is_taught
@@ -378,10 +378,10 @@ def test_a_teacher_of_another_kind_of_scene(
     facts: dict[str, Any], words: str, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = octree_file(tmp_path)
-    loaded = teacher_file.load(file, device_type="cpu")
+    loaded = loading.load(file, device_type="cpu")
     scene: Scene = replace(loaded.model.scene, **facts)
     other = replace(loaded, model=DrawnOctree(ball(), scene))
-    monkeypatch.setattr(teacher_file, "load", lambda *_, **__: other)
+    monkeypatch.setattr(loading, "load", lambda *_, **__: other)
     assert words in refused_teacher(shared_tiny, tmp_path, file)
 
 

@@ -151,8 +151,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
-        seen, poses = batch.view.camera, self.poses
-        pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
+        seen, pose = batch.view.camera, self._pose(batch)
         octaves = self.sizes.next(self.progress)
         camera, target = splat_camera(seen, self.near, self.look(), pose, 1 << octaves), reduced(batch.rgb, octaves)
         gaussians = self.learnt_gaussians(batch.view.time)
@@ -200,6 +199,13 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             return rgb
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
+
+    def _pose(self, batch: ViewBatch) -> Tensor | None:
+        """Return the refined pose (3, 4) of a batch's camera; None for its own."""
+        if self.poses is None:
+            return None
+        given = batch.view.camera.camera_to_worlds[0]
+        return self.poses.propagated_pose(given) if batch.index is None else self.poses.pose(batch.index, given)
 
     def camera(self, camera: Cameras) -> SplatCamera:
         """Return the camera of a view outside of training, corrected like the training cameras near it."""

@@ -104,9 +104,9 @@ class TransientDensity(LossTerm):
         super().__init__("transient", "transient_density_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        density = shown.rendered.extras["transient_density"]
+        density = shown.rendered.extras.get("transient_density")  # None for the views of a teacher
         unit = 2 * shown.model.config.least_uncertainty**2 * half_edge(shown.model.scene.box)
-        return unit * density.mean() if len(density) else None
+        return None if density is None or not len(density) else unit * density.mean()
 
 
 class NerfW(RefinedModel[NerfWConfig], plain=True):

@@ -15,6 +15,7 @@ BUILT_IN = {
     "dnerf",
     "gaussian-splatting",
     "instant-ngp",
+    "kilo-nerf",
     "kplanes",
     "mip-nerf",
     "mip-nerf-360",

@@ -27,7 +27,7 @@ from tests.training.helpers import TINY
 
 SHARED_BY = type(load_method("instant-ngp").config)
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
+    "dnerf", "instant-ngp", "kilo-nerf", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
     "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
 )  # fmt: skip
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])

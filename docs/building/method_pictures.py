@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 COMMANDS = {
     "dnerf": "dnerf --canonical hash-grid {} procedural --moving True",
     "instant-ngp": "instant-ngp {}",
+    "kilo-nerf": "kilo-nerf {}",
     "kplanes": "kplanes {}",
     "mip-nerf": "mip-nerf --sampler occupancy {}",
     "mip-nerf-360": "mip-nerf-360 {}",

@@ -63,6 +63,8 @@ class TrainConfig:
         "train_image_indices": AT_LEAST_0,
         "lr_warmup_steps": AT_LEAST_0,
         "viewer_share": (0.001, 1),
+        "teacher_share": (0, 1),
+        "teacher_until": (0, 1),
     }
     """Allowed ranges; a method's config adds or overrides some. Every range allows None; each number of a tuple is
     checked."""
@@ -114,6 +116,12 @@ class TrainConfig:
     """Address of the viewer."""
     mixed_precision: bool | None = None
     """Run networks in bfloat16, density and compositing in float32. Default: if the device multiplies bfloat16 fast."""
+    teacher: Path | None = None
+    """Trained run, file of Gaussians or octree, which renders views between the training cameras to learn from."""
+    teacher_share: float = 0.5
+    """Fraction of the steps that learn from --teacher, at the start; it falls linearly to 0 at --teacher-until."""
+    teacher_until: float = 0.8
+    """Fraction of the budget after which training uses photographs alone (--teacher)."""
     load_dir: Path | None = None
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None

@@ -29,6 +29,7 @@ ELSEWHERE: dict[str, str] = {
     "nerf++": "here it is called 'nerf-plus-plus'",
     "nerfplusplus": "here it is called 'nerf-plus-plus'",
     "refnerf": "here it is called 'ref-nerf'",
+    "kilonerf": "here it is called 'kilo-nerf'",
     "pixelnerf": "here it is called 'pixel-nerf'",
     "instant-ngp-bounded": "here it is called 'instant-ngp'; it detects whether a scene is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",

@@ -130,6 +130,18 @@ class Placement:
         rotations = self._turned_back @ poses[:, :, :3].double()
         return torch.cat([rotations, self.original_points(poses[:, :, 3])[..., None]], dim=-1)
 
+    def onto(self, other: Placement) -> tuple[Tensor, float, Tensor]:
+        """Return rotation (3, 3), scale and shift (3,) from this scene to another one of the same input, float64.
+
+        A position x of this scene is scale * rotation @ x + shift in the other.
+
+        Args:
+            other: placement of the input in the other scene.
+        """
+        turned, size, moved = self.original_similarity()
+        rotation, scale, shift = other.similarity()
+        return rotation @ turned, scale * size, scale * (rotation @ moved) + shift
+
     @property
     def _turned_back(self) -> Tensor:
         return torch.linalg.inv(self.transform[:, :3])

@@ -139,7 +139,8 @@ def create_folder(run: Run) -> None:
             f"{run.folder} already holds a run; continue it with 'ns-train --resume {run.folder}', "
             "or choose another --timestamp"
         )
-    paths = {"data": run.config.data, "lpips_weights": run.config.lpips_weights}  # valid from any working folder
+    paths = {name: getattr(run.config, name) for name in ("data", "lpips_weights", "teacher")}
+    # Resolved, they are valid from any working folder.
     resolved: dict[str, Any] = {name: path.resolve() for name, path in paths.items() if path is not None}
     config = dataclasses.replace(run.config, **resolved)
     document = {

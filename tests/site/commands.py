@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-import nerfloom.training.load  # noqa: F401  modules that name find_data must have the true one, if a check comes first
+import nerfloom.training.load  # modules that name find_data or config_file must have the true ones, if a check is first
+import nerfloom.training.teacher  # noqa: F401
 from nerfloom.registry import load_dataparser, registered
 from nerfloom.training.run import Run
 from tests.site.pages import ROOT

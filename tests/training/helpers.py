@@ -90,6 +90,15 @@ TINY: dict[str, dict[str, Any]] = {
         "learning_rate": 5e-3,
         "lr_warmup_steps": 0,
     },
+    "kilo-nerf": {
+        "network_resolution": 3,
+        "hidden_width": 16,
+        "position_frequencies": 4,
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 4096,
+        "learning_rate": 1e-2,
+    },
     "kplanes": {
         "base_resolution": 16,
         "num_scales": 2,

@@ -61,7 +61,10 @@ class Checker:
             "nerfloom.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
             "benchmarks.__main__.trained_run": lambda path, *_: path,
             **{f"nerfloom.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
-            **{f"nerfloom.cli.{name}.check_data": lambda path: None for name in ("bench_results", "blocks", "compare", "stress")},
+            **{
+                f"nerfloom.cli.{name}.check_data": lambda path: None
+                for name in ("bench_results", "blocks", "compare", "stress")
+            },
             "nerfloom.cli.session.start": begin,
             "nerfloom.cli.session.resume": begin,
             "nerfloom.training.load.load": begin,

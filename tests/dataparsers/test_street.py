@@ -168,10 +168,7 @@ def test_the_street_is_read_as_a_capture_whose_placement_can_be_given(tmp_path: 
     assert float(train.cameras.camera_to_worlds[:, :, 3].abs().max()) <= 1 + 1e-6
     content = {"transform": np.eye(3, 4).tolist(), "scale": 0.25}
     (tmp_path / "placement.json").write_text(json.dumps(content))
-    moved = Procedural(
-        street=2, size=16, num_train=6, cars=2, changing_exposure=True, placement=tmp_path / "placement.json"
-    )
-    placed = moved.parse(None, "train")
+    placed = dataclasses.replace(flags, placement=tmp_path / "placement.json").parse(None, "train")
     assert placed.scale == pytest.approx(0.25)
     back = (parsed.placement.original_points(parsed.cameras.camera_to_worlds[:, :, 3]) for parsed in (train, placed))
     torch.testing.assert_close(*back, atol=1e-5, rtol=1e-5)

@@ -25,7 +25,7 @@ import yaml
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.config import read_yaml
-from nerfloom.base.errors import DataError, shown
+from nerfloom.base.errors import DataError, printable, shown
 from nerfloom.blocks.block import IDENTITY, Affine, TrainedBlock, Vector
 
 NAME = "blocks.yml"
@@ -128,7 +128,8 @@ def _block(values: Any, where: str, folder: Path) -> TrainedBlock:
     if not isinstance(run, str) or not run or "\0" in run:
         raise DataError(f"{where}: 'run' is {shown(run)}; it must be the folder of a run")
     if not os.path.isdir(folder / run):
-        raise DataError(f"{where}: its run {folder / run} does not exist; restore it, or run ns-blocks again")
+        missing = printable(str(folder / run))
+        raise DataError(f"{where}: its run {missing} does not exist; restore it, or run ns-blocks again")
     if not isinstance(cameras, list) or not all(type(index) is int and 0 <= index < 2**63 for index in cameras):
         raise DataError(f"{where}: 'cameras' is {shown(cameras)}; it must list indices of training images")
     radius = _number(values.get("radius"), "radius", where)

@@ -62,7 +62,7 @@ def _plain(colour: Colour, p: Tensor) -> Tensor:
     return blend(colour, colour, p[0])
 
 
-def _front(half: Colour, light: Colour, dark: Colour, frame: Colour, p: Tensor) -> Tensor:
+def _front(half: tuple[float, float, float], light: Colour, dark: Colour, frame: Colour, p: Tensor) -> Tensor:
     """Return bricks with rows of windows (3, R) on the walls of a house, and its roof."""
     face = (p.abs() / p.new_tensor(half)[:, None]).argmax(0)
     along, height = torch.where(face == 0, p[1], p[0]), p[2] + half[2]
@@ -111,7 +111,7 @@ def street(houses: int, seed: int) -> dict[str, Part]:
         (r, g, b), share = (level * base / base.max()).tolist(), random.uniform(0.4, 0.7)
         return (r, g, b), (share * r, share * g, share * b)
 
-    def add_house(name: str, half: Colour, x: float, y: float) -> None:
+    def add_house(name: str, half: tuple[float, float, float], x: float, y: float) -> None:
         frame = (0.85, 0.83, 0.78) if random.uniform() < 0.6 else (0.20, 0.13, 0.08)
         texture = partial(_front, half, *bricks(), frame)
         parts[name] = Part(Box(half), (x, y, half[2]), 0.0, texture, 0.0)

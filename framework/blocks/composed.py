@@ -27,7 +27,7 @@ from nerfloom.splats.transform import transformed
 KEPT = 4
 """Number of blocks in memory; where a grid of blocks overlaps, a place is in four of them."""
 MIN_SHARE = 1e-3
-"""Blocks with a smaller share are not drawn. It changes a colour by less than a quarter of a step of 8 bits."""
+"""Blocks with a smaller share are not drawn. It changes a colour by about a quarter of a step of 8 bits."""
 LOOK_SIDE = 16
 """Shorter side of the pictures that tell how much of a view a block shows, pixels."""
 
@@ -96,7 +96,7 @@ class Blocks(Renderable):
             coarse = replace(view, stride=view.stride * max(min(view.height, view.width) // LOOK_SIDE, 1))
             visibilities = torch.zeros_like(shares)
             for number in near:
-                visibilities[number] = self.picture_of(number, coarse, background).accumulation.double().mean().cpu()
+                visibilities[number] = float(self.picture_of(number, coarse, background).accumulation.mean())
             shares = visible_shares(torch.where(shares >= MIN_SHARE, shares, 0.0), visibilities)
             near = _worth_drawing(shares)
         total = float(shares[near].sum())

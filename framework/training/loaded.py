@@ -37,7 +37,7 @@ class Loaded:
     method: str
     """Name of the method that made it."""
     origin: Path
-    """The run's folder, or the file of Gaussians, for commands that load it again."""
+    """The run's folder, or the file, for commands that load it again."""
     checkpoint: Path
     """File of the parameters."""
     step: int = 0
@@ -54,7 +54,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file of Gaussians."""
+        """True for a run, False for a file: of Gaussians, of an octree, or of a scene in blocks."""
         return self.origin != self.checkpoint
 
     @property
@@ -74,7 +74,7 @@ class Loaded:
 
     @property
     def run(self) -> Run:
-        """The run. For Gaussians with data it is a placeholder that holds the data.
+        """The run. For a file with data, and for a scene in blocks, it is a placeholder that holds the data.
 
         Raises:
             ConfigError: for Gaussians without data.
@@ -196,13 +196,13 @@ class Loaded:
         """Write the scale to the run's folder, where whatever loads the run finds it.
 
         Raises:
-            ConfigError: for a file of Gaussians, whose coordinates are in a unit already.
+            ConfigError: for a file, whose coordinates are in a unit already.
             OSError: if it cannot be written.
         """
         if not self.is_run:
             raise ConfigError(
-                f"{self.origin} is a file of Gaussians, and keeps its coordinates: set the scale of the run that it is "
-                "from, and export it again"
+                f"{self.origin} is a file, not a run, and keeps its coordinates: set the scale of the run that it is "
+                "from, and export that again"
             )
         write_scale(self.folder, self.scale)
 

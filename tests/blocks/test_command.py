@@ -89,7 +89,7 @@ def test_a_picture_is_that_of_its_blocks(loaded: Loaded) -> None:
 def test_commands_that_take_a_run_take_it(town: Path, tmp_path: Path) -> None:
     done = called("ns-eval", town / "blocks.yml", "--max-images", 2, "--device-type", "cpu")
     assert done.returncode == 0, done.stderr
-    assert math.isfinite(json.loads((town / "eval.json").read_text())["results"]["psnr"])
+    assert math.isfinite(json.loads((town / "blocks.eval.json").read_text())["results"]["psnr"])
     flags = ("--output-path", tmp_path / "flight", "--num-frames", 2, "--downscale-factor", 2)
     done = called("ns-render", "interpolate", town, *flags)
     assert done.returncode == 0, done.stderr

@@ -151,6 +151,7 @@ LAYERS = (
     ("plug_and_play",),
     ("losses",),
     ("splats", "octrees"),
+    ("blocks",),
     ("model",),
     ("ray_model", "gaussian_model", "octree_model"),
     ("moving_model",),

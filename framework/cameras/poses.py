@@ -81,6 +81,19 @@ class Placement:
         """Return rotation (3, 3), scale and shift (3,) of `original_points`: x -> scale * rotation @ x + shift."""
         return self._turned_back, 1 / self.scale, -self._turned_back @ self.transform[:, 3]
 
+    def similarity_to(self, other: Placement) -> tuple[Tensor, float, Tensor]:
+        """Return rotation (3, 3), scale and shift (3,) from this scene to another of the same input, both float64.
+
+        A point x of this scene is at scale * rotation @ x + shift in the other. The input's coordinates may be large;
+        they cancel before they are rounded.
+
+        Args:
+            other: placement of the same input in the other scene.
+        """
+        rotation = other.transform[:, :3] @ self._turned_back
+        shift = other.scale * (other.transform[:, 3] - rotation @ self.transform[:, 3])
+        return rotation, other.scale / self.scale, shift
+
     def about(self, origin: Tensor) -> Placement:
         """Return the same placement for input coordinates relative to `origin` (3,), a point in the input's frame."""
         rotation = self.transform[:, :3]
@@ -129,18 +142,6 @@ class Placement:
         """Transform `poses` (M, 3, 4) from the scene's frame to the input's, float64: the inverse of `poses`."""
         rotations = self._turned_back @ poses[:, :, :3].double()
         return torch.cat([rotations, self.original_points(poses[:, :, 3])[..., None]], dim=-1)
-
-    def onto(self, other: Placement) -> tuple[Tensor, float, Tensor]:
-        """Return rotation (3, 3), scale and shift (3,) from this scene to another one of the same input, float64.
-
-        A position x of this scene is scale * rotation @ x + shift in the other.
-
-        Args:
-            other: placement of the input in the other scene.
-        """
-        turned, size, moved = self.original_similarity()
-        rotation, scale, shift = other.similarity()
-        return rotation @ turned, scale * size, scale * (rotation @ moved) + shift
 
     @property
     def _turned_back(self) -> Tensor:

@@ -54,7 +54,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file."""
+        """True for a run, False for a file: of Gaussians, of an octree, or of a scene in blocks."""
         return self.origin != self.checkpoint
 
     @property
@@ -74,7 +74,7 @@ class Loaded:
 
     @property
     def run(self) -> Run:
-        """The run. For a file with data it is a placeholder that holds the data.
+        """The run. For a file with data, and for a scene in blocks, it is a placeholder that holds the data.
 
         Raises:
             ConfigError: for a file without data.

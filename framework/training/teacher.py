@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError, NerfloomError
 from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.moved import moved_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
@@ -39,7 +40,7 @@ class Teacher:
 
     def __init__(self, model: Renderable, placement: Placement, pupil: Placement) -> None:
         self.model = model
-        self.rotation, self.scale, self.shift = pupil.onto(placement)
+        self.rotation, self.scale, self.shift = pupil.similarity_to(placement)
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return cameras of the pupil's scene in the teacher's.
@@ -47,13 +48,7 @@ class Teacher:
         Args:
             cameras: M cameras.
         """
-        poses = cameras.camera_to_worlds.cpu().double()
-        rotations = self.rotation @ poses[:, :, :3]
-        positions = self.scale * poses[:, :, 3] @ self.rotation.T + self.shift
-        moved = torch.cat([rotations, positions[..., None]], dim=-1).to(cameras.camera_to_worlds)
-        # The focal lengths of parallel rays are pixels per scene unit; others are the same in every scene.
-        per_unit = 1 / self.scale if cameras.model == "orthographic" else 1.0
-        return replace(cameras, camera_to_worlds=moved, fx=per_unit * cameras.fx, fy=per_unit * cameras.fy)
+        return moved_cameras(cameras, self.rotation, self.scale, self.shift)
 
     @torch.no_grad()
     def picture(self, view: View, background: Tensor) -> Picture:

@@ -17,6 +17,8 @@ import torch
 
 from nerfloom import DataParser, Dataset
 from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.blocks.block import TrainedBlock
+from nerfloom.blocks.files import BlockList, read_blocks, write_blocks
 from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale, write_scale
@@ -364,6 +366,23 @@ def read_recipe(folder: Path, scratch: Path) -> None:
     require(plan.contenders and plan.conditions.budget(), "a comparison of nothing")
 
 
+def write_two_blocks(folder: Path) -> None:
+    runs = [folder / "runs" / str(number) for number in (0, 1)]
+    for run in runs:
+        run.mkdir(parents=True)
+        (run / "config.yml").write_text("method: instant-ngp\n")
+    blocks = [TrainedBlock((0.5, 1.0, 2.0), 3.0 + number, (0, 1, 2), run) for number, run in enumerate(runs)]
+    write_blocks(folder / "blocks.yml", BlockList(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 0.05, 1e3, tuple(blocks)))
+
+
+def read_scene_in_blocks(folder: Path, scratch: Path) -> None:
+    found = read_blocks(folder / "blocks.yml")
+    require(0 <= found.near < found.far and found.blocks, "a scene of nothing")
+    for block in found.blocks:
+        require(block.radius > 0 and all(map(math.isfinite, block.center)), "a block without a place")
+        require(all(len(row) == 4 and all(map(math.isfinite, row)) for row in block.color), "colours of nothing")
+
+
 def read_checkpoints(folder: Path, scratch: Path) -> None:
     content = load_newest(folder / "run" / FOLDER)
     require(content is None or "model" in content, "a checkpoint without a model")
@@ -521,6 +540,9 @@ READERS: dict[str, Reader] = {
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
     "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius")),
+    "blocks": Reader(
+        write_two_blocks, read_scene_in_blocks, ("blocks.yml",), ("version", "box", "run", "center", "cameras", "color")
+    ),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),

@@ -25,6 +25,21 @@ MUTANTS = {
             "ns-render time shows the first moment all along",
             "cli/test_render_command.py::test_one_camera_while_time_runs"),
     ],
+    "nerfloom.blocks.blend": [
+        Mutant("blocks-end-suddenly", "near_shares", "1 / A - 1 / B", "1 / A",
+            "a block appears and leaves suddenly where a flight passes its radius",
+            "blocks/test_blend.py::test_shares_in_closed_form"),
+    ],
+    "nerfloom.blocks.composed": [
+        Mutant("depth-in-units-of-a-block", "Blocks.picture_of", "A / scale, B / scale", "A, B",
+            "depths of composed pictures are in the units of whichever block they are from",
+            "blocks/test_composed.py::test_two_blocks_of_one_colour_each_are_blended_exactly"),
+    ],
+    "nerfloom.blocks.merge": [
+        Mutant("doubled-borders", "merged", "part[in_cell(A, B, C)]", "part",
+            "what two blocks have learned is drawn twice",
+            "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
+    ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
             "exports stay in the unit of the input after a true length was given",

@@ -37,6 +37,8 @@ ELSEWHERE = {
     r"python -m nerfloom.cli.bench gpu": "tests/benchmarks/test_gpu.py",
     r"ns-bake": "tests/export/test_bake.py",
     r"ns-edit": "tests/edit/test_command.py",
+    r"ns-blocks": "tests/blocks/test_command.py",
+    r"ns-(eval|render|viewer|export) .*outputs/blocks-": "tests/blocks/test_command.py",
     r"ns-download-data": "tests/downloads/test_install.py",
     r"ns-measure": "tests/test_scale.py",
     r"ns-stress": "tests/stress_command/test_runs.py",

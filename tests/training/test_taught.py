@@ -106,7 +106,7 @@ def test_photographs_finish() -> None:
 
 def test_what_is_between_two_scenes() -> None:
     one, other = placed(1, 0.5), placed(2, 3.0)
-    rotation, scale, shift = one.onto(other)
+    rotation, scale, shift = one.similarity_to(other)
     points = torch.randn(50, 3, dtype=torch.float64)
     expected = other.points(one.original_points(points))
     torch.testing.assert_close(scale * points @ rotation.T + shift, expected, rtol=0, atol=1e-6)
@@ -117,7 +117,7 @@ def test_rays_are_those_of_the_pupils_cameras(model: str) -> None:
     own, pupil = placed(1, 0.5), placed(2, 3.0)
     octree = ball()
     teacher, camera = Teacher(DrawnOctree(octree, octree.scene), own, pupil), replace(front(), model=model)
-    pixels, (rotation, scale, shift) = torch.arange(0, 1600, 37), pupil.onto(own)
+    pixels, (rotation, scale, shift) = torch.arange(0, 1600, 37), pupil.similarity_to(own)
     given, found = (each.pixel_rays(pixels, 0.0, 1.0) for each in (camera, teacher.cameras(camera)))
     origins = scale * given.origins.double() @ rotation.T + shift
     torch.testing.assert_close(found.origins.double(), origins, rtol=0, atol=1e-4)
@@ -140,7 +140,7 @@ def test_a_picture_is_the_same_in_another_frame() -> None:
 def test_density_and_colours_at_points() -> None:
     """A density is per length: in a scene of six times the scale, it is a sixth."""
     own, pupil = placed(1, 0.5), placed(2, 3.0)
-    rotation, scale, shift = pupil.onto(own)
+    rotation, scale, shift = pupil.similarity_to(own)
     assert scale == pytest.approx(1 / 6)
     there = 0.5 * torch.randn(40, 3, dtype=torch.float64)
     here = ((there - shift) / scale) @ rotation
@@ -177,7 +177,7 @@ def test_pixels_show_what_the_teacher_sees_along_their_rays(rays_per_pixel: int)
     assert (len(batch), batch.rays_per_pixel, batch.rays.camera_indices) == (400, rays_per_pixel, None)
     assert bool(((batch.pixels >= 0) & (batch.pixels < len(dataset.pixels))).all())
     assert float(batch.rays.origins.norm(dim=-1).max()) < 4  # cameras are at distance 3
-    rotation, scale, shift = dataset.placement.onto(own)
+    rotation, scale, shift = dataset.placement.similarity_to(own)
     origins = scale * batch.rays.origins @ rotation.T.float() + shift.float()
     ends = (torch.full((len(origins),), end) for end in (model.scene.near, model.scene.far))
     rays = Rays(origins, batch.rays.directions @ rotation.T.float(), *ends)

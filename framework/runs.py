@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from nerfloom.base.config import from_plain, to_plain
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.registry import load_dataparser, load_method, registered, summary
 from nerfloom.rendering.rendered import Picture

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.base.config import TrainConfig, from_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.errors import ConfigError, NerfloomError
 from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.plain import from_plain
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes

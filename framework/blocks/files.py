@@ -24,8 +24,8 @@ from typing import Any
 import yaml
 
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.config import read_yaml
 from nerfloom.base.errors import DataError, printable, shown
+from nerfloom.base.plain import read_yaml
 from nerfloom.blocks.block import IDENTITY, Affine, TrainedBlock, Vector
 
 NAME = "blocks.yml"

@@ -103,7 +103,7 @@ def _views(name: str, flags: PathFlags, loaded: Loaded) -> Views:
 
 def _facts(name: str, flags: PathFlags, loaded: Loaded, views: Views) -> dict[str, Any]:
     """Return everything that determines the pictures, as plain data."""
-    from nerfloom.base.config import to_plain
+    from nerfloom.base.plain import to_plain
     from nerfloom.evaluation.frames import hash_of_file, hash_of_tensors
 
     cameras = views.cameras

@@ -6,8 +6,9 @@ import os
 from itertools import pairwise
 from pathlib import Path
 
-from nerfloom.base.config import TrainConfig, read_yaml
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.errors import CheckpointError, ConfigError, DataError
+from nerfloom.base.plain import read_yaml
 from nerfloom.cli.flags import HELP
 from nerfloom.training.run_path import check_data, check_writable
 

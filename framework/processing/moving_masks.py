@@ -7,10 +7,10 @@ from typing import Any
 
 from PIL import Image
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.json_files import read_object
+from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.processing import transforms

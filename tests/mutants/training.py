@@ -4,7 +4,7 @@ from tests.mutants.mutant import Mutant
 
 # fmt: off
 MUTANTS = {
-    "nerfloom.base.config": [
+    "nerfloom.base.plain": [
         Mutant("yaml-lists", "to_plain", "[A for item in B]", "[A for item in B][:1]",
             "a setting of several numbers is written to config.yml with the first alone",
             "test_config.py::test_every_methods_config_survives_yaml"),

@@ -140,7 +140,7 @@ def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 
 @pytest.mark.entry(15)
 def test_srgb_curves_have_no_gradient_and_a_value_at_black() -> None:
-    """Colours are as stored; numpy's curve looks at photographs, and at colours of a glTF file, which no gradient passes.
+    """Colours are as stored; numpy has curves for the light of photographs and for glTF files, without a gradient.
 
     A curve that is learnt through needs a test of its slope at 0.
     """

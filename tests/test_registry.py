@@ -18,6 +18,7 @@ BUILT_IN = {
     "kplanes",
     "mip-nerf",
     "mip-nerf-360",
+    "moving-gaussians",
     "nerf-plus-plus",
     "nerf-w",
     "nerfacto",

@@ -27,7 +27,7 @@ from nerfloom.splats.table import Column
 DURATIONS: Range = (1e-4, 1e3)
 """Allowed range of a duration, in the time from 0 to 1. Above about 10 nothing fades."""
 MAX_LOGIT = 30.0
-"""Logits are at most this before they are faded. The opacity differs from 1 by 1e-13, and its exponential is finite."""
+"""Maximum logit before fading. Its opacity is within 1e-13 of 1, and its exponential is finite in float32."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,9 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         super().start(dataset)
 
     def start_without_points(self) -> Literal["field", "silhouettes", "random"]:
-        return "random" if self.scene.moving else super().start_without_points()
+        # A still field blurs what moves, but it shows far surroundings, where no box says where to begin.
+        in_a_box = self.scene.moving and not self.scene.unbounded
+        return "random" if in_a_box else super().start_without_points()
 
     def at_time(self, gaussians: Gaussians, time: float | None) -> Gaussians:
         return gaussians if time is None else shown_at(gaussians, time)

@@ -296,6 +296,14 @@ def test_a_still_scene_has_no_columns_of_motion() -> None:
     assert model.start_without_points() == "field"
 
 
+@pytest.mark.parametrize(("unbounded", "kind"), [(False, "random"), (True, "field")])
+def test_a_scene_without_a_box_starts_on_a_field(unbounded: bool, kind: str) -> None:
+    scene = dataclasses.replace(MOVING, unbounded=unbounded)
+    config, _ = METHOD.decided(dataclasses.replace(METHOD.config, **{**FEW, "start": "auto"}), scene)
+    assert MovingGaussians(config, scene).start_without_points() == kind
+    assert config.field_depth_mult == 0.0  # a field of all times tells no distance at one
+
+
 def test_the_minimum_duration_follows_the_images_times() -> None:
     for scene, expected in (
         (MOVING, 1 / 16),

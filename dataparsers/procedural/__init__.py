@@ -2,8 +2,8 @@
 
 It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, otherwise XDG_CACHE_HOME,
 otherwise ~/.cache), and read from there. `--num-scenes` renders many random scenes instead, for methods that learn from
-several scenes. `--courtyard True` photographs a courtyard instead, through which people walk (`--distractors`) and
-where light changes.
+several scenes. `--courtyard True` photographs a courtyard instead, where people walk through (`--distractors`) and
+light changes.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ class Procedural(DataParser):
     courtyard: bool = False
     """Use a courtyard: the solids on paving between walls, so that every pixel shows a surface."""
     distractors: float = 0.0
-    """Share of the pixels of training images of the courtyard that show people and things which are in no other image,
-    from 0 to 0.4. Test images are clean."""
+    """Share of the courtyard's training pixels that show people and things found in no other image, from 0 to 0.4. Test
+    images are clean."""
     changing_exposure: bool = False
     """Whether training images of the courtyard differ in exposure, by up to a stop."""
     changing_white_balance: bool = False
     """Whether training images of the courtyard differ in white balance."""
     changing_sun: bool = False
-    """Whether the sun stands elsewhere in each training image of the courtyard."""
+    """Whether the position of the sun differs between training images of the courtyard."""
     views_per_scene: int = 12
     """Images of each random scene. Of a held-out scene, every fourth is evaluated and the others are sources."""
 
@@ -93,7 +93,7 @@ class Procedural(DataParser):
         if self.courtyard and (self.moving or self.num_scenes > 1):
             raise DataError("--courtyard is a scene of its own: leave out --moving and --num-scenes")
         if not self.courtyard and (self.distractors or any(self._changing)):
-            raise DataError("--distractors and --changing-* are of the courtyard: add --courtyard True")
+            raise DataError("--distractors and --changing-* apply to the courtyard only: add --courtyard True")
 
     def _rendered_folder(self) -> Path:
         """Return the scene's folder; render the scene first if it is not in the cache."""

@@ -28,7 +28,7 @@ from nerfloom.samplers.motion import MotionConfig, slices_choice
 NUM_STEPS, HASH_NUM_STEPS = 192, 384
 """Steps along the diagonal of the box: with networks, and with a hash grid."""
 HASH_SAMPLES_PER_BATCH = 2**13
-"""Samples per training step with a hash grid, whose networks are small, and an occupancy grid."""
+"""Samples per training step with an occupancy grid and a hash grid, which needs small networks only."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""NeRF in the Wild: light that differs between photographs, and people and things that are in one of them only.
+"""NeRF in the Wild: photographs that differ in light and show people and things that appear in one of them only.
 
 Martin-Brualla et al., "NeRF in the Wild: Neural Radiance Fields for Unconstrained Photo Collections", CVPR 2021. Each
-training image has an appearance vector, an input of the static colours, and a transient vector. A second head turns
-the latter into density, colour and uncertainty that exist in that image alone. Where an image disagrees with the
-others, to say so costs less than to change the scene. Views that are no training images show the static part alone.
+training image has an appearance vector, an input of the static colours, and a transient vector. A second head turns the
+transient vector into density, colour and uncertainty that exist in that image alone. Where an image disagrees with the
+others, this costs less than changing the scene. Other views show the static part alone.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from nerfloom.samplers.proposal import half_edge
 APPEARANCE_SIZE = 48
 """Default length of appearance vectors if the appearance varies."""
 PAPER_WIDTH, GRID_WIDTH = 256, 64
-"""Features of a hidden layer, of the paper's networks and of those on a hash grid. The heads of the first have half."""
+"""Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""
 PAPER_RATE = 0.05
 """Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
 START = 0.05
@@ -83,7 +83,7 @@ class NerfWConfig(
     transient_embedding_dim: int = 16
     """Length of an image's transient vectors."""
     transient_resolution: int = 1
-    """Vectors along each side of an image, interpolated between; 1: one for each image, as in the paper."""
+    """Transient vectors along each side of an image, with interpolation. 1: one per image, as in the paper."""
     least_uncertainty: float = 0.1
     """Standard deviation of colours where nothing is transient; 0.03 in the paper."""
     transient_density_mult: float = 0.01
@@ -94,10 +94,10 @@ class WildRenderer(VolumeRenderer):
     """Volume rendering of the static field alone, and together with the transient part of the rays' images.
 
     In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
-    constant densities. The paper's equation 8 adds the opacities of both instead, which is the same for thin intervals.
+    constant densities. The paper's equation 8 adds their opacities instead, which is the same for thin intervals.
 
     Depth, opacity and weights are those of the static part. The uncertainty is composited by the transient density
-    alone (equation 11), so that the static part does not change on its account.
+    alone (equation 11), so that it does not change the static part.
 
     Args:
         head: the transient part.
@@ -159,7 +159,7 @@ class TransientDensity(LossTerm):
 
 
 class NerfW(RefinedModel[NerfWConfig], plain=True):
-    """A model that believes images only as far as others agree with them."""
+    """A model that gives less weight to an image where the others disagree with it."""
 
     losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
     renderer: WildRenderer
@@ -201,7 +201,7 @@ def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decisio
     Returns:
         Settings without open ones, and a record of each setting that was filled in.
     """
-    config, scaled = fill(config, Choice("gradient_scaling", True, "what is near one camera may be in its image alone"))
+    config, scaled = fill(config, Choice("gradient_scaling", True, "things near one camera may be in its image alone"))
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
@@ -225,7 +225,7 @@ def make_field(config: NerfWConfig, scene: Scene) -> EncodedField | NeRFField:
 
 
 def sampler(config: NerfWConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler, which knows the static density alone."""
+    """Return the configured sampler; it uses the static density alone."""
     return make_sampler(config, replace(scene, unbounded=config.contraction))
 
 

@@ -118,7 +118,7 @@ def read_table(
             row = replace(row, conditions=replace(row.conditions, lpips_weights=weights, num_threads=num_threads))
             if not re.fullmatch(r"[\w.-]+", row.name):
                 raise ConfigError(
-                    f"{path}: {shown(row.name)} is no name of a row; take letters, digits and hyphens for names"
+                    f"{path}: {shown(row.name)} is not a name for a row; use letters, digits and hyphens"
                 )
             if row.name in rows:
                 raise ConfigError(f"{path}: two rows are called {row.name}; rename the data or method of one")

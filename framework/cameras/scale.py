@@ -1,8 +1,8 @@
 """The scale of a run: the unit of its lengths, once a true length in the scene has been given.
 
 Photographs do not tell a scene's size. The scale is a number and a name: lengths of the input times `factor` are in
-`unit`. It is kept in the file scale.json of a run's folder, and beside an exported file NAME of Gaussians, whose
-coordinates it has been applied to, in NAME.scale.json. Without such a file, lengths are in the input's own unit.
+`unit`. It is kept in the file scale.json of a run's folder. An exported file NAME of Gaussians has coordinates in that
+unit and the scale in NAME.scale.json. Without such a file, lengths are in the input's own unit.
 """
 
 from __future__ import annotations

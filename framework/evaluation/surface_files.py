@@ -60,7 +60,7 @@ def _said(surface: Surface, file: Path) -> Surface:
     """Return the usable part of a surface, and say what is left out."""
     found, notes = usable(surface, str(file))
     if notes:
-        say(f"{file}: left out are {', '.join(notes)}")
+        say(f"{file}: left out: {', '.join(notes)}")
     return found
 
 

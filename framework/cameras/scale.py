@@ -89,7 +89,7 @@ def scale_file(path: Path) -> Path:
 
 
 def read_scale(path: Path) -> Scale:
-    """Read the scale of a run or of a file of Gaussians; that of the input if none is kept.
+    """Read the scale of a run, a file of Gaussians or an octree; that of the input if none is kept.
 
     Args:
         path: the run's folder, or the file.
@@ -111,7 +111,7 @@ def read_scale(path: Path) -> Scale:
 
 
 def write_scale(path: Path, scale: Scale) -> None:
-    """Write the scale of a run or of a file of Gaussians, or remove an earlier one if it is the input's own.
+    """Write the scale of a run, a file of Gaussians or an octree; remove an earlier one if it is the input's own.
 
     Args:
         path: the run's folder, or the file.

@@ -1,4 +1,4 @@
-"""The command `ns-eval`: metrics of a trained run, or of a file of Gaussians, on held-out views."""
+"""The command `ns-eval`: metrics of a trained run, a file of Gaussians or an octree on held-out views."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from nerfloom.training.run_path import check_writable
 
 @dataclass(frozen=True, kw_only=True)
 class EvalFlags(GeometryFlags, RunFlags):
-    """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views.
+    """Compute PSNR, SSIM and LPIPS of a run, or with --data of a file of Gaussians or an octree, on held-out views.
 
     With --reference-mesh or --reference-points, also compare its surface with the true one."""
 
     output_path: Path | None = None
-    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
+    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians or an
+    octree."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
@@ -119,7 +120,7 @@ def _command(arguments: list[str]) -> None:
 
 
 def _beside(run: Path) -> Path:
-    """Return the default results file for a run's config.yml or a file of Gaussians."""
+    """Return the default results file for a run's config.yml, a file of Gaussians or an octree."""
     return run.parent / "eval.json" if run.suffix == ".yml" else run.with_suffix(".eval.json")
 
 

@@ -35,7 +35,7 @@ class RunFlags:
     the surface. Default: the run's setting."""
 
     def check(self) -> Path:
-        """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
+        """Check that all files exist, without torch, and return the run's config.yml or the file.
 
         Raises:
             ConfigError, CheckpointError, DataError: if something is missing.

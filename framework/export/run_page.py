@@ -228,9 +228,12 @@ def _title(loaded: Loaded) -> str:
 
 def _about(loaded: Loaded, moment: float | None) -> str:
     method = loaded.method
-    parts = [f"Made by Nerfloom with {method}." if loaded.is_run else "Made by Nerfloom from a file of Gaussians."]
-    if not isinstance(loaded.model, HasGaussians):
-        parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
+    drawn = isinstance(loaded.model, HasGaussians)
+    file = "a file of Gaussians" if drawn else "an octree"
+    parts = [f"Made by Nerfloom with {method}." if loaded.is_run else f"Made by Nerfloom from {file}."]
+    if not drawn:
+        field = f"{method}'s field" if loaded.is_run else "the octree"
+        parts.append(f"The Gaussians shown here are fitted to pictures of {field}.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")
-    return " ".join([*parts, "The page works offline and asks no host for anything."])
+    return " ".join([*parts, "The page works offline and requests nothing from any host."])

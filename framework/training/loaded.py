@@ -1,4 +1,4 @@
-"""A loaded run or file of Gaussians, for rendering and evaluation."""
+"""A loaded run, file of Gaussians or octree, for rendering and evaluation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Loaded:
     method: str
     """Name of the method that made it."""
     origin: Path
-    """The run's folder, or the file of Gaussians, for commands that load it again."""
+    """The run's folder, or the file of Gaussians or octree, for commands that load it again."""
     checkpoint: Path
     """File of the parameters."""
     step: int = 0
@@ -54,7 +54,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file of Gaussians."""
+        """True for a run, False for a file of Gaussians or an octree."""
         return self.origin != self.checkpoint
 
     @property
@@ -170,7 +170,7 @@ class Loaded:
         unit: str = "m",
         time: float | None = None,
     ) -> Loaded:
-        """Return this with the scale in which two points have a given distance; `keep_scale` keeps it.
+        """Return this in a scale that gives two points a known distance; `keep_scale` writes the scale to the run.
 
         Args:
             start, end: the points, as in `measure`.
@@ -196,12 +196,12 @@ class Loaded:
         """Write the scale to the run's folder, where whatever loads the run finds it.
 
         Raises:
-            ConfigError: for a file of Gaussians, whose coordinates are in a unit already.
+            ConfigError: for a file of Gaussians or an octree, because its coordinates are in a unit already.
             OSError: if it cannot be written.
         """
         if not self.is_run:
             raise ConfigError(
-                f"{self.origin} is a file of Gaussians, and keeps its coordinates: set the scale of the run that it is "
+                f"{self.origin} is a file and keeps its coordinates: set the scale of the run that it is "
                 "from, and export it again"
             )
         write_scale(self.folder, self.scale)

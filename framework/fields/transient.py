@@ -13,14 +13,14 @@ from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.table_memory import require
 
 FREQUENCIES = 6
-"""Number of frequencies of positions, since a field's features need not tell where they are."""
+"""Number of frequencies of positions, which are an input because a field's features need not determine the position."""
 
 
 class TransientHead(nn.Module):
-    """Density, colour and uncertainty that one image has alone: NeRF-W, equation 10.
+    """Density, colour and uncertainty that exist in one image alone: NeRF-W, equation 10.
 
-    Each image has a map of vectors, interpolated between the vertices of a square grid over it. A map of one vertex is
-    the paper's transient vector.
+    Each image has vectors at the vertices of a square grid over it, with interpolation between them. With one vertex,
+    this is the paper's transient vector.
 
     Args:
         num_features: number F of features of the field.
@@ -56,7 +56,7 @@ class TransientHead(nn.Module):
         self.register_buffer("reach", torch.ones(()))  # tangent of the widest angle between a ray and its camera's axis
         self.start = start
         self.shown_image: int | None = None
-        """Training image whose transient part is rendered outside of training; None for none."""
+        """Index of the training image to render with its transient part outside of training; None for none."""
 
     def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return transient density (N,), 1/length, colour (N, 3) in [0, 1], and uncertainty (N,), all of float32.
@@ -64,14 +64,14 @@ class TransientHead(nn.Module):
         Args:
             features: (N, F) features of the field.
             positions: (N, 3) scene coordinates.
-            vectors: (N, S) vector of each sample's image where its ray crosses the image.
+            vectors: (N, S) vector of each sample's image at the ray's position in it.
         """
         placed = frequency_encoding(2 * contract_to_unit(positions, self.box) - 1, FREQUENCIES)
         density, found = self.network.density(features, vectors.to(features.dtype), placed.to(features.dtype))
         return self.start * density, found[:, 1:4].float().sigmoid(), functional.softplus(found[:, 4].float())
 
     def vectors_of(self, rays: Rays) -> Tensor | None:
-        """Return the vector (R, S) of each ray's image where the ray crosses it; None for rays of no training image."""
+        """Return the vector (R, S) of each ray's image at the ray's position; None if rays have no training image."""
         images = rays.camera_indices
         if images is None and self.shown_image is not None:
             images = torch.full((len(rays),), self.shown_image, device=rays.origins.device)

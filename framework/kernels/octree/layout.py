@@ -28,7 +28,8 @@ MAX_BRICKS = 2**24
 
 @dataclass(frozen=True)
 class OctreeLayout:
-    """The leaves of an octree: L cells of a grid, in B bricks. `build` makes it, and everything relies on that."""
+    """The leaves of an octree: L cells of a grid, in B bricks. Make it with `build`; other code relies on its
+    checks."""
 
     origin: Tensor
     """(3,) corner of the first cell, scene units."""

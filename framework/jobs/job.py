@@ -38,11 +38,11 @@ class Resources:
 
 @dataclass(frozen=True)
 class Job:
-    """Commands that run one after the other. Running a job again goes on where it was stopped.
+    """Commands that run one after the other. A job that was stopped resumes when it is run again.
 
     Args:
         title: name of the job in messages.
-        description: what it does, such as its budget; a message at its start has it.
+        description: what it does, such as its budget, for the message at its start.
         steps: the commands.
         log: file for the output of the commands.
         finished: returns whether the job's files are complete; called where the jobs are launched.

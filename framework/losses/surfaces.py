@@ -173,8 +173,7 @@ class SurfacePoints(LossTerm):
 
 
 class DistanceBounds(LossTerm):
-    """Bounds of the distance on rays through points of a reconstruction, at random positions before and behind the
-    points.
+    """Bounds of the distance at random positions before and behind points of a reconstruction, on rays that see them.
 
     If an image shows a point, space in front of the point is empty: the signed distance there is positive, and at most
     the distance to the point. Space just behind the point counts as solid: the signed distance there is negative, and

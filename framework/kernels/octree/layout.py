@@ -28,8 +28,7 @@ MAX_BRICKS = 2**24
 
 @dataclass(frozen=True)
 class OctreeLayout:
-    """The leaves of an octree: L cells of a grid, in B bricks. Make it with `build`; other code relies on its
-    checks."""
+    """The leaves of an octree: L cells of a grid, in B bricks. `build` makes one and checks it."""
 
     origin: Tensor
     """(3,) corner of the first cell, scene units."""

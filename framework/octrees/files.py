@@ -106,8 +106,8 @@ def read_octree(file: Path) -> Octree:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, LookupError, ArithmeticError, TypeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise DataError(f"{file} is no octree, or is damaged: {_short(error)}; copy or bake it again") from error
-    except (RuntimeError, NotImplementedError, MemoryError) as error:  # encrypted, compressed otherwise, too large
+        raise DataError(f"{file} is not an octree, or is damaged: {_short(error)}; copy or bake it again") from error
+    except (RuntimeError, NotImplementedError, MemoryError) as error:  # encrypted, compressed in another way, too large
         raise DataError(f"{file} cannot be read as an octree: {_short(error)}; copy or bake it again") from error
 
 
@@ -121,7 +121,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"it has no array '{missing[0]}'")
     version = _number(arrays, "version", 0, 1e6)
     if version != VERSION:
-        raise ValueError(f"it has version {version:g} of the format, and {VERSION} is known")
+        raise ValueError(f"it has version {version:g} of the format; only version {VERSION} is supported")
     return arrays
 
 
@@ -130,7 +130,7 @@ def _octree(arrays: dict[str, np.ndarray]) -> Octree:
     leaves = _leaves(arrays, layout.num_leaves)
     transform = _floats(arrays, "transform", (3, 4), np.float64)
     if not abs(float(np.linalg.det(transform[:, :3])) - 1) < 1e-3:
-        raise ValueError("its transform is no rigid motion")
+        raise ValueError("its transform is not a rigid motion")
     near, far = _number(arrays, "near", 0, MAX_COORDINATE), _number(arrays, "far", 0, MAX_COORDINATE)
     if not near < far:
         raise ValueError("it ends before it starts")

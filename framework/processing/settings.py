@@ -66,7 +66,7 @@ class ColmapFlags(OutputFlags):
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), for registered images only."""
     mask_moving: bool = False
-    """Train on the images for a short time with --robust, and write masks that leave out what moves."""
+    """Train on the images for a short time with --robust, and write masks that leave out moving things."""
     mask_seconds: float = 120.0
     """Seconds of this training."""
     device_type: Literal["cpu", "cuda"] = "cpu"

@@ -155,7 +155,7 @@ def drawn(surface: Surface, count: int, seed: int = 0) -> Samples:
 def point_spacing(points: Tensor) -> float:
     """Return the distance between neighbours among `points` (N, 3) on a surface: twice the median to the nearest.
 
-    Points at random places, N in an area, are half of sqrt(area / N) from the nearest in the mean.
+    For N points at random positions in an area, the mean distance to the nearest is half of sqrt(area / N).
     """
     if len(points) < 2:
         return 0.0

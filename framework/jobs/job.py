@@ -14,8 +14,8 @@ class Step:
 
     Args:
         command: program and arguments.
-        started: file that the command leaves early; if it exists, `resume` is run instead of `command`.
-        resume: command that goes on where an earlier one was stopped.
+        started: file that the command writes early; if it exists, `resume` is run instead of `command`.
+        resume: command that continues where an earlier one was stopped.
     """
 
     command: tuple[str, ...]

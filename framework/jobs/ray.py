@@ -176,7 +176,7 @@ def _goes_on(job: Job, lost: int, error: Exception, ledger: Ledger) -> bool:
     if lost > MAX_LOST:
         ledger.ended(job, f"it lost {lost} workers, the last by {_first_line(error)}")
         return False
-    say(f"  {job.title}: worker lost ({_first_line(error)}); the job goes on with another, {lost} of {MAX_LOST}")
+    say(f"  {job.title}: worker lost ({_first_line(error)}); the job continues on another, {lost} of {MAX_LOST}")
     return True
 
 

@@ -27,7 +27,7 @@ class OutputFlags:
     num_downscales: int = 3
     """Number of folders of reduced images: 3 writes images_2, images_4 and images_8."""
     can_resume: ClassVar[bool] = False
-    """Whether a stopped run can go on where it stopped."""
+    """Whether a stopped run can continue where it stopped."""
 
     def check(self) -> None:
         """Check the values.

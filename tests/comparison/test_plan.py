@@ -1,4 +1,4 @@
-"""What is compared, under which conditions, by which commands."""
+"""Plans: contenders, conditions and commands."""
 
 import json
 import math

@@ -163,4 +163,4 @@ def test_setup_builds_every_variant_or_the_one_that_this_processor_takes(monkeyp
     assert set(built()) == (there if platform.machine() in ("x86_64", "AMD64") else {"baseline"})
     monkeypatch.setenv("NERFLOOM_VARIANTS", "native")
     here = [name for name, needs in native.NEEDS.items() if cpu_features().issuperset(needs)]
-    assert built() == here[::-1] or platform.system() != "Linux"  # of which the last that compiles is built
+    assert built() == here[::-1] or platform.system() != "Linux"  # the last that compiles is built

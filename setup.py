@@ -1,8 +1,8 @@
 """Builds the CPU kernels: plain shared libraries with a C interface, one for each instruction set.
 
-They know nothing of Python or torch, so one wheel a platform serves every Python and every torch version. Where no
-compiler is at hand the installation goes on without them, and so it does without one whose flags a compiler does not
-know. With NERFLOOM_VARIANTS=native only the one that this machine would choose is built, in a fifth of the time.
+They use neither Python nor torch, so one wheel per platform serves every version of both. Without a compiler, the
+installation continues without kernels, and it skips instruction sets that the compiler does not know. With
+NERFLOOM_VARIANTS=native only the library that this machine would choose is built, in a fifth of the time.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ if platform.machine().lower() in ("x86_64", "amd64"):
 
 
 def fitting(variants: dict[str, list[str]]) -> dict[str, list[str]] | None:
-    """Return those of `variants` for whose flags -mNAME Linux lists this processor's NAME; None if it lists none."""
+    """Return the `variants` with flags -mNAME that Linux lists for this processor; None if it lists none."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

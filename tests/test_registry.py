@@ -19,6 +19,7 @@ BUILT_IN = {
     "kplanes",
     "mip-nerf",
     "mip-nerf-360",
+    "moving-gaussians",
     "nerf-plus-plus",
     "nerf-w",
     "nerfacto",

@@ -37,6 +37,7 @@ COMMANDS = {
     "ref-nerf": "ref-nerf {}",
     "pixel-nerf": "pixel-nerf {} procedural --num-scenes 200 --size 32",
     "gaussian-splatting": "gaussian-splatting {}",
+    "moving-gaussians": "moving-gaussians {} procedural --moving True",
     "tensorf": "tensorf {}",
     "vanilla-nerf": "vanilla-nerf --sampler occupancy {}",
     "zip-nerf": "zip-nerf {}",

@@ -38,6 +38,8 @@ ELSEWHERE: dict[str, str] = {
     "semantic-nerfw": "here it is called 'nerf-w', without semantics",
     "nerfplayer-nerfacto": "for moving scenes there are 'kplanes' and 'dnerf'",
     "nerfplayer-ngp": "for moving scenes there are 'kplanes' and 'dnerf'",
+    "freetimegs": "here it is called 'moving-gaussians'",
+    "4dgs": "for moving scenes 'moving-gaussians' has Gaussians with velocities, and no network",
     "depth-nerfacto": "here 'nerfacto' does that if the images come with depth images",
     "k-planes": "here it is called 'kplanes'",
     "d-nerf": "here it is called 'dnerf'",

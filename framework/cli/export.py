@@ -18,6 +18,7 @@ from nerfloom.cli.run_flags import OPENS
 
 if TYPE_CHECKING:
     from nerfloom.data.parsed_scene import ParsedScene
+    from nerfloom.splats.gaussians import HasGaussians
     from nerfloom.training.loaded import Loaded
 
 USAGE = """\
@@ -26,7 +27,11 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   tsdf            mesh.ply, .obj or .glb: a mesh of what the training cameras see; for captures, and every method
   marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
+<<<<<<< HEAD
   gaussian-splat  splat.ply, .spz, .sog or .glb: the Gaussians of gaussian-splatting, for other programs
+=======
+  gaussian-splat  splat.ply or splat.spz: the Gaussians of a run, for other programs
+>>>>>>> moving-splats
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
                   refined them; transforms_train.json: the training cameras, in nerfstudio's format
@@ -89,6 +94,9 @@ class SplatFlags(RegionFlags, ExportFlags):
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None
     """Time of a moving scene, 0 to 1. Default: 0."""
+    num_frames: int | None = None
+    """Write this many files of a moving scene, at times evenly spaced from 0 to 1: splat_0000.ply and so on. Default:
+    one file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,24 +233,48 @@ def _occupancy(flags: OccupancyFlags, loaded: Loaded, path: Path) -> None:
 def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
+    if flags.num_frames is not None and flags.num_frames < 1:
+        raise FlagError(f"--num-frames is {flags.num_frames}; it must be at least 1")
+    if flags.num_frames is not None and flags.time is not None:
+        raise FlagError("--num-frames writes all times, and --time one; leave out one of them")
     from nerfloom.export.run_page import moment_of
-    from nerfloom.geometry.regions import inside_all
     from nerfloom.splats.gaussians import HasGaussians
-    from nerfloom.splats.placed_files import in_input, write_placed
 
-    if not isinstance(loaded.model, HasGaussians):
+    model = loaded.model
+    if not isinstance(model, HasGaussians):
         raise ConfigError(
             f"ns-export gaussian-splat: {loaded.method} has no Gaussians; ns-train gaussian-splatting makes them"
         )
-    moment = moment_of(loaded.model.scene.moving, flags.time)
-    found = loaded.model.gaussians(moment).map(lambda values: values.detach().cpu())
+    if flags.num_frames is None:
+        _write_splats(flags, loaded, model, moment_of(model.scene.moving, flags.time), path)
+        return
+    if not model.scene.moving:
+        raise ConfigError(f"--num-frames {flags.num_frames}: the photographs of this run have no times")
+    for index in range(flags.num_frames):
+        time = index / max(flags.num_frames - 1, 1)
+        _write_splats(flags, loaded, model, time, path.with_stem(f"{path.stem}_{index:04d}"))
+
+
+def _write_splats(flags: SplatFlags, loaded: Loaded, model: HasGaussians, moment: float | None, path: Path) -> None:
+    """Write the Gaussians of a model at a moment, None of a static scene, to a file."""
+    from nerfloom.geometry.regions import inside_all
+    from nerfloom.splats.placed_files import in_input, write_placed
+
+    found = model.gaussians(moment).map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
+<<<<<<< HEAD
         raise ConfigError("this run has no Gaussians left; train it again")
     look, placement = loaded.model.look(), loaded.placement
     placed = in_input(good, placement)
+=======
+        at = "" if moment is None else f" at time {moment:g}"
+        raise ConfigError(f"this run has no Gaussians left{at}; train it again")
+    look = model.look()
+    placed = in_input(good, loaded.placement)
+>>>>>>> moving-splats
     if regions := flags.regions():
         placed = placed[inside_all(placed.means, regions)]
     for sentence in write_placed(path, placed, look, loaded.scale, placement, flags.max_megabytes, flags.spz_version):

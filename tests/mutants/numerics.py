@@ -315,6 +315,17 @@ MUTANTS = {
             "all rays of a moving scene are coloured at the time of the first",
             "plug_and_play/test_skipping.py::test_functions_of_time_see_the_time_of_their_ray"),
     ],
+    "nerfloom.methods.moving_gaussians": [
+        Mutant("gaussians-fade-too-fast", "log_visibility", "-0.5 * A", "-A",
+            "durations are no standard deviations: files of other programs that read them fade otherwise",
+            "splats/test_moving_gaussians.py::test_positions_and_opacities_are_the_equations"),
+        Mutant("gaussians-move-from-time-zero", "shown_at", "time - extras['moments']", "time",
+            "Gaussians are away from their means at their moments",
+            "splats/test_moving_gaussians.py::test_positions_and_opacities_are_the_equations"),
+        Mutant("penalty-shortens-durations", "MovingGaussians.penalised_opacities", "A.detach()", "A",
+            "the 4D regularisation shortens durations instead of keeping Gaussians translucent",
+            "splats/test_moving_gaussians.py::test_the_penalty_counts_what_is_seen_and_shortens_no_duration"),
+    ],
     "nerfloom.plug_and_play.rendering": [
         Mutant("extras-teach-no-density", "accumulate", "weights", "weights.detach()",
             "a loss on depths, normals or semantics moves no density",
@@ -469,6 +480,7 @@ MUTANTS = {
             "Mip-Splatting's Gaussians are larger by their filter, and no fainter",
             "splats/test_foreign_files.py::test_the_filter_of_mip_splatting_is_a_part_of_the_gaussian"),
     ],
+<<<<<<< HEAD
     "nerfloom.splats.sog": [
         Mutant("splats-sog-palette", "_harmonics", "A.transpose(0, 2, 1)", "A.reshape(len(A), 3, terms)",
             "the colours of harmonics in a SOG file are exchanged",
@@ -479,6 +491,13 @@ MUTANTS = {
             "A.save(B, format='WEBP', lossless=True)",
             "transparent Gaussians in a SOG file lose their colour",
             "splats/test_sog.py::test_opacity_0_keeps_its_colour"),
+=======
+    "nerfloom.splats.relocation": [
+        Mutant("relocation-by-gradient-alone", "sampling_scores", "OPACITY_WEIGHT * _relative(opacities)",
+            "0 * opacities",
+            "a Gaussian that no image has shown for some steps is never a place to move to",
+            "splats/test_relocation.py::test_scores_are_the_weighted_sum_of_relative_gradients_and_opacities"),
+>>>>>>> moving-splats
     ],
     "nerfloom.splats.splat": [
         Mutant("splats-quaternions-of-splat-files", "read_splat", "A - 128", "(A - 128)[:, [1, 2, 3, 0]]",

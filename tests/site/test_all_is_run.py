@@ -25,6 +25,8 @@ ELSEWHERE = {
     r"ns-train .* (blender|nerfstudio|colmap|dtu) --": "tests/truth/test_captures.py",
     r"ns-eval .*--eval-appearance half": "tests/truth/test_training.py",
     r"ns-render (camera-path|time) ": "tests/cli/test_render_command.py",
+    r"ns-(train|viewer|eval|render|export) .*/balls": "tests/splats/test_moving_gaussians.py",
+    r"ns-compare .*/balls": "tests/cli/test_compare_command.py",
     r"ns-process-data (polycam|record3d) ": "tests/truth/test_processing.py",
     r"ns-process-data images .*(FISHEYE|scan/images)": "tests/truth/test_processing.py",
     r"ns-process-data images .*--resume": "tests/processing/test_process_command.py",

@@ -115,6 +115,13 @@ TINY: dict[str, dict[str, Any]] = {
         "steps_per_move": 10,
         "rate_factor": 3.0,
     },
+    "moving-gaussians": {
+        "num_gaussians": 600,
+        "start_gaussians": 400,
+        "start": "silhouettes",
+        "steps_per_move": 10,
+        "rate_factor": 3.0,
+    },
     "nerf-plus-plus": {
         "num_layers": 3,
         "hidden_width": 32,

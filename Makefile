@@ -52,20 +52,20 @@ test-versions: .venv/installed-release
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-# For what follows at once: without the kernels of other processors, and without compiling modules that nobody imports.
+# Quick: with the kernels of this processor alone, and without compiling modules that nobody imports.
 .venv/installed: .venv/bin/python pyproject.toml setup.py constraints.txt $(wildcard framework/kernels/*/*.cpp framework/kernels/*/*.h)
 	@echo "installing nerfloom into .venv"
-	NERFLOOM_VARIANTS=native $(PIP) --no-compile -e .
+	$(PIP) --no-compile -e .
 	@touch $@
 
 .venv/installed-test: .venv/installed
 	@echo "installing the test extra into .venv"
-	$(PIP) -e '.[test]'
+	NERFLOOM_VARIANTS=all $(PIP) -e '.[test]'
 	@touch $@
 
 .venv/installed-release: .venv/installed-test
 	@echo "installing the release extra into .venv"
-	$(PIP) -e '.[release]'
+	NERFLOOM_VARIANTS=all $(PIP) -e '.[release]'
 	@touch $@
 
 .venv/installed-docs: .venv/installed

@@ -93,7 +93,7 @@ def without_torch(session: nox.Session) -> None:
     """Compile every file, and run the tests that need no torch, for versions of Python without a torch here."""
     needs = ("numpy", "scipy", "tyro", "rich", "imageio", "pillow", "PyYAML", "pycolmap", "jinja2", "trimesh")
     session.install("-c", str(ROOT / "constraints.txt"), *needs, "pytest", "hypothesis")
-    session.install("--no-deps", "-e", str(ROOT), env={"NERFLOOM_VARIANTS": "native"})
+    session.install("--no-deps", "-e", str(ROOT))
     session.run("python", "-c", COMPILE, silent=True)
     plugins = ("--noconftest", "-p", "tests.downloads.conftest")  # the conftest.py of all tests imports torch
     session.run("python", "-m", "pytest", *plugins, *(session.posargs or TORCHLESS))

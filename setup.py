@@ -1,8 +1,10 @@
-"""Builds the CPU kernels: plain shared libraries with a C interface, one for each instruction set.
+"""Builds the CPU kernels: plain shared libraries with a C interface, for one instruction set or for each.
 
 They use neither Python nor torch, so one wheel per platform serves every version of both. Without a compiler, the
-installation continues without kernels, and it skips instruction sets that the compiler does not know. With
-NERFLOOM_VARIANTS=native only the library that this machine would choose is built, in a fifth of the time.
+installation continues without kernels, and it skips instruction sets that the compiler does not know.
+
+Only the library that this machine chooses is built. With NERFLOOM_VARIANTS=all every one is, which takes five times as
+long: for wheels, which other machines install.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ def gives_tiles() -> bool:
     return ctypes.CDLL(None).syscall(system_call, request, tile_data) == 0
 
 
-HERE = fitting(VARIANTS) if os.environ.get("NERFLOOM_VARIANTS") == "native" else None
+HERE = None if os.environ.get("NERFLOOM_VARIANTS") == "all" else fitting(VARIANTS)
 VARIANTS = HERE or VARIANTS
 # GCC for Windows aligns the stack to 16 bytes, and stores wider vectors there as if it were to more (GCC bug 54412).
 MINGW_FLAGS = ["-Wa,-muse-unaligned-vector-move"]
@@ -72,7 +74,7 @@ NETWORK_FLAGS = ["-fno-wrapv"]
 
 
 class BuildKernels(build_ext):
-    """Compiles every variant that the compiler can; with NERFLOOM_VARIANTS=native the fastest of these."""
+    """Compiles the fastest variant for this processor; with NERFLOOM_VARIANTS=all every one that the compiler can."""
 
     def get_ext_filename(self, fullname: str) -> str:
         suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.curves import conditions
-from nerfloom.base.config import from_plain, read_yaml
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, shown
+from nerfloom.base.plain import from_plain, read_yaml
 from nerfloom.benchmarks.results import add_row, read_rows
 from nerfloom.comparison.measures import measure, read_json
 from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, PlannedRun, split_words

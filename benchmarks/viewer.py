@@ -29,6 +29,8 @@ WARM_UP = 12
 class Times:
     """Seconds of a viewer's pictures of one run."""
 
+    run: str
+    """Name of the run's folder of experiments, which is that of its data if nothing else was given."""
     method: str
     """Name of the method."""
     width: int
@@ -85,6 +87,7 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
             threading.Event().wait(0.005)
     assert shown[-1][1] == FINE_QUALITY
     return Times(
+        run.resolve().parent.parent.name,
         trained.method,
         width,
         height,

@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from nerfloom import edit as edit
     from nerfloom.base.config import RayConfig as RayConfig
     from nerfloom.base.config import TrainConfig as TrainConfig
     from nerfloom.base.decisions import Decision as Decision
@@ -142,6 +143,8 @@ __all__ = sorted(_HOMES)
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"nerfloom.{_HOMES[name]}"), name)
+    if name == "edit":
+        return import_module("nerfloom.edit")
     raise AttributeError(f"module 'nerfloom' has no attribute '{name}'")
 
 

@@ -23,6 +23,7 @@ from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
 from nerfloom.splats.mcmc import Mcmc, shaken
 from nerfloom.splats.rasteriser import Projected
+from nerfloom.splats.relocation import Relocation
 from nerfloom.splats.resolution import ImageSizes, most_octaves
 from nerfloom.splats.settings import SplattingConfig, SplattingConfigT
 from nerfloom.splats.start import from_points, scene_size
@@ -34,6 +35,7 @@ MAX_NEW_GAUSSIANS = 1_000
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
     "mcmc": lambda config: Mcmc(),
+    "relocation": lambda config: Relocation(),
 }
 """Strategies by their name in the setting `strategy`."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from nerfloom.base.config import from_plain, to_plain
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.registry import load_dataparser, load_method, registered, summary
 from nerfloom.rendering.rendered import Picture
@@ -28,11 +28,11 @@ def list_methods() -> dict[str, str]:
 
 
 def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Loaded:
-    """Load a trained run, a file of Gaussians, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
 
     Args:
-        path: folder of the run, its config.yml, a folder above it (for its newest run), a file of Gaussians (.ply,
-            .spz, .splat), or an octree (.octree).
+        path: folder of the run, its config.yml, a folder above it (for its newest run), a blocks.yml or its folder, a
+            file of Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree).
         data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
 

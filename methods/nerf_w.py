@@ -8,15 +8,14 @@ others, this costs less than changing the scene. Other views show the static par
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from nerfloom import Decision, Field, Method, Picture, Rays, Rendered, Sampler, Samples, Scene, View
+from nerfloom import ConfigError, Decision, Method, Picture, Sampler, Scene, View
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
@@ -26,14 +25,13 @@ from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
-from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_capture
-from nerfloom.rendering.outputs import Output
-from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_render
-from nerfloom.samplers.choice import contracted_box, decide_samples, make_sampler
+from nerfloom.rendering.transient import UNCERTAINTY, TransientRenderer
+from nerfloom.rendering.volume import scaled_up_to
+from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
 
 APPEARANCE_SIZE = 48
@@ -46,9 +44,6 @@ START = 0.05
 """Transient density before training, per half edge of the box."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid over a box."""
-STATIC = Output("static", "color", of_training=True)
-TRANSIENT = Output("transient", "color", of_training=True)
-UNCERTAINTY = Output("uncertainty", "scalar", of_training=True)
 
 
 @dataclass(frozen=True)
@@ -90,50 +85,6 @@ class NerfWConfig(
     """Weight of the mean transient density, per half edge of the box."""
 
 
-class WildRenderer(VolumeRenderer):
-    """Volume rendering of the static field alone, and together with the transient part of the rays' images.
-
-    In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
-    constant densities. The paper's equation 8 adds their opacities instead, which is the same for thin intervals.
-
-    Depth, opacity and weights are those of the static part. The uncertainty is composited by the transient density
-    alone (equation 11), so that it does not change the static part.
-
-    Args:
-        head: the transient part.
-        least: uncertainty where nothing is transient.
-        unit_length: gradients are scaled within this distance from the camera, scene units; None for no scaling.
-        thin: samples are thinned below this fraction of the mean gradient of the static part; 0 for none.
-    """
-
-    outputs = (STATIC, TRANSIENT, UNCERTAINTY)
-
-    def __init__(self, head: TransientHead, least: float, unit_length: float | None, thin: float = 0.0) -> None:
-        super().__init__(unit_length, thin)
-        self.head, self.least = head, least
-
-    def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
-        sigma, rgb = self.values(rays, samples, field)
-        static = volume_render(rays, samples, sigma, rgb, background)
-        extras = {STATIC.name: static.rgb, TRANSIENT.name: torch.zeros_like(static.rgb)}
-        extras[UNCERTAINTY.name] = torch.full_like(static.depth, self.least)
-        vectors = self.head.vectors_of(rays)
-        if vectors is None:
-            return replace(static, extras=extras)
-        assert samples.features is not None
-        density, color, doubt = self.head(
-            samples.features, samples.positions(rays).detach(), vectors.index_select(0, samples.ray_indices)
-        )
-        share = (density / (sigma + density).clamp(min=torch.finfo(torch.float32).tiny))[:, None]
-        both = volume_render(rays, samples, sigma + density, torch.lerp(rgb, color, share), background)
-        assert both.weights is not None
-        extras[TRANSIENT.name] = ray_sum((both.weights[:, None] * share * color).detach(), samples)
-        nothing_behind, doubts = torch.zeros_like(background), doubt[:, None].expand(-1, 3)
-        extras[UNCERTAINTY.name] = self.least + volume_render(rays, samples, density, doubts, nothing_behind).rgb[:, 0]
-        extras["transient_density"] = ray_sum(density, samples) / samples.counts.clamp(min=1)
-        return replace(static, rgb=both.rgb, extras=extras)
-
-
 class DoubtedError(LossTerm):
     """Error of colours in units of their uncertainty."""
 
@@ -153,16 +104,16 @@ class TransientDensity(LossTerm):
         super().__init__("transient", "transient_density_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        density = shown.rendered.extras["transient_density"]
+        density = shown.rendered.extras.get("transient_density")  # None for the views of a teacher
         unit = 2 * shown.model.config.least_uncertainty**2 * half_edge(shown.model.scene.box)
-        return unit * density.mean() if len(density) else None
+        return None if density is None or not len(density) else unit * density.mean()
 
 
 class NerfW(RefinedModel[NerfWConfig], plain=True):
     """A model that gives less weight to an image where the others disagree with it."""
 
     losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
-    renderer: WildRenderer
+    renderer: TransientRenderer
 
     @property
     def appearance(self) -> Appearance | None:
@@ -170,7 +121,11 @@ class NerfW(RefinedModel[NerfWConfig], plain=True):
         return self.field.appearance if isinstance(self.field, (EncodedField, NeRFField)) else None
 
     def render_view(self, view: View, background: Tensor) -> Picture:
-        with nullcontext() if view.image is None else self._showing(view.image):
+        if view.image is None:
+            return super().render_view(view, background)
+        appearance = self.appearance
+        lit = nullcontext() if appearance is None else appearance.shown(appearance.vectors[view.image].detach())
+        with lit, self.renderer.head.shown(view.image):
             return super().render_view(view, background)
 
     def start(self, dataset: Dataset) -> None:
@@ -183,24 +138,18 @@ class NerfW(RefinedModel[NerfWConfig], plain=True):
         half = torch.maximum(cameras.widths / cameras.fx, cameras.heights / cameras.fy) / 2
         self.renderer.head.reach.fill_(float(half.max()))
 
-    @contextmanager
-    def _showing(self, image: int) -> Iterator[None]:
-        """Render with the appearance and the transient part of a training image, within a `with` block."""
-        own, appearance = self.renderer.head, self.appearance
-        own.shown_image = image
-        try:
-            with nullcontext() if appearance is None else appearance.shown(appearance.vectors[image].detach()):
-                yield
-        finally:
-            own.shown_image = None
-
 
 def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
 
     Returns:
         Settings without open ones, and a record of each setting that was filled in.
+
+    Raises:
+        ConfigError: if an image has a map of vectors in normalised device coordinates.
     """
+    if scene.warped and config.transient_resolution > 1:
+        raise ConfigError("--transient-resolution: maps do not work in normalised device coordinates; use 1")
     config, scaled = fill(config, Choice("gradient_scaling", True, "things near one camera may be in its image alone"))
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
@@ -216,8 +165,8 @@ def make_field(config: NerfWConfig, scene: Scene) -> EncodedField | NeRFField:
     if size:
         appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
     if config.encoding == "frequency":
-        field = NeRFField(PAPER_WIDTH, contracted=contracted_box(config, scene), appearance=appearance)
-        field.optimised = Optimised(learning_rate=PAPER_RATE * config.learning_rate)
+        field = NeRFField(PAPER_WIDTH, contracted=scene.box if config.contraction else None, appearance=appearance)
+        field.optimised = _optimised(config)
         return field
     return EncodedField(
         scene.box, HashGrid.of(config, 0.0), GRID_WIDTH, unbounded=config.contraction, appearance=appearance
@@ -229,13 +178,20 @@ def sampler(config: NerfWConfig, scene: Scene) -> Sampler:
     return make_sampler(config, replace(scene, unbounded=config.contraction))
 
 
-def renderer(config: NerfWConfig, scene: Scene) -> WildRenderer:
+def renderer(config: NerfWConfig, scene: Scene) -> TransientRenderer:
     """Return the renderer, with the transient head."""
     features, width = (PAPER_WIDTH, PAPER_WIDTH // 2) if config.encoding == "frequency" else (NUM_FEATURES, GRID_WIDTH)
     known, sizes = scene.camera_to_worlds, (config.transient_embedding_dim, config.transient_resolution, width)
     poses = torch.eye(3, 4).repeat(scene.num_cameras, 1, 1) if known is None else known
     head = TransientHead(features, *sizes, scene.box, poses, START / half_edge(scene.box))
-    return WildRenderer(head, config.least_uncertainty, scaled_up_to(config, scene), config.thin_gradients)
+    made = TransientRenderer(head, config.least_uncertainty, scaled_up_to(config, scene), config.thin_gradients)
+    made.optimised = _optimised(config)
+    return made
+
+
+def _optimised(config: NerfWConfig) -> Optimised | None:
+    """Return the optimiser settings of the paper's networks; None on a hash grid."""
+    return Optimised(learning_rate=PAPER_RATE * config.learning_rate) if config.encoding == "frequency" else None
 
 
 METHOD = Method(

@@ -151,6 +151,7 @@ LAYERS = (
     ("plug_and_play",),
     ("losses",),
     ("splats", "octrees"),
+    ("blocks",),
     ("model",),
     ("ray_model", "gaussian_model", "octree_model"),
     ("moving_model",),
@@ -160,6 +161,7 @@ LAYERS = (
     ("training",),
     ("viewer",),
     ("export",),
+    ("edit",),
     ("processing", "comparison", "downloads", "stress", "testing", "integrations", "benchmarks"),
     ("cli",),
     ("runs",),
@@ -202,7 +204,7 @@ def test_nothing_is_at_the_root_of_the_framework_but_what_joins_the_rooms() -> N
     assert found - rooms <= {"__init__", "py", "templates"}
 
 
-FRONTS = ("nerfloom", "nerfloom.testing")
+FRONTS = ("nerfloom", "nerfloom.edit", "nerfloom.testing")
 """Packages that gather names from elsewhere, for notebooks and authors of plugins."""
 
 

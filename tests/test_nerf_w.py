@@ -6,14 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom import Field, Points, Rays, Samples
+from nerfloom import ConfigError, Field, Points, Rays, Samples
+from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
 from nerfloom.losses.functions import doubted_error
 from nerfloom.methods import nerf_w
-from nerfloom.methods.nerf_w import START, WildRenderer
+from nerfloom.methods.nerf_w import START
+from nerfloom.rendering.transient import TransientRenderer
 from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
 from nerfloom.testing.ball import cameras_at
+from nerfloom.testing.scenes import ball_in_a_box
+from nerfloom.training.optim import make_optimizer
 from tests.training.helpers import TINY
 
 LEAST = 0.1
@@ -87,7 +91,7 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
     """Reference: 20,000 slices of each interval, whose light is that of equation 8; and equation 11."""
     rays, samples, field, head = two_parts()
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
-    found = WildRenderer(head, LEAST, None).render(rays, samples, field, background)
+    found = TransientRenderer(head, LEAST, None).render(rays, samples, field, background)
     density, color, doubt = (x.double() for x in head.given)
     count = 20_000
     for ray in range(2):
@@ -115,16 +119,17 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
 
 def test_rays_of_no_training_image_show_the_static_part() -> None:
     rays, samples, field, head = two_parts()
-    renderer, background = WildRenderer(head, LEAST, None), torch.zeros(3, dtype=torch.float64)
+    renderer, background = TransientRenderer(head, LEAST, None), torch.zeros(3, dtype=torch.float64)
     of_image = renderer.render(rays, samples, field, background)
     held_out = renderer.render(dataclasses.replace(rays, camera_indices=None), samples, field, background)
     assert not torch.allclose(of_image.rgb, held_out.rgb)
     torch.testing.assert_close(held_out.rgb, of_image.extras["static"], rtol=0, atol=0)
     assert not held_out.extras["transient"].any()
     assert (held_out.extras["uncertainty"] == LEAST).all()
-    head.shown_image = 3
-    shown = renderer.render(dataclasses.replace(rays, camera_indices=None), samples, field, background)
+    with head.shown(3):
+        shown = renderer.render(dataclasses.replace(rays, camera_indices=None), samples, field, background)
     torch.testing.assert_close(shown.rgb, of_image.rgb, rtol=0, atol=0)
+    assert head.vectors_of(dataclasses.replace(rays, camera_indices=None)) is None
 
 
 def test_before_training_the_transient_part_is_nearly_transparent() -> None:
@@ -163,6 +168,35 @@ def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
         torch.testing.assert_close(found[:, 2], torch.full((81,), float(index)), atol=1e-5, rtol=0)
 
 
-@pytest.mark.medium
+def test_maps_are_refused_where_directions_are_not_those_of_cameras() -> None:
+    scene = dataclasses.replace(ball_in_a_box().scene, warped=True)
+    config = nerf_w.METHOD.config
+    nerf_w.METHOD.decided(config, scene)
+    with pytest.raises(ConfigError, match="--transient-resolution"):
+        nerf_w.METHOD.decided(dataclasses.replace(config, transient_resolution=2), scene)
+
+
+@pytest.mark.parametrize(("encoding", "rate"), [("frequency", 5e-4), ("hash-grid", 1e-2)])
+def test_field_and_transient_head_learn_at_the_same_rate(encoding: str, rate: float) -> None:
+    """The paper's, 5e-4, for the paper's networks."""
+    scene, small = ball_in_a_box().scene, {"log2_table_size": 12, "grid_resolution": 16}
+    config, _ = nerf_w.METHOD.decided(dataclasses.replace(nerf_w.METHOD.config, encoding=encoding, **small), scene)
+    model = nerf_w.METHOD.build(config, scene)
+    groups = make_optimizer(model, config).param_groups
+    assert [group["lr"] for group in groups] == pytest.approx([rate] * len(groups))
+    assert sum(len(group["params"]) for group in groups) == len(list(model.parameters()))
+
+
+@pytest.mark.parametrize("contraction", [False, True])
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_the_paper_network_contracts_space_if_asked(unbounded: bool, contraction: bool) -> None:
+    scene = dataclasses.replace(ball_in_a_box().scene, unbounded=unbounded)
+    config = dataclasses.replace(nerf_w.METHOD.config, encoding="frequency", contraction=contraction)
+    field = nerf_w.make_field(nerf_w.METHOD.decided(config, scene)[0], scene)
+    assert isinstance(field, NeRFField)
+    assert (field.contracted is not None) == contraction
+
+
+@pytest.mark.slow
 def test_the_papers_networks_pass() -> None:
     assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.plain import from_plain
+from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.pixels.contradicted import (
     ALL_UNTIL,
@@ -119,10 +120,10 @@ def test_all_pixels_count_at_first_and_without_draws() -> None:
     assert few.tiles.side >= MIN_SIDE
 
 
-def contradicting() -> tuple[BatchSource, torch.Tensor]:
+def contradicting(dataset: Dataset = BALL.train) -> tuple[BatchSource, torch.Tensor]:
     """A source with --robust whose first tiles are contradicted, and which (P,) bool of all pixels are in them."""
     config = dataclasses.replace(load_method("instant-ngp").config, robust=True)
-    source = make_source("pixels", BALL.train, config)
+    source = make_source("pixels", dataset, config)
     assert source.contradicted is not None
     source.contradicted.state[:5, 4] = 1
     return source, source.contradicted.counting(torch.arange(len(BALL.train.pixels))) == 0
@@ -137,9 +138,32 @@ def test_pixels_of_a_batch_have_weights_of_0_or_1() -> None:
     assert 0 < float((batch.weights == 0).float().mean()) < 0.5
 
 
+def test_left_out_pixels_have_no_known_distance() -> None:
+    """Depth images show people too."""
+    depths = torch.full((len(BALL.train.pixels),), 2.0, dtype=torch.float16)
+    source, out = contradicting(dataclasses.replace(BALL.train, depths=depths))
+    batch = source.draw(Request(0, 2000))
+    assert batch.distances is not None
+    assert torch.equal(batch.distances == 0, out[batch.pixels])
+    assert float(batch.distances[~out[batch.pixels]].min()) >= 2
+
+
+def test_the_psnr_of_training_is_that_of_pixels_that_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, seen = load_method("instant-ngp"), dict[str, Any]()
+    trainer = Trainer(found, from_plain(found.config, {**SMALL, "robust": True}, "test"), BALL.train)
+    trainer.prepare()
+    assert trainer.source.contradicted is not None
+    trainer.source.contradicted.state[:40, 4] = 1
+    monkeypatch.setattr(trainer.source, "learn", lambda request, batch, rgb: seen.update(batch=batch, rgb=rgb.clone()))
+    trainer.train_step()
+    errors, counts = (seen["rgb"] - seen["batch"].rgb).double().square(), seen["batch"].weights > 0
+    assert 0 < float(counts.double().mean()) < 1
+    assert trainer.state.train_mse == pytest.approx(float(errors[counts].mean()), rel=1e-4)
+
+
 @pytest.mark.parametrize("method", ["instant-ngp", "vanilla-nerf"])
 def test_left_out_pixels_have_no_effect_on_colours(method: str) -> None:
-    """The colour loss is the mean of the others' squared errors, in one native call and by terms alike."""
+    """The colour loss is the mean of squared errors, 0 for left-out pixels, in one native call and by terms alike."""
     found = load_method(method)
     settings = {key: value for key, value in SMALL.items() if hasattr(found.config, key)}
     trainer = Trainer(found, from_plain(found.config, {**settings, "robust": True}, "test"), BALL.train)

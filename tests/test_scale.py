@@ -23,8 +23,9 @@ METRES = Scale(0.25, "m", 0.01)
 def test_a_scale_is_read_as_it_was_written(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "splat.ply"):
         assert read_scale(path) == Scale()
-        write_scale(path, METRES)
-        assert read_scale(path) == METRES
+        for scale in (METRES, Scale(0.25, "m", None)):
+            write_scale(path, scale)
+            assert read_scale(path) == scale
         assert scale_file(path).parent == tmp_path
         write_scale(path, Scale())
         assert not scale_file(path).exists()
@@ -99,7 +100,7 @@ def test_a_true_length_scales_all_that_is_exported(run: Path, tmp_path: Path) ->
         again = called("ns-measure", run, "--scale-points", "0,0,0", "-0.6,0.8,0", 0.25)
         assert again.returncode == 1
         assert "--forget-scale" in again.stderr  # points would be taken for other ones
-        assert "0.25 cm" in called("ns-measure", run, "--between", "0,0,0", "-0.15,0.2,0").stderr
+        assert "0.25 cm" in called("ns-measure", "--between", "0,0,0", "-0.15,0.2,0", run).stderr
     finally:
         assert called("ns-measure", run, "--forget-scale", True).returncode == 0
     np.testing.assert_allclose(centers(run, tmp_path), before, rtol=1e-6)
@@ -108,7 +109,7 @@ def test_a_true_length_scales_all_that_is_exported(run: Path, tmp_path: Path) ->
 @pytest.mark.medium
 def test_points_are_given_in_a_photograph(run: Path) -> None:
     """Of the ball of radius 1 at the origin."""
-    name = load(run).dataset("test").names[0]
+    name = f"train/{load(run).dataset('train').names[0]}"
     done = called("ns-measure", run, "--between", "9.5,7", "9.5,12", "--image", name)
     assert done.returncode == 0, done.stderr
     points = [line.split(": ")[-1] for line in done.stderr.splitlines() if f"of {name}" in line]
@@ -129,7 +130,10 @@ def test_what_cannot_be_measured(run: Path) -> None:
     assert "column,row" in said("--between", "1,2,3", "3,4,5", "--image", "r_0.png")
     assert "same" in said("--between", "1,2,3", "1,2,3")
     assert "r_0.png" in said("--between", "1,2", "3,4", "--image", "r_0.pnk")
-    assert "no surface" in said("--between", "0,0", "9.5,7", "--image", "r_0.png")
+    assert "such as train/r_0.png" in said("--between", "1,2", "3,4", "--image", "r_0.png")
+    assert "no surface" in said("--between", "0,0", "9.5,7", "--image", "train/r_0.png")
+    assert "20 x 20 pixels" in said("--between", "20,0", "9.5,7", "--image", "train/r_0.png")
+    assert "--between" in said("--image", "train/r_0.png")
     assert "one at a time" in said("--between", "1,2,3", "1,2,4", "--forget-scale", True)
     assert "0 m" in said("--scale-points", "0,0,0", "1,0,0", 0)
     assert not scale_file(run).exists()

@@ -15,12 +15,13 @@ from nerfloom.export.lattice import lattice_of
 from nerfloom.export.meshing import Cleaning, distance_mesh
 from nerfloom.fields.surface import NeuSField, SurfaceField
 from nerfloom.geometry.points import Points
-from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.surfaces.opacity import surface_opacity
 from nerfloom.losses.surfaces import (
     EVERY,
     Curvature,
     DistanceBounds,
+    Silhouette,
     SurfacePoints,
     beyond_bounds,
     normal_change,
@@ -31,6 +32,7 @@ from nerfloom.method import Method
 from nerfloom.registry import load_method
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
+from nerfloom.rendering.rendered import Rendered
 from nerfloom.samplers.background import foreground_sphere
 from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -266,6 +268,33 @@ def test_the_curvature_term_is_that_of_level_sets() -> None:
     assert nearest < 0.02
     found.backward()
     assert float(field.second.grad.abs().max()) > 0  # type: ignore[union-attr]
+
+
+def test_a_single_sample_has_a_curvature() -> None:
+    """Whichever of the samples the term begins with."""
+    trainer, field = exact_ball()
+    field.progress = 1.0
+    batch, at = points_on_axes(0.5)[torch.tensor([0])], torch.tensor([1.5])
+    _, features = field.density(Points(batch.rays.points(torch.tensor([0]), at)))
+    samples = Samples(at - 0.01, at + 0.01, torch.tensor([0, 1]), features=features)
+    nothing = torch.zeros(1)
+    shown = RenderedBatch(
+        batch, Rendered(torch.zeros(1, 3), nothing, nothing, nothing, 1, samples=samples), trainer.model, 0
+    )
+    truth = 2 - 2 / (1 + (0.02 / 0.5) ** 2) ** 0.5
+    for _ in range(20):
+        assert float(Curvature()(shown)) == pytest.approx(truth, rel=0.01)  # type: ignore[arg-type]
+
+
+def test_silhouettes_are_weighted_as_the_pixels_are() -> None:
+    torch.manual_seed(0)
+    trainer, _ = exact_ball()
+    batch, weights = draw_batch(trainer.train_set, 64, "white"), torch.rand(64)
+    assert batch.alpha is not None
+    shown = shown_by(trainer, dataclasses.replace(batch, weights=weights))
+    wrong = (shown.pixels.accumulation - batch.alpha).tolist()
+    truth = sum(weight * each**2 for weight, each in zip(weights.tolist(), wrong, strict=True)) / 64
+    assert float(Silhouette()(shown)) == pytest.approx(truth, rel=1e-4)  # type: ignore[arg-type]
 
 
 def points_on_axes(radius: float) -> PixelBatch:

@@ -118,9 +118,7 @@ SCENES: Mapping[str, tuple[Solid, ...]] = {
 
 
 @torch.no_grad()
-def light_along(
-    origin: Tensor, directions: Tensor, solids: tuple[Solid, ...], environment: Environment, shaded: bool = True
-) -> Light:
+def light_along(origin: Tensor, directions: Tensor, solids: tuple[Solid, ...], environment: Environment) -> Light:
     """Return the light of the first surface along rays.
 
     Args:
@@ -128,13 +126,11 @@ def light_along(
         directions: (3, R) unit directions.
         solids: the solids.
         environment: the light around them.
-        shaded: whether to compute light; otherwise it is 0.
     """
     parts = {str(i): Part(s.shape, s.centre, s.yaw, s.material.texture, 0.0) for i, s in enumerate(solids)}
     hit = trace_rows(origin, directions, 0.0, colour=False, parts=parts)
-    diffuse, specular, roughness = torch.zeros_like(directions), torch.zeros_like(directions), hit.depth.new_zeros(1)
-    roughness = roughness.repeat(directions.shape[1])
-    for index, solid in enumerate(solids) if shaded else ():
+    diffuse, specular, roughness = (torch.zeros_like(each) for each in (directions, directions, directions[0]))
+    for index, solid in enumerate(solids):
         rays = (hit.part == index).nonzero()[:, 0]
         material, view, normal = solid.material, directions[:, rays], hit.normals[:, rays]
         offset = origin + hit.depth[rays] * view - view.new_tensor(solid.centre)[:, None]

@@ -93,7 +93,67 @@ def _skipped(what: str) -> Lines:
             yield [row["scene"], *bound, *(errors[::-1] if bound else errors), saved]
 
 
+def _viewer() -> Lines:
+    for row in _content("viewer")["pictures"]:
+        stride = f", one ray for {row['stride']}x{row['stride']} pixels while it moves" if row["stride"] > 1 else ""
+        seconds = [f"{row['first']:.2f}", f"{1000 * row['coarse']:.0f}", f"{1000 * row['slowest']:.0f}"]
+        finished = f"{row['finished']:.2g}"
+        name, size = f"{row['run']}, `{row['method']}`{stride}", f"{row['width']}x{row['height']}"
+        yield [name, size, *seconds, f"{row['per_second']:.0f}", finished]
+
+
+def _processes() -> Lines:
+    for row in _content("processes-lego")["runs"]:
+        seconds = ", ".join(f"{row[f'seconds to {level} dB']:.1f}" for level in (24, 26, 28))
+        yield [row["kind"], f"{row['steps']:,}", seconds, f"{row['PSNR of test views, dB']:.2f} dB"]
+
+
+def _methods(data: str) -> Lines:
+    for row in _content(f"methods-{data}")["runs"]:
+        rates = [f"{row['steps']:,}", f"{row['rays_per_second']:,.0f}", f"{row['render_seconds']:.2f}"]
+        sizes = [f"{row['peak_memory_bytes'] / 2**30:.2f}", f"{row['parameters']:,}"]
+        yield [f"`{row['label']}`", f"{row['psnr']:.2f}", f"{row['ssim']:.4f}", *rates, *sizes]
+
+
+def _levels(*levels: int) -> Lines:
+    for row in _content("methods-lego")["runs"]:
+        times = (row["seconds_to"].get(str(level)) for level in levels)
+        yield [f"`{row['label']}`", *("–" if time is None else f"{time:.1f}" for time in times)]
+
+
+def _curves() -> Lines:
+    for row in _content("curves-lego")["methods"]:
+        yield [f"`{row['method']}`", *(f"{point['PSNR, dB']:.2f}" for point in row["points"])]
+
+
+def _meshes() -> Lines:
+    for scene, run in _content("meshes")["rows"].items():
+        for row in run["rows"]:
+            seconds = [f"{row[key]:.1f}" for key in ("seconds", "CPU seconds")]
+            sizes = [f"{row[key]:,}" for key in ("peak memory, MB", "faces")]
+            closed = "yes" if row["watertight"] else "no"
+            yield [scene, f"{row['export']} of {run['method']}", f"{row['resolution']}", *seconds, *sizes, closed]
+
+
+def _mesh_distances() -> Lines:
+    ways = ("mesh to surface", "surface to mesh")
+    for row in _content("meshes")["rows"]["procedural"]["rows"]:
+        cells = [row["export"], f"{row['resolution']}"]
+        for seen, chamfer in (("", "chamfer, scene units"), ("seen ", "chamfer of what is seen, scene units")):
+            cells += [f"{row[seen + way]['mean']:.4f}, {row[seen + way]['median']:.4f}" for way in ways]
+            cells.append(f"{row[chamfer]:.4f}")
+        yield cells
+
+
 TABLES: dict[str, Callable[[], Lines]] = {
+    "curves": _curves,
+    "levels": lambda: _levels(*range(20, 36, 2)),
+    "mesh-distances": _mesh_distances,
+    "meshes": _meshes,
+    "methods-lego": lambda: _methods("lego"),
+    "methods-procedural": lambda: _methods("procedural"),
+    "processes": _processes,
+    "viewer": _viewer,
     "kernels": _kernels,
     "gpu": _gpu,
     "interpreter": _interpreter,

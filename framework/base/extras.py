@@ -12,6 +12,8 @@ EXTRAS: dict[str, dict[str, str]] = {
     "export": {"skimage": "scikit-image", "trimesh": "trimesh", "fast_simplification": "fast-simplification"},
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
     "cluster": {"ray": "ray"},
+    "heic": {"pillow_heif": "pillow-heif"},
+    "spz": {"zstandard": "zstandard"},
 }
 """Extra in pyproject.toml -> {imported module: name of its package for pip}."""
 

@@ -33,8 +33,8 @@ class Scale:
     """Lengths in `unit` per length of the input."""
     unit: str = ""
     """Name of the unit; empty for the input's own."""
-    relative_error: float = 0.0
-    """Standard deviation of `factor`, as a fraction of it."""
+    relative_error: float | None = 0.0
+    """Standard deviation of `factor`, as a fraction of it; None if it is not known."""
 
     @property
     def is_known(self) -> bool:
@@ -62,6 +62,8 @@ class Scale:
         if not self.is_known:
             return "lengths are in the unit of the input; a true length sets another: --scale-points"
         error = f" ± {100 * self.relative_error:.2g} %" if self.relative_error else ""
+        if self.relative_error is None:
+            error = ", with an unknown error"
         return f"lengths are in {self.unit}; a unit of the input is {self.factor:.6g} {self.unit}{error}"
 
 
@@ -78,7 +80,7 @@ def checked(scale: Scale, where: str) -> Scale:
     name = scale.unit
     if not name or len(name) > MAX_NAME or not name.isprintable() or set(name) & set("<>&\"'"):
         raise FlagError(f"{where}: the unit is {shown(name)}; it must be a short name, such as m, cm or inch")
-    if not 1e-12 < scale.factor < 1e12 or not 0 <= scale.relative_error < math.inf:
+    if not 1e-12 < scale.factor < 1e12 or not 0 <= (scale.relative_error or 0.0) < math.inf:
         raise FlagError(f"{where}: a unit of the input would be {scale.factor:g} {name}; give another length")
     return scale
 
@@ -102,10 +104,11 @@ def read_scale(path: Path) -> Scale:
         return Scale()
     content = read_object(file)
     factor, unit, error = content.get("factor"), content.get("unit"), content.get("relative_error", 0.0)
-    if not isinstance(unit, str) or not all(type(value) in (int, float) for value in (factor, error)):
+    numbers = (factor,) if error is None else (factor, error)
+    if not isinstance(unit, str) or not all(type(value) in (int, float) for value in numbers):
         raise DataError(f"{file} needs a number 'factor' and a name 'unit'; set the scale again, or remove the file")
     try:
-        return checked(Scale(float(factor), unit, float(error)), str(file))  # type: ignore[arg-type]
+        return checked(Scale(float(factor), unit, None if error is None else float(error)), str(file))  # type: ignore[arg-type]
     except (FlagError, OverflowError) as problem:
         raise DataError(f"{file} cannot be used: {problem}; set the scale again, or remove the file") from problem
 

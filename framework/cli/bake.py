@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,14 +66,14 @@ def _command(arguments: list[str]) -> None:
 def _check(flags: BakeFlags) -> None:
     if flags.output_path is not None and flags.output_path.suffix.lower() != ".octree":
         raise FlagError(f"--output-path is {flags.output_path}; octrees are written to .octree files")
-    if not flags.max_megabytes > 0:
-        raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes:g}")
+    if not 0 < flags.max_megabytes < math.inf:
+        raise FlagError(f"--max-megabytes is {flags.max_megabytes:g}; it must be more than 0 and finite")
     if not MIN_RESOLUTION <= flags.resolution <= MAX_RESOLUTION:
         raise FlagError(f"--resolution is {flags.resolution}; it must be from {MIN_RESOLUTION} to {MAX_RESOLUTION}")
     if flags.degree is not None and not 0 <= flags.degree <= 3:
         raise FlagError(f"--degree is {flags.degree}; it must be from 0 to 3")
-    if not flags.fine_tune_seconds >= 0:
-        raise FlagError(f"--fine-tune-seconds is {flags.fine_tune_seconds:g}; it must be at least 0")
+    if not 0 <= flags.fine_tune_seconds < math.inf:
+        raise FlagError(f"--fine-tune-seconds is {flags.fine_tune_seconds:g}; it must be at least 0 and finite")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from typing import Literal
 
 from nerfloom.base.config import HeldOutAppearance, RaysPerPixel
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
+from nerfloom.blocks.files import is_blocks_file
 from nerfloom.cli.common import make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
@@ -22,8 +23,7 @@ class EvalFlags(GeometryFlags, RunFlags):
     With --reference-mesh or --reference-points, also compare its surface with the true one."""
 
     output_path: Path | None = None
-    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians or an
-    octree."""
+    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside any other file."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
@@ -78,9 +78,7 @@ def _command(arguments: list[str]) -> None:
     from nerfloom.training.report import write_evaluation
 
     reference = read_reference(flags)
-    loaded = flags.load(
-        found, rays_per_pixel=flags.rays_per_pixel, eval_appearance=flags.eval_appearance, data_format=named
-    )
+    loaded = flags.load(found, named, rays_per_pixel=flags.rays_per_pixel, eval_appearance=flags.eval_appearance)
     model, dataset = loaded.model, loaded.dataset(flags.split)
     bound = None if flags.max_error is None else parse_error(flags.max_error)
     with nullcontext() if bound is None else limited_error(model, bound):
@@ -120,8 +118,9 @@ def _command(arguments: list[str]) -> None:
 
 
 def _beside(run: Path) -> Path:
-    """Return the default results file for a run's config.yml, a file of Gaussians or an octree."""
-    return run.parent / "eval.json" if run.suffix == ".yml" else run.with_suffix(".eval.json")
+    """Return the default results file for a run's config.yml, a blocks.yml, a file of Gaussians or an octree."""
+    is_run = run.suffix == ".yml" and not is_blocks_file(run)
+    return run.parent / "eval.json" if is_run else run.with_suffix(".eval.json")
 
 
 if __name__ == "__main__":

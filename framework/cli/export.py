@@ -13,10 +13,12 @@ from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format
 from nerfloom.cli.export_flags import ExportFlags
 from nerfloom.cli.export_mesh import MarchingCubesFlags, TsdfFlags, marching_cubes, tsdf
 from nerfloom.cli.flags import read_flags
+from nerfloom.cli.region_flags import RegionFlags
 from nerfloom.cli.run_flags import OPENS
 
 if TYPE_CHECKING:
     from nerfloom.data.parsed_scene import ParsedScene
+    from nerfloom.splats.gaussians import HasGaussians
     from nerfloom.training.loaded import Loaded
 
 USAGE = """\
@@ -25,7 +27,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   tsdf            mesh.ply, .obj or .glb: a mesh of what the training cameras see; for captures, and every method
   marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
-  gaussian-splat  splat.ply or splat.spz: the Gaussians of gaussian-splatting, for other programs
+  gaussian-splat  splat.ply, .spz, .sog or .glb: the Gaussians of a run, for other programs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
                   refined them; transforms_train.json: the training cameras, in nerfstudio's format
@@ -33,17 +35,18 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): gaussian-splat and web need no data, others --data DIR.
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat and web need no data,
+others --data DIR.
 
   ns-export web splat.ply --output-dir exports
 
 ns-export WHAT --help shows its flags. All files use the frame and units of the input, or the unit that ns-measure
-has set.
+has set. In .glb files, y is up.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
-class PointFlags(ExportFlags):
+class PointFlags(RegionFlags, ExportFlags):
     """Write point_cloud.ply: points at the median depth of random training rays."""
 
     num_points: int = 1_000_000
@@ -75,19 +78,25 @@ class OccupancyFlags(ExportFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplatFlags(ExportFlags):
-    """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
+class SplatFlags(RegionFlags, ExportFlags):
+    """Write splat.ply, .spz, .sog or .glb: Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
-    format: Literal["ply", "spz"] = "ply"
-    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth."""
+    format: Literal["ply", "spz", "sog", "glb"] = "ply"
+    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth; sog: images
+    in a zip file, for PlayCanvas; glb: glTF with KHR_gaussian_splatting, y up."""
+    spz_version: Literal[2, 3, 4] = 2
+    """Version of spz files. 2: read by most programs; 3: finer rotations; 4: newest, needs the package zstandard."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None
     """Time of a moving scene, 0 to 1. Default: 0."""
+    num_frames: int | None = None
+    """Write this many files of a moving scene, at times evenly spaced from 0 to 1: splat_0000.ply and so on. Default:
+    one file."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class WebFlags(ExportFlags):
+class WebFlags(RegionFlags, ExportFlags):
     """Write scene.html: a page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field."""
 
     max_megabytes: float = 30.0
@@ -112,7 +121,7 @@ def _command(arguments: list[str]) -> None:
     found = flags.check()
     path = flags.output_dir / file.format_map(vars(flags))
     make_room(path)
-    loaded = flags.load(found, data_format=named)
+    loaded = flags.load(found, named)
     if loaded.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
     if loaded.scale.is_known:
@@ -130,6 +139,7 @@ def _points(flags: PointFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.data.ply import write_points
     from nerfloom.export.neighbors import inliers, plane_normals
     from nerfloom.export.points import joined, num_views, picture_points, surface_points
+    from nerfloom.geometry.regions import inside_all
     from nerfloom.renderable import RendersRays
 
     model, dataset = loaded.model, loaded.dataset("train")
@@ -143,6 +153,8 @@ def _points(flags: PointFlags, loaded: Loaded, path: Path) -> None:
     found = joined(track(parts, "Looking for surfaces", total=chunks))
     if not len(found.positions):
         raise ConfigError("no training ray ends in a surface inside --reach; is the run trained? --reach 0 keeps all")
+    if regions := flags.regions():
+        found = found[inside_all(loaded.placement.original_points(found.positions), regions)]
     if flags.remove_outliers:
         kept = inliers(found.positions, flags.std_ratio)
         say(f"{len(kept) - int(kept.sum()):,} of {len(kept):,} points are outliers and left out (--remove-outliers)")
@@ -217,33 +229,46 @@ def _occupancy(flags: OccupancyFlags, loaded: Loaded, path: Path) -> None:
 def _splats(flags: SplatFlags, loaded: Loaded, path: Path) -> None:
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")
-    from nerfloom.cameras.scale import write_scale
-    from nerfloom.data.offsets import write_offset
+    if flags.num_frames is not None and flags.num_frames < 1:
+        raise FlagError(f"--num-frames is {flags.num_frames}; it must be at least 1")
+    if flags.num_frames is not None and flags.time is not None:
+        raise FlagError("--num-frames writes all times, and --time one; leave out one of them")
     from nerfloom.export.run_page import moment_of
-    from nerfloom.geometry.local_origin import local_origin
-    from nerfloom.splats.files import write_gaussians
     from nerfloom.splats.gaussians import HasGaussians
-    from nerfloom.splats.transform import transformed
 
-    if not isinstance(loaded.model, HasGaussians):
+    model = loaded.model
+    if not isinstance(model, HasGaussians):
         raise ConfigError(
             f"ns-export gaussian-splat: {loaded.method} has no Gaussians; ns-train gaussian-splatting makes them"
         )
-    moment = moment_of(loaded.model.scene.moving, flags.time)
-    found = loaded.model.gaussians(moment).map(lambda values: values.detach().cpu())
+    if flags.num_frames is None:
+        _write_splats(flags, loaded, model, moment_of(model.scene.moving, flags.time), path)
+        return
+    if not model.scene.moving:
+        raise ConfigError(f"--num-frames {flags.num_frames}: the photographs of this run have no times")
+    for index in range(flags.num_frames):
+        time = index / max(flags.num_frames - 1, 1)
+        _write_splats(flags, loaded, model, time, path.with_stem(f"{path.stem}_{index:04d}"))
+
+
+def _write_splats(flags: SplatFlags, loaded: Loaded, model: HasGaussians, moment: float | None, path: Path) -> None:
+    """Write the Gaussians of a model at a moment, None of a static scene, to a file."""
+    from nerfloom.geometry.regions import inside_all
+    from nerfloom.splats.placed_files import in_input, write_placed
+
+    found = model.gaussians(moment).map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
-        raise ConfigError("this run has no Gaussians left; train it again")
-    # Programs read float32 from these files.
-    origin = local_origin(loaded.placement.original_points(good.means), good.typical_size / loaded.placement.scale)
-    about, look = loaded.placement if origin is None else loaded.placement.about(origin), loaded.model.look()
-    for cost in write_gaussians(path, transformed(good, *about.original_similarity()), flags.max_megabytes, look):
-        say(cost)
-    if sentence := write_offset(path, origin):
+        at = "" if moment is None else f" at time {moment:g}"
+        raise ConfigError(f"this run has no Gaussians left{at}; train it again")
+    look, placement = model.look(), loaded.placement
+    placed = in_input(good, placement)
+    if regions := flags.regions():
+        placed = placed[inside_all(placed.means, regions)]
+    for sentence in write_placed(path, placed, look, loaded.scale, placement, flags.max_megabytes, flags.spz_version):
         say(sentence)
-    write_scale(path, loaded.scale)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")
 
 
@@ -252,7 +277,7 @@ def _web(flags: WebFlags, loaded: Loaded, path: Path) -> None:
     from nerfloom.registry import load_method
 
     splatting = load_method("gaussian-splatting")
-    export_page(loaded, path, flags.max_megabytes, flags.fit_seconds, flags.time, splatting)
+    export_page(loaded, path, flags.max_megabytes, flags.fit_seconds, flags.time, splatting, flags.regions())
 
 
 KINDS: dict[str, tuple[type[Any], str, Any]] = {

@@ -25,7 +25,7 @@ class MeshFlags(ExportFlags):
     """Flags of every mesh."""
 
     format: Literal["ply", "obj", "glb"] = "ply"
-    """File format; ply is the smallest and fastest."""
+    """File format; ply is the smallest and fastest. In glb, y is up."""
     resolution: int = 256
     """Number of cells along the longest edge of the box, up to 1024."""
     bounding_box_min: tuple[float, float, float] | None = None
@@ -149,12 +149,12 @@ def _prepared(flags: MeshFlags, loaded: Loaded) -> tuple[Lattice, Cleaning, Text
 
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:
-    """Write a mesh, and say what it is."""
+    """Write a mesh, in a .glb file with y up, and say what it is."""
     from nerfloom.base.console import say
     from nerfloom.export.mesh import closedness
     from nerfloom.export.mesh_files import write_mesh
     from nerfloom.export.meshing import in_input
 
-    write_mesh(path, in_input(mesh, placement))
+    write_mesh(path, in_input(mesh, placement.y_up() if path.suffix == ".glb" else placement))
     counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closedness(mesh).sentence()}"
     say(f"{counts}; {path.stat().st_size / 1e6:.1f} MB after {time.monotonic() - start:.1f} s: {path}")

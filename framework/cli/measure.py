@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, DataError, FlagError, nearest, shown
+from nerfloom.base.errors import ConfigError, FlagError, shown
 from nerfloom.cli.common import run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.run_flags import OPENS, RunFlags
@@ -15,7 +15,6 @@ from nerfloom.cli.run_flags import OPENS, RunFlags
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nerfloom.cameras.view import View
     from nerfloom.training.loaded import Loaded
 
 
@@ -30,7 +29,8 @@ class MeasureFlags(RunFlags):
     unit: str = "m"
     """Name of the unit of DISTANCE."""
     image: str | None = None
-    """Photograph for points column,row: its file name. (0, 0) is the centre of its top left pixel."""
+    """Photograph for points column,row: its file name, or the end of its path. (0, 0) is the centre of its top left
+    pixel."""
     forget_scale: bool = False
     """Remove the scale, so that lengths are in the unit of the input again."""
 
@@ -41,12 +41,14 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    words, named = with_format("ns-measure", with_run(arguments))
+    words, named = with_format("ns-measure", with_run(arguments, ("--between", "--scale-points")))
     flags = read_flags(MeasureFlags, "ns-measure", words, takes=OPENS)
     given = [flags.between, flags.scale_points, flags.forget_scale or None]
     if sum(each is not None for each in given) > 1:
         raise FlagError("--between, --scale-points and --forget-scale exclude each other: give one at a time")
-    loaded = flags.load(flags.check(), data_format=named)
+    if flags.image is not None and flags.between is None and flags.scale_points is None:
+        raise FlagError("--image is the photograph of points: give --between or --scale-points with it")
+    loaded = flags.load(flags.check(), named)
     if flags.between is not None:
         start, end = _points(flags, loaded, flags.between)
         say(str(loaded.measure(start, end)))
@@ -80,7 +82,7 @@ def _points(flags: MeasureFlags, loaded: Loaded, words: tuple[str, str]) -> list
     numbers = [_numbers(word, 3 if flags.image is None else 2) for word in words]
     if flags.image is None:
         return [torch.tensor(each, dtype=torch.float64) for each in numbers]
-    view = _photograph(loaded, flags.image)
+    view = loaded.photograph(flags.image)
     found = [loaded.pick(view, column, row) for column, row in numbers]
     for word, point in zip(words, found, strict=True):
         say(f"{word} of {flags.image}: {','.join(f'{value:.6g}' for value in point.tolist())}")
@@ -99,26 +101,6 @@ def _numbers(word: str, count: int) -> list[float]:
         )
         raise FlagError(f"a point is {shown(word)}; it must be {what}")
     return found
-
-
-def _photograph(loaded: Loaded, name: str) -> View:
-    """Return the view of the photograph with a file name."""
-    from nerfloom.cameras.view import View
-    from nerfloom.export.cameras import SPLITS
-
-    known: list[str] = []
-    for split in SPLITS:
-        try:
-            parsed = loaded.run.parse(split)
-        except DataError:
-            if split == "train":
-                raise
-            continue
-        names = [path.name for path in parsed.image_paths]
-        if name in names:
-            return View.of(parsed.cameras.to(loaded.model.device), names.index(name), parsed.times)
-        known += names
-    raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
 
 
 if __name__ == "__main__":

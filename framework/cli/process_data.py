@@ -159,15 +159,25 @@ def _check_input(flags: OutputFlags) -> None:
 
 
 def _is_finished(flags: ColmapFlags) -> bool:
-    """Return whether there is nothing to resume, and say so; raise ConfigError if COLMAP is missing."""
+    """Return whether a run is resumed whose poses are finished; write the masks that it lacks.
+
+    Raises:
+        ConfigError: if COLMAP is missing.
+    """
     from nerfloom.processing import colmap
-    from nerfloom.processing.output import FINISHED, ready
+    from nerfloom.processing.output import FINISHED, lacks_masks, ready
 
     colmap.require()
-    finished = flags.resume and (flags.output_dir / FINISHED).exists()
-    if finished:
+    if not flags.resume or not (flags.output_dir / FINISHED).exists():
+        return False
+    if lacks_masks(flags):
+        from nerfloom.processing.moving_masks import mask_moving  # imports all that trains
+
+        mask_moving(flags.output_dir, flags.num_downscales, max_seconds=flags.mask_seconds)
+        say(ready(flags.output_dir))
+    else:
         say(f"nothing to resume: it is finished. {ready(flags.output_dir)}")
-    return finished
+    return True
 
 
 def _process_images(flags: ImagesFlags) -> None:

@@ -64,7 +64,7 @@ def _render(name: str, flags: PathFlags, named: DataFormat | None) -> None:
     from nerfloom.evaluation.outputs import chosen_outputs, rendered_outputs
 
     bound = None if flags.outputs.max_error is None else parse_error(flags.outputs.max_error)
-    loaded = flags.run.load(found, rays_per_pixel=flags.outputs.rays_per_pixel, data_format=named)
+    loaded = flags.run.load(found, named, rays_per_pixel=flags.outputs.rays_per_pixel)
     model = loaded.model
     outputs = chosen_outputs(model, flags.outputs.rendered_output_names)
     views, background = _views(name, flags, loaded), model.background
@@ -103,7 +103,7 @@ def _views(name: str, flags: PathFlags, loaded: Loaded) -> Views:
 
 def _facts(name: str, flags: PathFlags, loaded: Loaded, views: Views) -> dict[str, Any]:
     """Return everything that determines the pictures, as plain data."""
-    from nerfloom.base.config import to_plain
+    from nerfloom.base.plain import to_plain
     from nerfloom.evaluation.frames import hash_of_file, hash_of_tensors
 
     cameras = views.cameras

@@ -1,4 +1,4 @@
-"""Flags of every command that opens a trained run, a file of Gaussians, or an octree."""
+"""Flags of every command that opens a trained run, a scene in blocks, a file of Gaussians, or an octree."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from nerfloom.training.run_path import trained_run
 
 if TYPE_CHECKING:
+    from nerfloom.training.file_data import DataFormat
     from nerfloom.training.loaded import Loaded
 
 OPENS = "RUN_FOLDER or FILE"
@@ -16,23 +17,18 @@ OPENS = "RUN_FOLDER or FILE"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFlags:
-    """The trained run, the file of Gaussians, or the octree."""
+class OpenFlags:
+    """The trained run or file, and the device that opens it."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
-    octree (.octree). The flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), a blocks.yml of ns-blocks or its folder, a file of
+    Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree). The flag's name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None
     """Folder of the data, if it has moved since training; optional data for a file."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to render on."""
-    eval_rendering: Literal["volume", "surface"] | None = None
-    """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
-    the surface. Default: the run's setting."""
 
     def check(self) -> Path:
         """Check that all files exist, without torch, and return the run's config.yml or the file.
@@ -42,17 +38,29 @@ class RunFlags:
         """
         return trained_run(self.load_config, self.load_checkpoint, self.data)
 
-    def load(self, found: Path, **others: Any) -> Loaded:
+
+@dataclass(frozen=True, kw_only=True)
+class RunFlags(OpenFlags):
+    """The trained run, the file of Gaussians, or the octree, and how it is shown."""
+
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
+    eval_rendering: Literal["volume", "surface"] | None = None
+    """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
+    the surface. Default: the run's setting."""
+
+    def load(self, found: Path, data_format: DataFormat | None = None, **settings: Any) -> Loaded:
         """Load the run or the file that `check` has found.
 
         Args:
             found: the result of `check`.
-            others: further arguments of `nerfloom.training.load.load`.
+            data_format: data format for a file, with its flags; None to detect it.
+            settings: further changed settings of a run, by name; None for the run's own value.
 
         Raises:
             ConfigError, CheckpointError, DataError: if it cannot be used.
         """
         from nerfloom.training.load import load
 
-        given = self.load_checkpoint, self.device_type, self.data
-        return load(found, *given, eval_rendering=self.eval_rendering, up=self.up, **others)
+        given = self.load_checkpoint, self.device_type, self.data, data_format, self.up
+        return load(found, *given, eval_rendering=self.eval_rendering, **settings)

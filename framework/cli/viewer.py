@@ -35,7 +35,7 @@ def _command(arguments: list[str]) -> None:
     found = flags.check()
     from nerfloom.viewer.trained_viewer import view_loaded
 
-    loaded = flags.load(found, data_format=named)
+    loaded = flags.load(found, named)
     follow = flags.load_checkpoint is None and loaded.is_run
     view_loaded(loaded, flags.websocket_host, flags.websocket_port, follow)
 

@@ -11,7 +11,8 @@ import numpy as np
 from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.suffixes import UNREAD_SUFFIXES
+from nerfloom.base.extras import install_command
+from nerfloom.data.suffixes import HEIF_SUFFIXES, UNREAD_SUFFIXES
 
 # Pillow detects the format from the content, not from the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False
@@ -20,6 +21,14 @@ MAX_FILE = 2**30
 """Maximum size of an image file, bytes."""
 BAND = 64
 """Number of rows of a reduced image computed at once: float64 takes eight times the memory of the source pixels."""
+
+
+def read_heif(path: Path) -> None:
+    """Let Pillow read HEIC from now on, if `path` is such a file and the package pillow-heif is installed."""
+    if path.suffix.lower() in HEIF_SUFFIXES and install_command("heic") is None:
+        from pillow_heif import register_heif_opener
+
+        register_heif_opener()
 
 
 def image_size(paths: Sequence[Path]) -> tuple[int, int]:
@@ -33,6 +42,7 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
     """
     reason = ""
     for path in paths:
+        read_heif(path)
         try:
             height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]  # the first frame of an animation
             if width and height:
@@ -74,6 +84,7 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
     Raises:
         DataError: if the image cannot be decoded, or has more than 8 bits per channel.
     """
+    read_heif(path)
     try:
         mode = str(iio.immeta(path, plugin="pillow", index=0).get("mode", ""))
         if mode.startswith(("I", "F")) or _is_deep_png(path):
@@ -124,6 +135,7 @@ def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
 
 def may_be_transparent(path: Path) -> bool:
     """Return whether the header of an image allows for alpha; False if the header of `path` cannot be read."""
+    read_heif(path)
     try:
         meta = iio.immeta(path, plugin="pillow", index=0)
     except Exception:  # any type; the file is reported when it is decoded
@@ -151,8 +163,8 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
         reason = str(error)
     elif size == 0:
         reason = "the file is empty; copy it again"
-    elif unidentified and path.suffix.lower() in (".heic", ".heif"):
-        reason = "HEIC needs another package: pip install pillow-heif"
+    elif unidentified and path.suffix.lower() in HEIF_SUFFIXES and (command := install_command("heic")):
+        reason = f"HEIC needs another package: {command}"
     elif unidentified and path.suffix.lower() == ".avif" and not features.check("avif"):
         reason = "AVIF needs Pillow 11.3 or later, built with it: pip install --upgrade pillow"
     elif unidentified and path.suffix.lower() in UNREAD_SUFFIXES:

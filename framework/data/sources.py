@@ -147,7 +147,8 @@ class PixelSource(BatchSource):
         if self.contradicted is not None:
             counting = self.contradicted.counting(batch.pixels)
             weights = counting if batch.weights is None else counting * batch.weights
-            batch = replace(batch, weights=weights)
+            distances = None if batch.distances is None else counting * batch.distances  # 0 is unknown
+            batch = replace(batch, weights=weights, distances=distances)
         if self.clear is None or batch.rays.camera_indices is None:
             return batch
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])

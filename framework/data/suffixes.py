@@ -4,6 +4,8 @@ from __future__ import annotations
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".jp2", ".jfif")
 """Suffixes of image files."""
+HEIF_SUFFIXES = (".heic", ".heif")
+"""Suffixes of images for which Pillow needs the package pillow-heif."""
 UNREAD_SUFFIXES = (
     ".jxl",
     ".gif",

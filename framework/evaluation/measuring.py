@@ -47,14 +47,16 @@ class Length:
     value: float
     """The length, in `unit`."""
     error: float | None
-    """Standard deviation, in `unit`; None if fewer than two photographs see one of the points."""
+    """Standard deviation, in `unit`; None if fewer than two photographs see one of the points, of this length or of the
+    one that has set the scale."""
     unit: str
     """Name of the unit; empty for the unit of the input."""
 
     def __str__(self) -> str:
         name = f" {self.unit}" if self.unit else ""
         if self.error is None:
-            return f"{self.value:.4g}{name} (error unknown: fewer than two photographs see an end)"
+            reason = "fewer than two photographs see an end, of it or of the length that set the scale"
+            return f"{self.value:.4g}{name} (error unknown: {reason})"
         digits = max(1 - math.floor(math.log10(self.error)), 0) if self.error > 0 else 6
         return f"{self.value:.{digits}f}{name} ± {self.error:.{digits}f}{name}"
 
@@ -69,12 +71,18 @@ def surface_point(model: Renderable, view: View, column: float, row: float) -> T
         column, row: the pixel; (0, 0) is the centre of the top left one, and fractions are allowed.
 
     Raises:
-        ConfigError: if the pixel shows no surface.
+        ConfigError: if the pixel is outside of the image, has no ray through the lens, or shows no surface.
     """
-    here = torch.tensor([[column, row]], dtype=torch.float64).to(view.camera.fx)
-    rays, depth, opacity = _first_surfaces(model, view.camera, here, view.time)
+    camera, place = view.camera, f"column {column:.1f}, row {row:.1f}"
+    height, width = camera.sizes[0]
+    if not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5):
+        raise ConfigError(f"{place} is outside of the image, which has {width} x {height} pixels")
+    here = torch.tensor([[column, row]], dtype=torch.float64).to(camera.fx)
+    if not bool(camera.look(torch.zeros_like(camera.widths), here[:, 0], here[:, 1])[2].valid[0]):
+        raise ConfigError(f"the {camera.model} lens has no ray at {place}")
+    rays, depth, opacity = _first_surfaces(model, camera, here, view.time)
     if not bool(opacity[0] >= OPAQUE) or not bool(depth[0] < rays.fars[0]):
-        raise ConfigError(f"there is no surface at column {column:.1f}, row {row:.1f}: opacity {float(opacity[0]):.2f}")
+        raise ConfigError(f"there is no surface at {place}: opacity {float(opacity[0]):.2f}")
     if isinstance(model, HasSignedDistance):
         depth = _onto_level(model, rays, depth)
     return _along(rays, depth)[0].double().cpu()
@@ -116,8 +124,8 @@ def located(model: Renderable, cameras: Cameras, point: Tensor, time: float | No
     """
     seeing = seeing_cameras(model, cameras, point, time)
     jacobians = projection_jacobians(cameras[seeing], point)
-    covariance = point_covariance(jacobians, PIXEL_ERROR)
-    return covariance + reading_error(jacobians, PIXEL_ERROR) ** 2 * torch.eye(3, dtype=torch.float64)
+    reading = torch.full((3,), reading_error(jacobians, PIXEL_ERROR) ** 2, dtype=torch.float64)
+    return point_covariance(jacobians, PIXEL_ERROR) + reading.diag()
 
 
 def measured(
@@ -146,17 +154,18 @@ def measured(
     if not length > 0:
         raise ConfigError("the two points are the same: choose two different ones")
     error = math.inf
-    if cameras is not None:
-        error = length_error(start, end, (located(model, cameras, start, time), located(model, cameras, end, time)))
-    total = unit * math.hypot(error, length * scale.relative_error)
-    return Length(unit * length, total if math.isfinite(total) else None, scale.unit)
+    if cameras is not None and scale.relative_error is not None:
+        places = located(model, cameras, start, time), located(model, cameras, end, time)
+        error = unit * math.hypot(length_error(start, end, places), length * scale.relative_error)
+    return Length(unit * length, error if math.isfinite(error) else None, scale.unit)
 
 
 def scale_of(found: Length, scale: Scale, distance: float, unit: str) -> Scale:
     """Return the scale that makes a measured length equal to its true length.
 
     Args:
-        found: the measured length in the present scale, without the error of the scale itself.
+        found: the measured length in the present scale, without the error of the scale itself; the new scale has the
+            error of the length.
         scale: the present scale.
         distance: the true length.
         unit: name of its unit.
@@ -164,7 +173,7 @@ def scale_of(found: Length, scale: Scale, distance: float, unit: str) -> Scale:
     Raises:
         FlagError: if the length or the name cannot be used.
     """
-    error = 0.0 if found.error is None else found.error / found.value
+    error = None if found.error is None else found.error / found.value
     return checked(Scale(scale.factor * distance / found.value, unit, error), f"a length of {distance:g}")
 
 
@@ -180,6 +189,7 @@ def _first_surfaces(
     moment = 0.0 if time is None and scene.moving else time
     times = None if moment is None else torch.full((count,), moment, device=cameras.fx.device)
     rays = single.pixel_rays(torch.arange(count, device=cameras.fx.device), scene.near, scene.far, times)
+    rays = replace(rays, camera_indices=None)  # their numbers must not stand for training cameras
     if isinstance(model, RendersRays):
         with model.rendering():
             shown = model.render(rays, model.background)

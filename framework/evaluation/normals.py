@@ -41,7 +41,7 @@ def normal_mae(picture: Picture, dataset: Dataset, index: int, half: bool) -> fl
 
 
 def mean_angle(found: Tensor, truth: Tensor, weights: Tensor) -> float | None:
-    """Return the weighted mean angle between unit vectors, degrees; None if all weights are 0.
+    """Return the weighted mean angle between unit vectors, degrees; None if all weights are 0, NaN if one is NaN.
 
     Args:
         found, truth: (..., 3) unit vectors; a vector of length 0 is 90 degrees from every other.
@@ -49,7 +49,7 @@ def mean_angle(found: Tensor, truth: Tensor, weights: Tensor) -> float | None:
     """
     found, truth, weights = to_float64(found), to_float64(truth), to_float64(weights)
     total = weights.sum()
-    if not total > 0:
+    if total == 0:
         return None
     sines, cosines = torch.linalg.cross(found, truth).norm(dim=-1), (found * truth).sum(-1)
     angles = torch.atan2(sines, cosines)  # exact for small angles too, where arccos loses half of its digits

@@ -26,6 +26,7 @@ from nerfloom.octree_model import OctreeConfig, OctreeModel
 from nerfloom.octrees.octree import Octree
 from nerfloom.octrees.packing import packed
 from nerfloom.ray_model import RayModel
+from nerfloom.renderable import RendersFromImages
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.trainer import Trainer
 
@@ -67,8 +68,8 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     Raises:
         ConfigError: if an octree of a box cannot show what the run shows.
     """
-    model, dataset = _bakeable(loaded), loaded.dataset("train").to("cpu")
-    dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras))
+    model, dataset = _bakeable(loaded), loaded.dataset("train")
+    dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras)).to("cpu")
     seed_step(loaded.run.config.machine.seed, 0)
     layout, raw, seen = _visible(model, dataset, settings.resolution)
     degree, kept = _chosen(seen.largest, settings)
@@ -92,7 +93,9 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     if not isinstance(model, RayModel):
         raise ConfigError(f"ns-bake: {name} has no field to bake; take a run of a method that casts rays")
     reason = None
-    if model.scene.moving:
+    if isinstance(model, RendersFromImages):
+        reason = "it renders from images, and has no field without them"
+    elif model.scene.moving:
         reason = "its scene moves, and an octree does not"
     elif model.scene.warped:
         reason = "its rays are in normalised device coordinates; train without --ndc"

@@ -28,8 +28,8 @@ DECIMALS = 8
 def write_mesh(file: Path, mesh: Mesh) -> None:
     """Write a mesh in the format of the file's suffix, under a temporary name until it is complete.
 
-    Coordinates are written unchanged. So a GLB file also has the axes of the mesh, although viewers take y as up. A
-    texture is inside a GLB file, and beside an OBJ file as NAME.mtl and NAME.png.
+    Coordinates are written unchanged. Viewers take y as up in a GLB file, so its mesh must be given with y up
+    (`Placement.y_up`). A texture is inside a GLB file, and beside an OBJ file as NAME.mtl and NAME.png.
 
     Far from the origin, where float32 is too coarse, PLY and OBJ files have double precision. A GLB file holds float32
     alone, and is written about a local origin with its offset beside it (`data.offsets`). A line says so.

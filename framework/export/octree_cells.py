@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -14,6 +15,7 @@ from nerfloom.export.lattice import lattice_of
 from nerfloom.kernels.octree.layout import BRICK, OCTANT
 from nerfloom.octrees.grid import Grid
 from nerfloom.renderable import Renderable
+from nerfloom.samplers.base import SkipsCells
 
 MIN_DEPTH = 0.01
 """Cells of a smaller optical depth along an edge count as empty."""
@@ -56,30 +58,34 @@ class MatterSearch:
     def octants(self, grid: Grid) -> Tensor:
         """Return the octants (N, 3) int64 of a grid that may hold matter."""
         counts = [count * BRICK // OCTANT for count in grid.size]
-        found = torch.zeros(counts, dtype=torch.bool)
-        if self._evaluate.grid is not None:
-            found = self._in_occupied(grid, counts)
-        else:
-            offsets = torch.rand(PROBES, 3, generator=torch.Generator().manual_seed(0))
-            ranges = [torch.arange(count) for count in counts[1:]]
-            for x in track(range(counts[0]), "Looking for matter", total=counts[0]):
-                slab = torch.cartesian_prod(torch.tensor([x]), *ranges).view(-1, 1, 3)
-                positions = grid.positions(((slab + offsets) * OCTANT).reshape(-1, 3))
-                sigma = self._evaluate.density(positions).view(-1, PROBES)
-                dense = (sigma.amax(-1) * grid.cell > MIN_DEPTH).view(counts[1:])
-                found[x] = dense
-            found = functional.max_pool3d(found[None, None].float(), 3, 1, 1)[0, 0] > 0
+        occupancy = self._evaluate.grid
+        found = self._dense(grid, counts) if occupancy is None else self._in_occupied(grid, counts, occupancy)
         return found.nonzero()
 
-    def _in_occupied(self, grid: Grid, counts: list[int]) -> Tensor:
-        """Return the octants that a cell of the occupancy grid overlaps, by their corners and centres."""
+    def _dense(self, grid: Grid, counts: list[int]) -> Tensor:
+        """Return whether each octant, or one beside it, is dense at one of a few positions."""
         found = torch.zeros(counts, dtype=torch.bool)
-        ranges = [torch.arange(2 * count + 1) for count in counts[1:]]
-        shape = [3, *(len(each) for each in ranges)]
+        offsets = torch.rand(PROBES, 3, generator=torch.Generator().manual_seed(0))
+        ranges = [torch.arange(count) for count in counts[1:]]
+        for x in track(range(counts[0]), "Looking for matter", total=counts[0]):
+            slab = torch.cartesian_prod(torch.tensor([x]), *ranges).view(-1, 1, 3)
+            positions = grid.positions(((slab + offsets) * OCTANT).reshape(-1, 3))
+            sigma = self._evaluate.density(positions).view(-1, PROBES)
+            found[x] = (sigma.amax(-1) * grid.cell > MIN_DEPTH).view(counts[1:])
+        return functional.max_pool3d(found[None, None].float(), 3, 1, 1)[0, 0] > 0
+
+    def _in_occupied(self, grid: Grid, counts: list[int], occupancy: SkipsCells) -> Tensor:
+        """Return whether a cell of the occupancy grid overlaps each octant."""
+        # Positions in an octant and on its faces are no further apart than the edge of a cell, so none is missed.
+        edge = float((occupancy.box[1] - occupancy.box[0]).min()) / occupancy.resolution
+        steps = max(math.ceil(OCTANT * grid.cell / edge), 2)
+        found = torch.zeros(counts, dtype=torch.bool)
+        ranges = [torch.arange(steps * count + 1) for count in counts[1:]]
+        shape = [steps + 1, *(len(each) for each in ranges)]
         for x in range(counts[0]):
-            half = torch.cartesian_prod(torch.arange(2 * x, 2 * x + 3), *ranges)
-            kept = self._evaluate.kept(grid.positions(half * (OCTANT / 2))).view(shape)
-            found[x] = functional.max_pool3d(kept[None, None].float(), 3, 2)[0, 0, 0] > 0
+            slab = torch.cartesian_prod(torch.arange(steps * x, steps * (x + 1) + 1), *ranges)
+            kept = self._evaluate.kept(grid.positions(slab * (OCTANT / steps))).view(shape)
+            found[x] = functional.max_pool3d(kept[None, None].float(), steps + 1, steps)[0, 0, 0] > 0
         return found
 
     def cells(self, grid: Grid) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -30,6 +31,7 @@ from nerfloom.export.web import (
     pinhole,
     upright,
 )
+from nerfloom.geometry.regions import Region, inside_all
 from nerfloom.method import Method
 from nerfloom.renderable import Renderable, RendersRays
 from nerfloom.scene.folded_poses import in_order
@@ -67,7 +69,13 @@ class Closeness:
 
 
 def export_page(
-    loaded: Loaded, path: Path, max_megabytes: float, fit_seconds: float, moment: float | None, splatting: Method
+    loaded: Loaded,
+    path: Path,
+    max_megabytes: float,
+    fit_seconds: float,
+    moment: float | None,
+    splatting: Method,
+    regions: Sequence[Region] = (),
 ) -> None:
     """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 
@@ -78,6 +86,7 @@ def export_page(
         fit_seconds: time for fitting Gaussians to a field, seconds.
         moment: time that the page shows of a scene that moves, 0 to 1; 0 if None.
         splatting: the method that fits them.
+        regions: the page shows what is in all of these, in the frame of exports; it is then not compared.
 
     Raises:
         ConfigError: if the flags do not fit the run, or there is nothing to show.
@@ -94,6 +103,7 @@ def export_page(
     near = smallest_depth(model.scene)
     found, look = _gaussians(loaded, dataset, cameras, fit_seconds, moment, splatting)
     good = _finite(found)
+    good = good[inside_all(loaded.placement.original_points(good.means), regions)]
     turn = upright(cameras)
     order = in_order(names)  # data formats sort 10.jpg before 2.jpg
     red, green, blue = model.background.tolist()
@@ -119,11 +129,26 @@ def export_page(
     say(f"{len(content) / 1e6:.2f} MB, {len(drawn):,} Gaussians of degree {drawn.degree}: {path}")
     if moment is not None:
         say(f"the scene moves, and the page shows it at time {moment:g}, still")
-    back = transformed(drawn, turn.T, 1.0, torch.zeros(3)).map(lambda values: values.to(model.device))
+    if not regions:
+        back = transformed(drawn, turn.T, 1.0, torch.zeros(3))
+        say(_closeness_to(loaded, back, dataset, cameras, near, look, moment).line())
+
+
+def _closeness_to(
+    loaded: Loaded,
+    drawn: Gaussians,
+    dataset: Dataset | None,
+    cameras: Cameras,
+    near: float,
+    look: Look,
+    moment: float | None,
+) -> Closeness:
+    """Compare Gaussians in the scene's frame with a run or file, on held-out views if there are any."""
+    model = loaded.model
     held_out = None if loaded.source is None else first_split(loaded.source, ("test", "val"))
     views = dataset if held_out is None else _at(held_out.to(model.device), moment)
     seen = cameras.to(model.device) if views is None else views.cameras
-    say(closeness(model, back, seen, views, near, look, moment).line())
+    return closeness(model, drawn.map(lambda values: values.to(model.device)), seen, views, near, look, moment)
 
 
 def _gaussians(
@@ -228,12 +253,10 @@ def _title(loaded: Loaded) -> str:
 
 def _about(loaded: Loaded, moment: float | None) -> str:
     method = loaded.method
-    drawn = isinstance(loaded.model, HasGaussians)
-    file = "a file of Gaussians" if drawn else "an octree"
-    parts = [f"Made by Nerfloom with {method}." if loaded.is_run else f"Made by Nerfloom from {file}."]
-    if not drawn:
-        field = f"{method}'s field" if loaded.is_run else "the octree"
-        parts.append(f"The Gaussians shown here are fitted to pictures of {field}.")
+    made = f"with {method}" if loaded.is_run else f"from {printable(loaded.origin.name)}"
+    parts = [f"Made by Nerfloom {made}."]
+    if not isinstance(loaded.model, HasGaussians):
+        parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")
     return " ".join([*parts, "The page works offline and requests nothing from any host."])

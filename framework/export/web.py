@@ -67,8 +67,8 @@ class PageFacts:
     """Length of a scene unit, in `unit`."""
     unit: str = ""
     """Name of the unit of lengths; empty for that of the input."""
-    relative_error: float = 0.0
-    """Standard deviation of `unit_length`, as a fraction of it."""
+    relative_error: float | None = 0.0
+    """Standard deviation of `unit_length`, as a fraction of it; None if it is not known."""
     photographed: bool = True
     """Whether `cameras` are those of photographs, which determine how precise a length is."""
 

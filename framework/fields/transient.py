@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -55,8 +58,7 @@ class TransientHead(nn.Module):
         self.register_buffer("turns", camera_to_worlds[:, :, :3].clone())
         self.register_buffer("reach", torch.ones(()))  # tangent of the widest angle between a ray and its camera's axis
         self.start = start
-        self.shown_image: int | None = None
-        """Index of the training image to render with its transient part outside of training; None for none."""
+        self._shown: int | None = None
 
     def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return transient density (N,), 1/length, colour (N, 3) in [0, 1], and uncertainty (N,), all of float32.
@@ -70,11 +72,20 @@ class TransientHead(nn.Module):
         density, found = self.network.density(features, vectors.to(features.dtype), placed.to(features.dtype))
         return self.start * density, found[:, 1:4].float().sigmoid(), functional.softplus(found[:, 4].float())
 
+    @contextmanager
+    def shown(self, image: int) -> Iterator[None]:
+        """Give rays of no training image those of the training image `image`, within a `with` block."""
+        self._shown, previous = image, self._shown
+        try:
+            yield
+        finally:
+            self._shown = previous
+
     def vectors_of(self, rays: Rays) -> Tensor | None:
         """Return the vector (R, S) of each ray's image at the ray's position; None if rays have no training image."""
         images = rays.camera_indices
-        if images is None and self.shown_image is not None:
-            images = torch.full((len(rays),), self.shown_image, device=rays.origins.device)
+        if images is None and self._shown is not None:
+            images = torch.full((len(rays),), self._shown, device=rays.origins.device)
         if images is None:
             return None
         local = torch.einsum("rij,ri->rj", self.turns.to(rays.directions)[images], rays.directions.detach())

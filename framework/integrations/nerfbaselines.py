@@ -19,10 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import TrainConfig, from_plain, to_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
 from nerfloom.integrations.nerfbaselines_data import (

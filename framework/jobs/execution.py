@@ -6,6 +6,7 @@ import json
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,14 +48,14 @@ def execute(
     assert process.stdin is not None
     assert process.stdout is not None
     try:
-        process.stdin.write(json.dumps(job).encode() + b"\n")
-        process.stdin.flush()
+        with suppress(BrokenPipeError):  # it has ended already
+            process.stdin.write(json.dumps(job).encode() + b"\n")
+            process.stdin.flush()
         while process.poll() is None and not stopped.wait(LOOK_EVERY):
             look()
-    except BrokenPipeError:  # it has ended already
-        pass
     finally:
-        process.stdin.close()
+        with suppress(BrokenPipeError):  # closing writes again what could not be written
+            process.stdin.close()
         process.wait()
     said = process.stdout.read().decode(errors="replace").strip()
     process.stdout.close()

@@ -15,12 +15,19 @@ class Step:
     Args:
         command: program and arguments.
         started: file that the command writes early; if it exists, `resume` is run instead of `command`.
-        resume: command that continues where an earlier one was stopped.
+        resume: command that continues where an earlier one was stopped; required with `started`.
+
+    Raises:
+        ValueError: if a command is missing.
     """
 
     command: tuple[str, ...]
     started: Path | None = None
     resume: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.command or bool(self.resume) != (self.started is not None):
+            raise ValueError("a step needs a command, and with `started` another that resumes it")
 
 
 @dataclass(frozen=True)

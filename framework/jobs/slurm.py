@@ -6,6 +6,7 @@ run on the cluster.
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,7 +50,7 @@ class Slurm(Launcher):
                 self.folder.mkdir(parents=True, exist_ok=True)
                 for job in waiting:
                     job.log.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(path, lambda file: file.write(script(waiting, self.at_once).encode()))
+                write_atomically(path, lambda file: file.write(os.fsencode(script(waiting, self.at_once))))
             except OSError as error:
                 raise ConfigError(f"cannot write {path}: {error.strerror}") from error
             say(f"{len(waiting)} jobs are ready: sbatch {shlex.quote(str(path))} (with --time and the like before it)")
@@ -76,7 +77,6 @@ def script(jobs: Sequence[Job], at_once: int | None) -> str:
         *([f"#SBATCH --gpus-per-task={gpus}"] if gpus else []),
         "#SBATCH --requeue",
         "#SBATCH --output=/dev/null",
-        f"cd {shlex.quote(str(Path.cwd()))} || exit 1",
         "export PYTHONUNBUFFERED=1",
         'case "$SLURM_ARRAY_TASK_ID" in',
     ]
@@ -84,7 +84,8 @@ def script(jobs: Sequence[Job], at_once: int | None) -> str:
         own = job.resources.cores
         lines += [
             f"{number})  # {printable(job.title)}",
-            f"  exec >> {shlex.quote(str(job.log))} 2>&1",
+            f"  exec >> {shlex.quote(str(job.log.absolute()))} 2>&1 || exit",
+            f"  cd {shlex.quote(str(Path.cwd()))} || exit",
             *([] if own is None else [f"  export OMP_NUM_THREADS={own}"]),
             *(f"  {_shell(step)} || exit" for step in job.steps),
             "  ;;",

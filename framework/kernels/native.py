@@ -90,6 +90,9 @@ def _load() -> tuple[str, ctypes.CDLL | None]:
                 problem = str(error)
     if asked != "auto":
         raise ConfigError(f"NERFLOOM_KERNELS asks for '{asked}', but {FOLDER / asked}{SUFFIX} does not load: {problem}")
+    others = [name for name in NEEDS if name not in fitting and (FOLDER / f"{name}{SUFFIX}").is_file()]
+    if others and problem == "they were not built":
+        problem = f"they were built for another processor: {', '.join(others)}"
     say(
         f"note: without its compiled kernels ({problem}) nerfloom trains more than ten times slower on this processor; "
         f"with a C++ compiler ({_compiler_hint()}), install it again: {reinstall_command()}"

@@ -56,8 +56,7 @@ class Eikonal(LossTerm):
         unit = torch.rand(max(len(samples) // ANYWHERE, 1), 3, device=field.box.device)
         low, high = field.box
         elsewhere = field.shape(torch.lerp(low, high, unit)).gradients
-        first = int(torch.randint(EVERY, ()))
-        gradients = torch.cat([samples.features[first::EVERY, :3], elsewhere])
+        gradients = torch.cat([samples.features[some_of(len(samples)), :3], elsewhere])
         return (gradients.norm(dim=-1) - 1).square().mean()
 
 
@@ -73,7 +72,7 @@ class Silhouette(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         batch = shown.batch
         assert batch.alpha is not None
-        return mean_squared_error(shown.pixels.accumulation, batch.alpha, batch.weights)
+        return mean_squared_error(shown.pixels.accumulation[:, None], batch.alpha[:, None], batch.weights)
 
 
 class Curvature(LossTerm):
@@ -93,11 +92,20 @@ class Curvature(LossTerm):
         early = field.progress < shown.model.config.curvature_from
         if early or samples is None or samples.features is None or not len(samples):
             return None
-        first = int(torch.randint(EVERY, ()))
-        normals = safe_normalize(samples.features[first::EVERY, :3])
-        positions, lengths = samples.positions(shown.batch.rays)[first::EVERY], samples.deltas[first::EVERY]
+        some = some_of(len(samples))
+        normals = safe_normalize(samples.features[some, :3])
+        positions, lengths = samples.positions(shown.batch.rays)[some], samples.deltas[some]
         moved = positions + lengths[:, None] * tangents(normals.detach())
         return normal_change(normals, safe_normalize(field.shape(moved).gradients))
+
+
+def some_of(count: int) -> slice:
+    """Return one in `EVERY` of `count` samples, from a random one on; at least one sample.
+
+    Args:
+        count: number of samples, at least 1.
+    """
+    return slice(int(torch.randint(min(EVERY, count), ())), None, EVERY)
 
 
 def tangents(normals: Tensor) -> Tensor:

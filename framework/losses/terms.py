@@ -192,6 +192,9 @@ class UnseenRoughness(LossTerm):
     def factor(self, config: Any, step: int) -> float:
         return unseen_weight(config, step)
 
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.rays.camera_indices is not None
+
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         batch, model = shown.batch, shown.model
         poses = model.scene.camera_to_worlds

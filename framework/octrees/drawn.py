@@ -112,7 +112,8 @@ class DrawnOctree(DrawsOctree):
 
     def density(self, points: Points) -> Tensor:
         """Return the density (N,) at `points`, in 1/length."""
-        layout = self.octree.layout
+        layout, leaves = self.octree.layout, self.octree.leaves
         leaf = leaf_at(layout, points.positions)
-        depths = self.octree.leaves.depths() / layout.cell
-        return torch.where(leaf >= 0, depths[leaf.clamp(min=0)], 0.0) if len(depths) else leaf.float() * 0
+        met, density = leaf >= 0, torch.zeros(len(leaf), device=leaf.device)
+        density[met] = leaves.table[leaves.codes[leaf[met]].long()] / layout.cell
+        return density

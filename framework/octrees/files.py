@@ -41,6 +41,8 @@ SUFFIX = ".octree"
 """Suffix of the files."""
 VERSION = 1
 """Version of the format."""
+MAX_SIDE = 2**16
+"""Maximum number of bricks along an axis: their coordinates are stored in 16 bits."""
 MAX_BYTES = 4e9
 """Maximum size of a file's arrays."""
 MAX_RATIO = 300
@@ -129,7 +131,8 @@ def _octree(arrays: dict[str, np.ndarray]) -> Octree:
     layout = _layout(arrays)
     leaves = _leaves(arrays, layout.num_leaves)
     transform = _floats(arrays, "transform", (3, 4), np.float64)
-    if not abs(float(np.linalg.det(transform[:, :3])) - 1) < 1e-3:
+    rotation = transform[:, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or not np.linalg.det(rotation) > 0:
         raise ValueError("its transform is not a rigid motion")
     near, far = _number(arrays, "near", 0, MAX_COORDINATE), _number(arrays, "far", 0, MAX_COORDINATE)
     if not near < far:
@@ -146,15 +149,19 @@ def _octree(arrays: dict[str, np.ndarray]) -> Octree:
 
 
 def _layout(arrays: dict[str, np.ndarray]) -> OctreeLayout:
-    size = tuple(int(count) for count in _integers(arrays, "size", (3,), 1, MAX_BRICKS))
+    size = tuple(int(count) for count in _integers(arrays, "size", (3,), 1, MAX_SIDE))
     cell = _number(arrays, "cell", 1e-9, MAX_COORDINATE)
     origin = _floats(arrays, "origin", (3,), np.float32)
     if max(size) * BRICK * cell > MAX_COORDINATE or math.prod(size) > MAX_BRICKS:
         raise ValueError("its box is too large")
     count = len(arrays["places"])
-    places = torch.from_numpy(_integers(arrays, "places", (count, 3), 0, 2**16 - 1).astype(np.int64))
-    masks = torch.from_numpy(_typed(arrays, "masks", (count, 8), np.uint64).view(np.int64))
-    cells = cells_of(places, masks)
+    places = torch.from_numpy(_integers(arrays, "places", (count, 3), 0, MAX_SIDE - 1).astype(np.int64))
+    masks = _typed(arrays, "masks", (count, 8), np.uint64)
+    # Before cells are listed: a brick of 64 bytes may claim 512 of them.
+    leaves, codes = int.from_bytes(masks.tobytes(), "little").bit_count(), arrays["codes"].shape
+    if codes != (leaves,):
+        raise ValueError(f"its masks have {leaves:,} leaves, and its array 'codes' has shape {codes}")
+    cells = cells_of(places, torch.from_numpy(masks.view(np.int64)))
     layout, rows = OctreeLayout.build(torch.from_numpy(origin), cell, size, cells)
     if not torch.equal(rows, torch.arange(len(cells))):
         raise ValueError("its bricks are not in order")

@@ -15,7 +15,7 @@ from PIL import Image
 
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
-from nerfloom.data.image_files import Content, unreadable
+from nerfloom.data.image_files import Content, read_heif, unreadable
 from nerfloom.processing.brightness import eight_bits, tones
 
 _JPEG = (".jpg", ".jpeg")
@@ -96,7 +96,6 @@ def prepare_all(
         DataError: if no image is readable.
     """
     names = output_names(sources)
-    register_heif()
 
     def attempt(index: int) -> PreparedImage | str:
         try:
@@ -130,6 +129,7 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
     """
     path, target = folder / source, images / name
     target.parent.mkdir(parents=True, exist_ok=True)
+    read_heif(path)
     try:
         with Image.open(Content(path)) as image:
             image.load()  # a truncated file fails here
@@ -228,15 +228,6 @@ def in_parallel(work: Callable[[T], R], items: Iterable[T], title: str, total: i
         return list(track(pool.map(work, items), title, total=total))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def register_heif() -> None:
-    """Enable HEIC in Pillow, if the package pillow-heif is installed."""
-    try:
-        import pillow_heif  # type: ignore[import-not-found,unused-ignore]
-    except ImportError:
-        return
-    pillow_heif.register_heif_opener()
 
 
 def _cropped(image: Image.Image, crop: int) -> Image.Image:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.console import say
+from nerfloom.base.device import choose_device
+from nerfloom.base.json_files import read_object
+from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
+from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.processing import transforms
 from nerfloom.processing.images import save
 from nerfloom.processing.output import FINISHED
@@ -21,8 +23,15 @@ from nerfloom.training.trainer import Trainer
 
 METHOD = "nerfacto"
 """The method that looks for moving things."""
-SETTINGS: dict[str, Any] = {"max_num_iterations": None, "robust": True, "gradient_scaling": True, "vis": "none"}
-"""Its settings. Without scaled gradients, people become fog in front of their camera, which no image contradicts."""
+SETTINGS: dict[str, Any] = {
+    "max_num_iterations": None,
+    "robust": True,
+    "gradient_scaling": True,
+    "mean_appearance_share": 0.0,
+    "vis": "none",
+}
+"""Its settings. Without scaled gradients, people become fog in front of their camera, which no image contradicts. In a
+step with the mean appearance, all of an image in other light would be wrong in one direction."""
 LONGER_SIDE = 400
 """Minimum longer side of the images that it learns from, pixels. Larger images are reduced by 2, 4 or 8."""
 
@@ -38,15 +47,16 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
         num_downscales: number of folders of reduced images and masks.
         settings: further settings of the training.
     """
-    content = json.loads((output / FINISHED).read_text())
+    content = read_object(output / FINISHED)
     frames = {Path(frame["file_path"]).relative_to("images").as_posix(): frame for frame in content["frames"]}
     with Image.open(output / "images" / next(iter(frames))) as image:
         longer = max(image.size)
     factor = max(2**level for level in range(min(num_downscales, 3) + 1) if longer >> level >= LONGER_SIDE or not level)
     parser = load_dataparser("nerfstudio")
     parsed = from_plain(parser(), {"eval_mode": "all", "downscale_factor": factor}, "masks").parse(output, "train")
-    dataset, method = load_dataset(parsed, "train"), load_method(METHOD)
+    method = load_method(METHOD)
     config = from_plain(method.config, {**SETTINGS, **settings}, "masks")
+    dataset, _ = on_device(load_dataset(parsed, "train"), choose_device(config.machine))
     trainer = Trainer(method, config, dataset)
     with ProgressBar(f"{METHOD}, to find moving things") as bar:
         for report in trainer.steps():

@@ -91,6 +91,11 @@ def is_unfinished(output: Path) -> bool:
     return not (output / FINISHED).exists() and (unfinished(output) / STARTED).is_file()
 
 
+def lacks_masks(flags: ColmapFlags) -> bool:
+    """Return whether a finished run has no masks although `flags` ask for masks of what moves."""
+    return flags.mask_moving and b'"mask_path"' not in (flags.output_dir / FINISHED).read_bytes()
+
+
 def ready(output: Path) -> str:
     """Return the last line of a command: the data folder and the command to train on it.
 

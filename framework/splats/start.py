@@ -58,25 +58,29 @@ def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OP
     )
 
 
-def neighbour_distance(points: Tensor) -> Tensor:
-    """Return the approximate mean distance (N,) of each point to its three nearest neighbours.
+def neighbour_distance(points: Tensor, neighbours: int = NEIGHBOURS, outside: float = 0.0) -> Tensor:
+    """Return the approximate mean distance (N,) of each point to its nearest neighbours.
 
     Candidates are adjacent points on four space-filling curves (Morton order with four offsets), which finds most
     neighbours.
 
     Args:
         points: (N, 3).
+        neighbours: number of nearest neighbours.
+        outside: share of the points, at both ends of each axis, that the curves need not resolve, so that a few points
+            far away do not make them coarse.
     """
     count = len(points)
     if count < 2:
         return points.new_ones(count)
-    low, high = points.min(0).values, points.max(0).values
+    ordered, skipped = points.sort(0).values, int(outside * count)
+    low, high = ordered[skipped], ordered[count - 1 - skipped]
     unit = (points - low) / (high - low).max().clamp(min=1e-12)
-    best = points.new_full((count, NEIGHBOURS), torch.inf)
+    best = points.new_full((count, neighbours), torch.inf)
     for shift in (0.0, 0.137, 0.291, 0.433):
         order = morton(((unit + shift) / 1.5 * (2**20 - 1)).long().clamp(0, 2**20 - 1)).argsort()
         along = points[order]
-        steps = range(1, min(2 * NEIGHBOURS, count - 1) + 1)
+        steps = range(1, min(2 * neighbours, count - 1) + 1)
         found = [best[order]]
         for step in steps:
             gap = (along[step:] - along[:-step]).norm(dim=-1)
@@ -85,7 +89,7 @@ def neighbour_distance(points: Tensor) -> Tensor:
         # Several curves may find the same neighbour: equal distances count once.
         near = torch.cat(found, 1).sort(1).values
         near[:, 1:][near[:, 1:] == near[:, :-1]] = torch.inf
-        best[order] = near.sort(1).values[:, :NEIGHBOURS]
+        best[order] = near.sort(1).values[:, :neighbours]
     known = best.isfinite()
     return best.masked_fill(~known, 0).sum(1) / known.sum(1).clamp(min=1)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -31,6 +32,18 @@ def transformed(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Ten
     Raises:
         ValueError: if `rotation` is not a rotation, or `scale` is not positive.
     """
+    moved = transformed_in_float64(gaussians, rotation, scale, shift)
+    return replace(moved, means=moved.means.to(gaussians.log_scales))
+
+
+def transformed_in_float64(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Tensor) -> Gaussians:
+    """Return `transformed` Gaussians whose centres are float64, for coordinates far from the origin.
+
+    `gaussians`, `rotation`, `scale` and `shift` are as in `transformed`.
+
+    Raises:
+        ValueError: as `transformed`.
+    """
     rotation = rotation.to(gaussians.means.device, torch.float64)
     shift = shift.to(rotation)
     identity = torch.eye(3).to(rotation)
@@ -38,10 +51,9 @@ def transformed(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Ten
         raise ValueError(f"{rotation.tolist()} is not a rotation")
     if not 0 < scale < math.inf:
         raise ValueError(f"a scale must be positive, not {scale}")
-    means = scale * (gaussians.means.double() @ rotation.T) + shift
     rotations = quaternion_product(quaternion(rotation), gaussians.rotations.double())
     return Gaussians(
-        means=means.to(gaussians.log_scales),
+        means=scale * (gaussians.means.double() @ rotation.T) + shift,
         log_scales=gaussians.log_scales + math.log(scale),
         rotations=rotations.to(gaussians.rotations),
         logits=gaussians.logits,

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import TrainConfig, from_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import NerfloomError
+from nerfloom.base.plain import from_plain
 from nerfloom.base.signals import Stopped
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.parsed_scene import DataParser, ParsedScene
@@ -46,8 +47,13 @@ def scene_of(parsed: ParsedScene, config: TrainConfig) -> Scene:
     Args:
         parsed: the training images.
         config: the settings of reading them.
+
+    Raises:
+        ConfigError: if rays are in normalised device coordinates.
     """
     few = parsed[torch.arange(min(LOOKED_AT, len(parsed.image_paths)))]
     scene = load_dataset(few, "train", PixelMemory.of(config.cache_limit, config.cache_dir), config.masks).scene
+    if scene.warped:
+        raise ConfigError("normalised device coordinates (--ndc) are for runs that were trained so; leave out --ndc")
     poses = parsed.cameras.camera_to_worlds
     return dataclasses.replace(scene, num_cameras=len(poses), camera_to_worlds=poses)

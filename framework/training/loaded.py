@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.errors import ConfigError, DataError, nearest
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
@@ -31,19 +31,19 @@ class Loaded:
     """A renderable and its origin: the result of `nerfloom.load`."""
 
     model: Renderable
-    """The renderable, on its device: a `nerfloom.Model` in evaluation mode, or Gaussians."""
+    """The renderable, on its device: a `nerfloom.Model` in evaluation mode, Gaussians, or an octree."""
     placement: Placement
     """Placement of the input, in the unit of `scale`, in the scene of `model`. All that is exported has this frame."""
     method: str
     """Name of the method that made it."""
     origin: Path
-    """The run's folder, or the file of Gaussians or octree, for commands that load it again."""
+    """The run's folder, or the file, for commands that load it again."""
     checkpoint: Path
     """File of the parameters."""
     step: int = 0
     """Number of training steps done; 0 if unknown."""
     source: Run | None = None
-    """Method, settings, data and folder; None for Gaussians without data."""
+    """Method, settings, data and folder; None for a file without data."""
     scale: Scale = field(default_factory=Scale)
     """The unit of lengths (docs/guides/measure.md)."""
     _datasets: dict[Split, Dataset] = field(default_factory=dict)
@@ -54,7 +54,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file of Gaussians or an octree."""
+        """True for a run, False for a file: of Gaussians, an octree, or a scene in blocks."""
         return self.origin != self.checkpoint
 
     @property
@@ -74,10 +74,10 @@ class Loaded:
 
     @property
     def run(self) -> Run:
-        """The run. For Gaussians with data it is a placeholder that holds the data.
+        """The run. For a file with data, and for a scene in blocks, it is a placeholder that holds the data.
 
         Raises:
-            ConfigError: for Gaussians without data.
+            ConfigError: for a file without data.
         """
         if self.source is None:
             raise ConfigError(f"{self.origin} is not a run, so that its photographs are unknown: give --data DIR")
@@ -90,7 +90,7 @@ class Loaded:
             split: train, val or test.
 
         Raises:
-            ConfigError: for Gaussians without data.
+            ConfigError: for a file without data.
             DataError: if the data cannot be read.
         """
         if split not in self._datasets:
@@ -102,6 +102,35 @@ class Loaded:
         dataset = self.dataset(split)
         return [dataset.view(index) for index in range(len(dataset))]
 
+    def photograph(self, name: str) -> View:
+        """Return the view of a photograph, of any split. Photographs are not decoded.
+
+        Args:
+            name: its file name, or the end of its path, such as test/r_0.png.
+
+        Raises:
+            ConfigError: if no photograph or several have this name, or for a file without data.
+            DataError: if the data cannot be read.
+        """
+        ending, known, found = Path(name).parts, set[str](), dict[Path, View]()
+        for split in get_args(Split):
+            try:
+                parsed = self.run.parse(split)
+            except DataError:
+                if split == "train":
+                    raise
+                continue
+            for index, path in enumerate(parsed.image_paths):
+                known.add(path.name)
+                if path.parts[-len(ending) :] == ending:
+                    found[path] = View.of(parsed.cameras.to(self.model.device), index, parsed.times)
+        if not found:
+            raise ConfigError(f"no photograph is named {name}. {nearest(name, known)}")
+        if len(found) > 1:
+            longer = "/".join(next(iter(found)).parts[-len(ending) - 1 :])
+            raise ConfigError(f"{len(found)} photographs are named {name}: give more of the path, such as {longer}")
+        return next(iter(found.values()))
+
     def render(self, camera: View | Cameras, time: float | None = None) -> Picture:
         """Render an image, with colour, depth and opacity.
 
@@ -112,13 +141,8 @@ class Loaded:
         Raises:
             ValueError: if there are several cameras.
         """
-        if isinstance(camera, Cameras):
-            if len(camera) != 1:
-                raise ValueError(f"render() takes one camera, not {len(camera)}: choose one, as in cameras[0:1]")
-            camera = View(camera.to(self.model.device), time)
-        elif time is not None:
-            camera = View(camera.camera, time, camera.rays_per_pixel, camera.stride)
-        return self.model.render_view(camera, self.model.background)
+        view = self._view(camera)
+        return self.model.render_view(view if time is None else replace(view, time=time), self.model.background)
 
     def evaluate(
         self, split: Split = "test", max_images: int | None = None, lpips_weights: str | Path | None = None
@@ -143,10 +167,12 @@ class Loaded:
             column, row: the pixel; (0, 0) is the centre of the top left one, and fractions are allowed.
 
         Raises:
-            ConfigError: if the pixel shows no surface.
+            ConfigError: if the pixel is outside of the image or shows no surface, or the run has no lengths
+                (`measure`).
+            ValueError: if there are several cameras.
         """
-        view = camera if isinstance(camera, View) else View(camera.to(self.model.device))
-        return self.placement.original_points(surface_point(self.model, view, column, row)[None])[0]
+        self._check_lengths()
+        return self.placement.original_points(surface_point(self.model, self._view(camera), column, row)[None])[0]
 
     def measure(
         self, start: Tensor | Sequence[float], end: Tensor | Sequence[float], time: float | None = None
@@ -158,7 +184,8 @@ class Loaded:
             time: time in [0, 1] of a moving scene; None for 0.
 
         Raises:
-            ConfigError: if the points are the same, or the scene has no scale (normalised device coordinates).
+            ConfigError: if the points are the same, or the run has no lengths: normalised device coordinates, or
+                several scenes.
         """
         return self._measured(start, end, self.scale, time)
 
@@ -196,13 +223,13 @@ class Loaded:
         """Write the scale to the run's folder, where whatever loads the run finds it.
 
         Raises:
-            ConfigError: for a file of Gaussians or an octree, because its coordinates are in a unit already.
+            ConfigError: for a file, because its coordinates are in a unit already.
             OSError: if it cannot be written.
         """
         if not self.is_run:
             raise ConfigError(
-                f"{self.origin} is a file and keeps its coordinates: set the scale of the run that it is "
-                "from, and export it again"
+                f"{self.origin} is not a run and keeps its coordinates: set the scale of the run that it is from, and "
+                "export or bake that again"
             )
         write_scale(self.folder, self.scale)
 
@@ -213,17 +240,35 @@ class Loaded:
         scale: Scale,
         time: float | None,
     ) -> Length:
-        if self.model.scene.warped:
-            raise ConfigError("this run is in normalised device coordinates (--ndc), which have no lengths to measure")
+        self._check_lengths()
         ends = self.placement.points(torch.stack([torch.as_tensor(p, dtype=torch.float64) for p in (start, end)]))
         return measured(self.model, self._photographs(), (ends[0], ends[1]), self.unit, scale, time)
 
+    def _check_lengths(self) -> None:
+        """Raise ConfigError if there are no lengths in the scene, or no single scene."""
+        if self.model.scene.warped:
+            raise ConfigError("this run is in normalised device coordinates (--ndc), which have no lengths to measure")
+        if self.model.scene.num_scenes > 1:
+            raise ConfigError(f"this run is of {self.model.scene.num_scenes} scenes; lengths are measured in one")
+
     def _photographs(self) -> Cameras | None:
-        """Return the cameras of the training images, which are not decoded; None if they are not known."""
+        """Return the cameras of the training images, in the sizes that were learnt from; None if they are not known.
+
+        The images are not decoded.
+        """
         if "train" not in self._cameras:
             try:
-                self._cameras["train"] = None if self.source is None else self.source.parse("train").cameras
+                parsed = None if self.source is None else self.source.parse("train")
             except DataError as error:
                 say(f"the errors of lengths are not known: {error}")
-                self._cameras["train"] = None
+                parsed = None
+            self._cameras["train"] = None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
         return self._cameras["train"]
+
+    def _view(self, camera: View | Cameras) -> View:
+        """Return a view as it is, or that of one camera on the model's device."""
+        if isinstance(camera, View):
+            return camera
+        if len(camera) != 1:
+            raise ValueError(f"a view is of one camera, not of {len(camera)}: choose one, as in cameras[0:1]")
+        return View(camera.to(self.model.device))

@@ -59,10 +59,6 @@ def load_splats(
         source = source_of(METHOD, file, data, data_format, machine)
         parsed = source.parse("train")
         scene, placement = scene_of(parsed, source.config), scale.placed(parsed.placement)
-        if scene.warped:
-            raise ConfigError(
-                f"{file}: normalised device coordinates (--ndc) have no place for Gaussians; leave out --ndc"
-            )
         placed = transformed(gaussians, *placement.about(offset).similarity())
         _check_place(file, gaussians, placed, parsed)
     device = choose_device(machine)

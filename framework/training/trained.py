@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import HeldOutAppearance, RaysPerPixel, TrainConfig
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
 from nerfloom.cameras.poses import Placement
@@ -23,7 +24,7 @@ from nerfloom.training.checkpoint import FOLDER, find_newest, load_checkpoint
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
 from nerfloom.training.loaded import Loaded
-from nerfloom.training.run import read_run
+from nerfloom.training.run import Run, read_run
 
 
 def load_trained(
@@ -31,9 +32,7 @@ def load_trained(
     checkpoint: Path | None = None,
     device_type: Any = "auto",
     data: Path | None = None,
-    rays_per_pixel: RaysPerPixel | None = None,
-    eval_appearance: HeldOutAppearance | None = None,
-    eval_rendering: Literal["volume", "surface"] | None = None,
+    **settings: Any,
 ) -> Loaded:
     """Load a run with its trained model.
 
@@ -42,9 +41,7 @@ def load_trained(
         checkpoint: checkpoint to load; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.
         data: folder of the data, if it has moved; None for the run's.
-        rays_per_pixel: rays per rendered pixel; None for the run's setting.
-        eval_appearance: appearance of held-out images; None for the run's setting.
-        eval_rendering: rendering of a signed distance; None for the run's setting.
+        settings: changed settings, by name, as in `rays_per_pixel=4`; None for the run's own value.
 
     Raises:
         ConfigError: if the run's settings are missing or do not fit.
@@ -52,21 +49,27 @@ def load_trained(
         DataError: if the run's scale cannot be read.
     """
     run = read_run(config_path)
-    machine = dataclasses.replace(run.config.machine, device_type=device_type)
     config = dataclasses.replace(
-        run.config,
-        machine=machine,
+        _changed(run.config, run.method, settings),
+        machine=dataclasses.replace(run.config.machine, device_type=device_type),
         data=run.config.data if data is None else find_data(data, run.dataparser)[0],
     )
-    config = _changed(
-        config,
-        run.method,
-        rays_per_pixel=rays_per_pixel,
-        eval_appearance=eval_appearance,
-        eval_rendering=eval_rendering,
-    )
-    run = dataclasses.replace(run, config=config)
-    device = choose_device(machine)
+    return load_parameters(dataclasses.replace(run, config=config), checkpoint)
+
+
+def load_parameters(run: Run, checkpoint: Path | None = None) -> Loaded:
+    """Load the trained model of a run whose settings are known.
+
+    Args:
+        run: the run.
+        checkpoint: checkpoint to load; None for the newest readable one.
+
+    Raises:
+        ConfigError: if the settings do not fit.
+        CheckpointError: if there is no readable checkpoint, or it does not fit the settings.
+        DataError: if the run's scale cannot be read.
+    """
+    device = choose_device(run.config.machine)
     if checkpoint is None:
         newest = find_newest(run.folder / FOLDER, device)
         if newest is None:
@@ -74,7 +77,7 @@ def load_trained(
         path, content = newest
     else:
         path, content = checkpoint, load_checkpoint(checkpoint, device)
-    model = restored_model(load_method(run.method), config, content, device)
+    model = restored_model(load_method(run.method), run.config, content, device)
     if isinstance(model, RendersFromImages):
         model.show_images(load_split(run, "train").to(device))
     placement, state = Placement.of(content["transform"], content["scale"]), content.get("state")
@@ -83,9 +86,9 @@ def load_trained(
     return loaded.scaled(read_scale(run.folder))
 
 
-def _changed(config: TrainConfig, method: str, **values: Any) -> TrainConfig:
-    """Return settings with the `values` that are not None; raise ConfigError if the method has no such settings."""
-    given = {name: value for name, value in values.items() if value is not None}
+def _changed(config: TrainConfig, method: str, settings: Mapping[str, Any]) -> TrainConfig:
+    """Return a config with the `settings` that are not None; raise ConfigError if the method has no such settings."""
+    given = {name: value for name, value in settings.items() if value is not None}
     for name in given:
         if not hasattr(config, name):
             raise ConfigError(f"--{name.replace('_', '-')} has no effect with {method}: leave it out")

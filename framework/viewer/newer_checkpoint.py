@@ -7,7 +7,7 @@ from pathlib import Path
 from nerfloom.base.errors import NerfloomError
 from nerfloom.training.checkpoint import FOLDER, list_checkpoints
 from nerfloom.training.loaded import Loaded
-from nerfloom.training.trained import load_trained
+from nerfloom.training.trained import load_parameters
 
 
 def newer_checkpoint(folder: Path, seen: Path | None) -> Path | None:
@@ -31,11 +31,7 @@ def reloaded(loaded: Loaded, checkpoint: Path) -> Loaded | str:
         loaded: the run that is looked at.
         checkpoint: file of the newer parameters.
     """
-    config = loaded.run.config
-    rendering = getattr(config, "eval_rendering", None)
     try:
-        return load_trained(
-            loaded.folder, checkpoint, config.machine.device_type, config.data, eval_rendering=rendering
-        )
+        return load_parameters(loaded.run, checkpoint)
     except (NerfloomError, OSError) as error:
         return f"{checkpoint.name} cannot be shown: {error}"

@@ -14,8 +14,10 @@ from tests.cli.helpers import called
 COMMANDS = {
     "ns-bake": [],
     "ns-bench": ["kernels"],
+    "ns-blocks": [],
     "ns-compare": [],
     "ns-download-data": ["blender"],
+    "ns-edit": [],
     "ns-eval": [],
     "ns-export": ["pointcloud"],
     "ns-measure": [],

@@ -258,6 +258,7 @@ def test_many_scenes_repeat_with_the_seed(tmp_path: Path) -> None:
         ({"num_scenes": 0}, "--num-scenes must be at least 1"),
         ({"num_scenes": 2, "views_per_scene": 3}, "--views-per-scene at least 4"),
         ({"num_scenes": 2, "moving": True}, "leave out --num-scenes or --moving"),
+        ({"scene_seed": -1}, "--scene-seed is -1; it must be at least 0"),
     ],
 )
 def test_scenes_that_cannot_be_made_are_refused(settings: dict[str, int], said: str) -> None:

@@ -1,6 +1,10 @@
 """Points at pixels, the cameras that see them, and lengths, in scenes that are known exactly."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -8,9 +12,12 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.scale import Scale
 from nerfloom.cameras.triangulation import point_covariance, projection_jacobians, reading_error
 from nerfloom.cameras.view import View
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.scene import Scene
 from nerfloom.evaluation.measuring import (
     PIXEL_ERROR,
@@ -29,6 +36,7 @@ from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS
 from nerfloom.testing.ball import RADIUS, cameras_at
+from nerfloom.training.loaded import Loaded
 
 SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 10.0, 4, True, False, 32, image_pixels=32 * 32)
 
@@ -62,6 +70,18 @@ class Surface(Ball):
         return 1.5 * (length**2 - RADIUS**2), 3 * points.positions
 
 
+class Refined(Ball):
+    """The same, with refined poses of its training cameras; other cameras are where they are."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.poses = PoseRefinement(count)
+        torch.nn.init.constant_(self.poses.tangents, 0.05)
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        return super().render(self.poses(rays), background)
+
+
 def around(count: int = 40) -> Cameras:
     """Cameras at random places 3 from the origin."""
     generator = torch.Generator().manual_seed(0)
@@ -89,6 +109,28 @@ def test_a_depth_far_from_the_level_set_is_kept() -> None:
 def test_a_pixel_beside_the_ball_has_no_point() -> None:
     with pytest.raises(ConfigError, match="no surface at column 1"):
         surface_point(Ball(), View.of(around(), 3), 1, 1)
+
+
+@pytest.mark.parametrize(("column", "row"), [(-0.6, 50.0), (50.0, 99.6), (math.nan, 50.0)])
+def test_a_pixel_outside_of_the_image_has_no_point(column: float, row: float) -> None:
+    with pytest.raises(ConfigError, match="100 x 100 pixels"):
+        surface_point(Ball(), View.of(around(), 3), column, row)
+
+
+def test_a_pixel_without_a_ray_has_no_point() -> None:
+    """The distorted radius r - r^3 is at most 0.38, and 0.5 at this pixel."""
+    cameras = around()
+    lens = torch.tensor([[-1.0, 0, 0, 0, 0, 0, 0, 0, 0]]).expand(len(cameras), -1)
+    with pytest.raises(ConfigError, match="opencv lens has no ray at column 1"):
+        surface_point(Ball(), View.of(replace(cameras, model="opencv", lens=lens), 3), 1, 1)
+
+
+def test_the_camera_of_a_picture_is_no_training_camera() -> None:
+    cameras = around()
+    model = Refined(len(cameras))
+    point = surface_point(model, View.of(cameras, 3), 30.2, 61.7)
+    assert float(point.norm()) == pytest.approx(RADIUS, abs=1e-6)
+    assert torch.equal(seeing_cameras(model, cameras, point), seeing_cameras(Ball(), cameras, point))
 
 
 def test_the_cameras_that_see_a_point() -> None:
@@ -131,7 +173,15 @@ def test_errors_that_are_not_known() -> None:
     cameras, ends = around(), (torch.tensor([RADIUS, 0, 0]), torch.tensor([0, RADIUS, 0]))
     for given in (None, cameras[:1], cameras[:0]):
         assert measured(Ball(), given, ends, 1.0, Scale()).error is None
-    assert bool(located(Ball(), cameras[:0], ends[0]).isinf().any())
+    for few in (cameras[:0], cameras[:1]):
+        assert bool(located(Ball(), few, ends[0]).isinf().all())
+    unknown = scale_of(measured(Ball(), None, ends, 1.0, Scale()), Scale(), 2.0, "m")
+    assert unknown.relative_error is None
+    assert "unknown error" in unknown.words()
+    seen = tuple(RADIUS * torch.nn.functional.normalize(torch.tensor(each).double(), dim=0)
+                 for each in ([1.0, 0.4, -0.2], [0.8, -0.3, 0.4]))  # fmt: skip
+    assert measured(Ball(), cameras, (seen[0], seen[1]), 1.0, Scale()).error is not None
+    assert measured(Ball(), cameras, (seen[0], seen[1]), 1.0, unknown).error is None
     with pytest.raises(ConfigError, match="same"):
         measured(Ball(), cameras, (ends[0], ends[0]), 1.0, Scale())
 
@@ -146,6 +196,42 @@ def test_a_gaussian_is_picked_at_its_centre() -> None:
     point = surface_point(model, View.of(cameras, 5), float(column), float(row))
     torch.testing.assert_close(point.float(), centre[0], atol=1e-4, rtol=0)
     assert len(seeing_cameras(model, cameras, point)) == len(cameras)  # nothing hides it
+
+
+def loaded(source: Any = None, **facts: Any) -> Loaded:
+    """The ball, in a scene with other facts."""
+    model = Ball()
+    model.scene = replace(SCENE, **facts)
+    return Loaded(model, Placement.of(None, 1.0), "ball", Path("run"), Path("run/step"), source=source)
+
+
+@pytest.mark.parametrize(("facts", "words"), [({"warped": True}, "--ndc"), ({"num_scenes": 2}, "2 scenes")])
+def test_runs_without_lengths(facts: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        loaded(**facts).pick(View.of(around(), 3), 49.5, 49.5)
+    with pytest.raises(ConfigError, match=words):
+        loaded(**facts).measure([0, 0, 0], [1, 0, 0])
+
+
+def test_a_point_is_picked_in_the_picture_of_one_camera() -> None:
+    cameras = around()
+    one = loaded().pick(cameras[3:4], 49.5, 49.5)
+    torch.testing.assert_close(one, loaded().pick(View.of(cameras, 3), 49.5, 49.5))
+    with pytest.raises(ValueError, match="choose one"):
+        loaded().pick(cameras, 49.5, 49.5)
+
+
+def test_half_a_pixel_is_one_of_the_images_that_were_learnt_from() -> None:
+    """Of images at half the size it is twice as long."""
+    ends = [RADIUS * torch.nn.functional.normalize(torch.tensor(each).double(), dim=0)
+            for each in ([1.0, 0.4, -0.2], [0.8, -0.3, 0.4])]  # fmt: skip
+    errors = []
+    for factor in (1, 2):
+        parsed = ParsedScene((), around(), SCENE.box, SCENE.near, SCENE.far, downscale_factor=factor)
+        found = loaded(SimpleNamespace(parse={"train": parsed}.get)).measure(*ends)
+        assert found.error is not None
+        errors.append(found.error)
+    assert errors[1] == pytest.approx(2 * errors[0], rel=1e-5)
 
 
 @pytest.mark.parametrize(

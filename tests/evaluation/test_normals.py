@@ -32,6 +32,14 @@ def test_angles_in_closed_form() -> None:
     assert mean_angle(torch.zeros(4, 3), truth, torch.ones(4)) == pytest.approx(90)
 
 
+def test_what_is_not_finite_is_not_hidden() -> None:
+    truth, broken = torch.tensor([[0.0, 0, 1]]).expand(2, 3), torch.tensor([1.0, torch.nan])
+    for found, weights in ((truth, broken), (truth * broken[:, None], torch.ones(2))):
+        angle = mean_angle(found, truth, weights)
+        assert angle is not None
+        assert math.isnan(angle)
+
+
 @pytest.fixture
 def ball(tmp_path: Path) -> Dataset:
     """Images of a ball whose colours are (normal + 1) / 2, and the same images as their normals."""

@@ -2,14 +2,16 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 import nerfloom
 from nerfloom.base.errors import ConfigError
+from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
 from nerfloom.export.bake import Baking, bake
 from nerfloom.export.octree_cells import MatterSearch
@@ -17,6 +19,9 @@ from nerfloom.export.octree_colors import fitted
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.octrees.files import read_octree
+from nerfloom.octrees.grid import Grid
+from nerfloom.ray_model import RayModel
+from nerfloom.samplers.occupancy import OccupancySampler
 from tests.cli.helpers import TINY_NGP, called
 
 RADIUS, SIGMA = 0.4, 50.0
@@ -54,6 +59,44 @@ def test_the_box_fits_the_matter_and_cells_fill_it() -> None:
     assert volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
     torch.testing.assert_close(depths, torch.full_like(depths, SIGMA * grid.cell))
     assert float(grid.positions(cells + 0.5).norm(dim=-1).max()) < RADIUS
+
+
+class Skipping(nn.Module):
+    """A model with an occupancy grid, dense everywhere."""
+
+    scene = replace(Ball.scene, box=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    device = torch.device("cpu")
+
+    def __init__(self, grid: OccupancySampler) -> None:
+        super().__init__()
+        self.grid = grid
+
+    def density(self, points: Points) -> Tensor:
+        return torch.ones(len(points.positions))
+
+
+def test_octants_are_those_that_an_occupied_cell_overlaps() -> None:
+    """Cells of the occupancy grid are an octant's 16th along each axis."""
+    occupancy, cells = OccupancySampler(Skipping.scene.box, resolution=64), [(5, 6, 7), (20, 40, 61), (33, 17, 50)]
+    occupancy.occupied.zero_()
+    for x, y, z in cells:
+        occupancy.occupied[(x * 64 + y) * 64 + z] = True
+    low, high = Skipping.scene.box.double()
+    found = MatterSearch(Skipping(occupancy)).octants(Grid.of(low, high, 16))
+    assert found.tolist() == [[x // 16, y // 16, z // 16] for x, y, z in sorted(cells)]
+
+
+class FromImages(RayModel):
+    """A model that has no field without images."""
+
+    def show_images(self, dataset: Dataset) -> None:
+        raise NotImplementedError
+
+
+def test_a_model_that_renders_from_images_has_nothing_to_bake() -> None:
+    loaded = SimpleNamespace(model=FromImages.__new__(FromImages), method="pixel-nerf")
+    with pytest.raises(ConfigError, match="pixel-nerf cannot be baked: it renders from images"):
+        bake(loaded, Baking())
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -109,7 +152,9 @@ def replace_scene(model):
         (("--resolution", 8), "--resolution"),
         (("--degree", 4), "--degree"),
         (("--max-megabytes", 0), "--max-megabytes"),
+        (("--max-megabytes", "inf"), "--max-megabytes"),
         (("--fine-tune-seconds", -1), "--fine-tune-seconds"),
+        (("--fine-tune-seconds", "inf"), "--fine-tune-seconds"),
         (("--output-path", "x.ply"), ".octree"),
     ],
 )

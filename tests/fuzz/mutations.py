@@ -25,6 +25,7 @@ KINDS: dict[str, Sequence[Mutation]] = {
     "ply": (*TEXT, *RAW),
     "npy": ARRAY,
     "npz": ARCHIVE,
+    "sog": ARCHIVE,
     "png": PICTURE,
     "jpg": PICTURE,
 }

@@ -16,7 +16,9 @@ import numpy as np
 import torch
 
 from nerfloom import DataParser, Dataset
-from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.base.plain import from_plain, read_yaml
+from nerfloom.blocks.block import TrainedBlock
+from nerfloom.blocks.files import BlockList, read_blocks, write_blocks
 from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale, write_scale
@@ -38,6 +40,9 @@ from nerfloom.dataparsers.polycam import Polycam
 from nerfloom.dataparsers.record3d import Record3D
 from nerfloom.dataparsers.sdfstudio import SdfStudio
 from nerfloom.downloads import unpack as downloads
+from nerfloom.edit.recipe import STEPS, step_of
+from nerfloom.edit.recipe import read_recipe as read_steps
+from nerfloom.edit.recipe import write_recipe as write_steps
 from nerfloom.evaluation.lpips import SHAPES, read_weights
 from nerfloom.evaluation.surface_files import read_mesh
 from nerfloom.evaluation.surface_files import read_points as read_surface_points
@@ -45,12 +50,13 @@ from nerfloom.evaluation.surfaces import drawn
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.regions import read_region
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import polycam, record3d
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
-from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
+from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import MAX_BLUR, MIN_BLUR, Look
 from nerfloom.training.checkpoint import FOLDER, load_checkpoint, load_newest
@@ -72,7 +78,7 @@ from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
 from tests.octrees.balls import ball
-from tests.splats.foreign_files import write_compressed, write_splat
+from tests.splats.foreign_files import write_compressed, write_ksplat, write_splat
 from tests.training.helpers import tiny_run
 
 MEMORY = 20e6
@@ -192,14 +198,19 @@ def write_splats(folder: Path) -> None:
     random = torch.Generator().manual_seed(0)
     shapes = ((6, 3), (6, 3), (6, 4), (6,), (6, 3), (6, 3, 8))
     gaussians = Gaussians(*(torch.randn(shape, generator=random) for shape in shapes))
-    for suffix in SUFFIXES:
-        write_gaussians(folder / f"splat{suffix}", gaussians, look=Look(True, 0.1))
+    (folder / "sog").mkdir()
+    for name in ("splat.ply", "splat.spz", "splat.sog", "sog/meta.json"):
+        write_gaussians(folder / name, gaussians, look=Look(True, 0.1))
+    write_gaussians(folder / "splat3.spz", gaussians, look=Look(True, 0.1), spz_version=3)
+    write_gaussians(folder / "splat4.spz", gaussians, look=Look(True, 0.1), spz_version=4)
     write_splat(folder / "splat.splat", gaussians)
     write_compressed(folder / "splat.compressed.ply", gaussians)
+    for level in range(3):
+        write_ksplat(folder / f"splat{level}.ksplat", gaussians, level)
 
 
 def read_splats(folder: Path, scratch: Path) -> None:
-    for file in sorted(folder.glob("splat*")):
+    for file in [*sorted(folder.glob("splat*")), folder / "sog" / "meta.json"]:
         gaussians, look = read_gaussians(file)
         require(MIN_BLUR <= look.blur <= MAX_BLUR, "Gaussians that are drawn as none can be")
         require(len(gaussians), "no Gaussians")
@@ -355,6 +366,23 @@ def read_recipe(folder: Path, scratch: Path) -> None:
     require(plan.contenders and plan.conditions.budget(), "a comparison of nothing")
 
 
+def write_two_blocks(folder: Path) -> None:
+    runs = [folder / "runs" / str(number) for number in (0, 1)]
+    for run in runs:
+        run.mkdir(parents=True)
+        (run / "config.yml").write_text("method: instant-ngp\n")
+    blocks = [TrainedBlock((0.5, 1.0, 2.0), 3.0 + number, (0, 1, 2), run) for number, run in enumerate(runs)]
+    write_blocks(folder / "blocks.yml", BlockList(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 0.05, 1e3, tuple(blocks)))
+
+
+def read_scene_in_blocks(folder: Path, scratch: Path) -> None:
+    found = read_blocks(folder / "blocks.yml")
+    require(0 <= found.near < found.far and found.blocks, "a scene of nothing")
+    for block in found.blocks:
+        require(block.radius > 0 and all(map(math.isfinite, block.center)), "a block without a place")
+        require(all(len(row) == 4 and all(map(math.isfinite, row)) for row in block.color), "colours of nothing")
+
+
 def read_checkpoints(folder: Path, scratch: Path) -> None:
     content = load_newest(folder / "run" / FOLDER)
     require(content is None or "model" in content, "a checkpoint without a model")
@@ -450,7 +478,26 @@ def read_lpips(folder: Path, scratch: Path) -> None:
 
 def read_run_scale(folder: Path, scratch: Path) -> None:
     scale = read_scale(folder)
-    require(0 < scale.factor < math.inf and 0 <= scale.relative_error < math.inf, "a scale that is no number")
+    require(0 < scale.factor < math.inf and 0 <= (scale.relative_error or 0) < math.inf, "a scale that is no number")
+
+
+def write_edits(folder: Path) -> None:
+    """A recipe of ns-edit with settings of every type, and a region."""
+    steps = [
+        step_of("crop_box", {"low": [-1, -1, 0], "high": [1, 1.5, 2], "keep": False}, "here"),
+        step_of("crop_polygon", {"image": "a.png", "corners": [[0, 0], [3, 0], [0, 3]]}, "here"),
+        step_of("scale", {"factor": 0.5, "unit": "m"}, "here"),
+        step_of("align_floor", {"tolerance": None, "seed": 3}, "here"),
+        step_of("merge", {"files": ["a.ply"]}, "here"),
+    ]
+    write_steps(folder / "edit.yml", steps)
+    (folder / "region.yml").write_text("sphere: {center: [0, 0, 1], radius: 2.5}\n", encoding="utf-8")
+
+
+def read_edits(folder: Path, scratch: Path) -> None:
+    for step in read_steps(folder / "edit.yml"):
+        require(step.name in STEPS, "a step that does not exist")
+    require(read_region(folder / "region.yml").contains(torch.zeros(1, 3)).shape == (1,), "another shape")
 
 
 READERS: dict[str, Reader] = {
@@ -468,7 +515,12 @@ READERS: dict[str, Reader] = {
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
     "surfaces": Reader(write_surfaces, read_surfaces, ("mesh.*",)),
-    "splats": Reader(write_splats, read_splats, ("splat.*",)),
+    "splats": Reader(
+        write_splats,
+        read_splats,
+        ("splat*", "sog/*"),
+        ("version", "count", "mins", "codebook", "files", "bands", "model"),
+    ),
     "octree": Reader(write_octrees, read_octrees, ("*.octree",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
     "scale": Reader(
@@ -487,6 +539,10 @@ READERS: dict[str, Reader] = {
     ),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
+    "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius")),
+    "blocks": Reader(
+        write_two_blocks, read_scene_in_blocks, ("blocks.yml",), ("version", "box", "run", "center", "cameras", "color")
+    ),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),

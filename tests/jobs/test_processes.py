@@ -1,10 +1,13 @@
 """Jobs as processes of this machine: order, failures, interruptions, and what is kept."""
 
 import errno
+import json
 import os
+import shlex
 import signal
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -126,6 +129,24 @@ def test_what_ends_the_launcher_lets_the_job_save_and_the_same_call_goes_on(
     assert Processes().run([job(tmp_path, "first"), long_job(tmp_path, "second")]) == {}
     assert files(tmp_path) == {"first.txt": "first", "second.txt": "second"}
     assert (tmp_path / "first.txt").stat().st_mtime_ns == kept
+
+
+def test_a_process_that_ends_before_it_knows_its_job_fails_that_job_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = tmp_path / "gone"
+    ends = ["sh", "-c", f"exec <&-; : > {shlex.quote(str(gone))}; exit 3"]
+    monkeypatch.setattr("nerfloom.jobs.execution.python_command", lambda *_: ends)
+    late = SimpleNamespace(dumps=lambda job: json.dumps(job) if until(gone.exists) else "")
+    monkeypatch.setattr("nerfloom.jobs.execution.json", late)
+    failures = Processes().run([job(tmp_path, "first"), job(tmp_path, "second")])
+    assert [failure.reason for failure in failures.values()] == ["exit status 3", "exit status 3"]
+
+
+def test_a_step_has_its_commands(tmp_path: Path) -> None:
+    for step in ({"command": ()}, {"command": ("a",), "started": tmp_path}, {"command": ("a",), "resume": ("b",)}):
+        with pytest.raises(ValueError, match="command"):
+            Step(**step)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no /dev/full")

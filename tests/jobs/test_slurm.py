@@ -3,6 +3,7 @@
 import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,35 @@ def test_a_task_goes_on_where_an_earlier_one_was_stopped(tmp_path: Path) -> None
     Slurm(tmp_path).run([job(tmp_path, "half", Step(first, begun, again))])
     assert [run_task(tmp_path / "jobs.sh", 0) for _ in range(2)] == [1, 0]
     assert files(tmp_path) == {"half.txt": "resumed"}
+
+
+def test_a_task_that_cannot_begin_says_so_in_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slurm's own output goes nowhere."""
+    gone, here = tmp_path / "gone", tmp_path / "here"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    Slurm(here).run([job(here, "a")])
+    monkeypatch.chdir(tmp_path)
+    gone.rmdir()
+    assert run_task(here / "jobs.sh", 0) == 1
+    assert str(gone) in (here / "logs" / "a.log").read_text()
+    gone.mkdir()
+    (here / "logs" / "a.log").unlink()
+    (here / "logs" / "a.log").mkdir()
+    assert run_task(here / "jobs.sh", 0) == 1  # without a log, nothing runs
+    assert files(here) == {}
+    (here / "logs" / "a.log").rmdir()
+    assert run_task(here / "jobs.sh", 0) == 0
+    assert files(here) == {"a.txt": "a"}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are Unicode there")
+def test_names_need_not_be_unicode(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
+    Slurm(folder).run([job(folder, "a")])
+    assert run_task(folder / "jobs.sh", 0) == 0
+    assert files(folder) == {"a.txt": "a"}
 
 
 def test_the_script_asks_for_what_the_jobs_need(tmp_path: Path) -> None:

@@ -56,7 +56,13 @@ def test_a_missing_library_is_said_once_and_torch_goes_on(tmp_path: Path, forks:
     done = forks.run(code, NERFLOOM_KERNELS="auto")
     assert done.returncode == 0
     said = done.stdout + done.stderr
-    assert said.count("without its compiled kernels") == 1
+    assert said.count("without its compiled kernels (they were not built)") == 1
+    assert "[[3.0], [3.0]]" in said
+    (tmp_path / f"avx2{native.SUFFIX}").touch()
+    (tmp_path / f"amx_bf16{native.SUFFIX}").touch()
+    done = forks.run(code.replace("native.FOLDER", "native.cpu_features = set\nnative.FOLDER"), NERFLOOM_KERNELS="auto")
+    said = done.stdout + done.stderr
+    assert "(they were built for another processor: amx_bf16, avx2)" in said
     assert "[[3.0], [3.0]]" in said
     broken = forks.run(code, NERFLOOM_KERNELS="avx2")
     assert broken.returncode == 1
@@ -76,7 +82,7 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
     if not native.cpu_features().issuperset(native.NEEDS[variant]):
         pytest.skip(f"this processor has no {variant}")
     if not (native.FOLDER / f"{variant}{native.SUFFIX}").is_file():
-        pytest.skip(f"{variant} was not built: NERFLOOM_VARIANTS=native builds the best one alone")
+        pytest.skip(f"{variant} was not built; NERFLOOM_VARIANTS=all builds every one")
     code = (
         "import torch\n"
         "from nerfloom.kernels import native\n"
@@ -158,9 +164,9 @@ def test_setup_builds_every_variant_or_the_one_that_this_processor_takes(monkeyp
     def built() -> list[str]:
         return [extension.name.rsplit(".", 1)[-1] for extension in extensions()]
 
-    monkeypatch.delenv("NERFLOOM_VARIANTS", raising=False)
+    monkeypatch.setenv("NERFLOOM_VARIANTS", "all")
     there = set(native.NEEDS) if platform.system() == "Linux" else set(native.NEEDS) - {"amx_bf16"}
     assert set(built()) == (there if platform.machine() in ("x86_64", "AMD64") else {"baseline"})
-    monkeypatch.setenv("NERFLOOM_VARIANTS", "native")
+    monkeypatch.delenv("NERFLOOM_VARIANTS")
     here = [name for name, needs in native.NEEDS.items() if cpu_features().issuperset(needs)]
     assert built() == here[::-1] or platform.system() != "Linux"  # the last that compiles is built

@@ -118,8 +118,9 @@ def test_the_reference_is_the_integral_over_every_leaf(degree: int) -> None:
     same(pick(found), pick(truth), 1e-6)
 
 
-def test_leaves_and_their_cells() -> None:
+def test_leaves_and_their_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
+    monkeypatch.setattr("nerfloom.kernels.octree.layout.BRICKS_AT_ONCE", 5)
     cells = scattered(0.2)
     cells = cells[torch.randperm(len(cells))]
     layout, rows = OctreeLayout.build(ORIGIN, CELL, SIZE, torch.cat([cells, cells[:50]]))
@@ -329,6 +330,28 @@ def test_extremes(trace) -> None:
     assert not light.opacity[200:204].any()
     light.color[usable].sum().backward()
     assert raw.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("trace", [trace_octree, trace_octree_reference])
+def test_rays_from_where_float32_does_not_tell_cells_apart(trace) -> None:
+    """Such a ray could walk in circles; it meets nothing."""
+    layout = layout_of(torch.tensor([[5, 6, 7]]))
+    direction = torch.tensor([0.0, 0.0, 1.0])
+    distances = CELL * torch.tensor([10.0, 2.0**19, 2.0**21, 1e8])
+    origins = layout.centers()[0] - distances[:, None] * direction
+    rays = Rays(origins, direction.expand(4, 3))
+    light = trace(layout, torch.tensor([[1e4]]), torch.zeros(1, 3), rays, torch.zeros(3))
+    assert light.opacity.tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("trace", [trace_octree, trace_octree_reference])
+def test_nan_is_shown_by_the_rays_that_meet_it_alone(trace) -> None:
+    layout = layout_of(torch.tensor([[1, 2, 3], [9, 9, 9]]))
+    origins = layout.centers() - torch.tensor([0.0, 0.0, 3.0])
+    rays = Rays(origins, torch.tensor([[0.0, 0, 1]]).repeat(2, 1))
+    light = trace(layout, torch.tensor([[math.nan], [1.0]]), torch.ones(2, 3), rays, torch.zeros(2, 3))
+    assert light.color.isnan().any(-1).tolist() == [True, False]
+    assert light.opacity.isnan().tolist() == [True, False]
 
 
 @pytest.mark.parametrize("trace", [trace_octree, trace_octree_reference])

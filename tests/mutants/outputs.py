@@ -25,6 +25,21 @@ MUTANTS = {
             "ns-render time shows the first moment all along",
             "cli/test_render_command.py::test_one_camera_while_time_runs"),
     ],
+    "nerfloom.blocks.blend": [
+        Mutant("blocks-end-suddenly", "near_shares", "1 / A - 1 / B", "1 / A",
+            "a block appears and leaves suddenly where a flight passes its radius",
+            "blocks/test_blend.py::test_shares_in_closed_form"),
+    ],
+    "nerfloom.blocks.composed": [
+        Mutant("depth-in-units-of-a-block", "Blocks.picture_of", "A / scale, B / scale", "A, B",
+            "depths of composed pictures are in the units of whichever block they are from",
+            "blocks/test_composed.py::test_two_blocks_of_one_colour_each_are_blended_exactly"),
+    ],
+    "nerfloom.blocks.merge": [
+        Mutant("doubled-borders", "merged", "part[in_cell(A, B, C)]", "part",
+            "what two blocks have learned is drawn twice",
+            "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
+    ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
             "exports stay in the unit of the input after a true length was given",
@@ -34,6 +49,21 @@ MUTANTS = {
         Mutant("pixel-error-not-squared", "point_covariance", "A / pixel_error ** 2", "A / pixel_error",
             "errors of lengths are too large by the root of two",
             "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
+    ],
+    "nerfloom.edit.drop": [
+        Mutant("floaters-however-opaque", "drop_floaters", "A & (seen.opacity_in_front <= max_opacity)", "A",
+            "what is seen before other things is dropped, even if it is opaque",
+            "edit/test_drop.py::test_floaters_of_a_capture_are_dropped"),
+    ],
+    "nerfloom.edit.edited": [
+        Mutant("edited-out-of-the-photographs", "Edited.moved", "self.placement.after(A, B)", "self.placement",
+            "after a move, photographs show other Gaussians in a polygon than those that it was drawn around",
+            "edit/test_place.py::test_what_has_been_moved_stays_where_it_was_in_the_scene"),
+    ],
+    "nerfloom.edit.floor": [
+        Mutant("wall-as-floor", "_best", "A & (normals @ up >= min_cosine)", "A",
+            "a wall that is larger than the floor is taken for it",
+            "edit/test_place.py::test_a_tilted_floor_becomes_the_plane_z_is_0"),
     ],
     "nerfloom.evaluation.appearance": [
         Mutant("appearance-of-judged-half", "_left_pixels", "A.view(-1, B)[:, :C]", "A.view(-1, B)[:, C:]",
@@ -81,6 +111,11 @@ MUTANTS = {
             "LPIPS by a file of weights is of images in another range than everyone's",
             "evaluation/test_lpips.py::test_lpips_is_the_papers"),
     ],
+    "nerfloom.evaluation.measuring": [
+        Mutant("picked-by-a-training-camera", "_first_surfaces", "replace(A, camera_indices=None)", "A",
+            "with refined poses, points at pixels are moved as the first training camera was",
+            "evaluation/test_measuring.py::test_the_camera_of_a_picture_is_no_training_camera"),
+    ],
     "nerfloom.evaluation.metrics": [
         Mutant("masked-windows-of-finest-scale", "windows_of_scales", "A == 1", "A > 0",
             "coarse pixels that are partly of ignored ones count as perfect in SSIM at five scales",
@@ -123,6 +158,11 @@ MUTANTS = {
         Mutant("mesh-of-skipped-cells", "LatticeDensity.kept", "inside & A", "inside | A",
             "meshes show density where the renderer never looks",
             "export/test_density.py::test_cells_that_the_renderer_skips_are_empty_and_not_evaluated"),
+    ],
+    "nerfloom.export.octree_cells": [
+        Mutant("octants-by-their-corners", "MatterSearch._in_occupied", "max(math.ceil(A), 2)", "2",
+            "an octree of few cells has holes where the occupancy grid has finer ones",
+            "export/test_bake.py::test_octants_are_those_that_an_occupied_cell_overlaps"),
     ],
     "nerfloom.export.octree_colors": [
         Mutant("octree-colours-unweighted", "fitted", "weights / A", "torch.ones_like(weights) / weights.shape[-1]",
@@ -229,6 +269,9 @@ MUTANTS = {
         Mutant("depth-in-scene-units", "Loaded.unit", "1 / self.placement.scale", "1.0",
             "depth files of a capture are in units of the scene, not of the input",
             "cli/test_render_outputs.py::test_depth_is_in_units_of_the_input"),
+        Mutant("error-of-stored-photographs", "Loaded._photographs", "A.scaled(B)", "A",
+            "after training on reduced images, errors of lengths are too small by that factor",
+            "evaluation/test_measuring.py::test_half_a_pixel_is_one_of_the_images_that_were_learnt_from"),
     ],
     "nerfloom.model": [
         Mutant("background-of-photographs", "Model.background",

@@ -1,6 +1,8 @@
 """An octree is looked at, judged and exported like a run."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -13,8 +15,11 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.error_bound import limited_error
 from nerfloom.geometry.points import Points
+from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import write_octree
+from nerfloom.octrees.packing import packed
+from nerfloom.registry import load_dataparser
 from tests.cli.helpers import called
 from tests.octrees.balls import CELL, RADIUS, ball
 
@@ -54,6 +59,13 @@ def test_density_is_that_of_the_leaf() -> None:
     torch.testing.assert_close(found, torch.tensor([2 / CELL, 2 / CELL, 0, 0, 0]), rtol=1e-4, atol=0)
 
 
+def test_an_octree_without_leaves_has_no_density() -> None:
+    layout, _ = OctreeLayout.build(torch.zeros(3), CELL, (1, 1, 1), torch.zeros(0, 3, dtype=torch.int64))
+    octree = replace(ball(), layout=layout, leaves=packed(torch.zeros(0), torch.zeros(0, 3))[0])
+    found = DrawnOctree(octree, octree.scene).density(Points(torch.tensor([[0.1, 0.1, 0.1], [9.0, 0, 0]])))
+    assert torch.equal(found, torch.zeros(2))
+
+
 def test_an_error_bound_is_kept() -> None:
     octree = ball(depth=0.4)
     model = DrawnOctree(octree, octree.scene)
@@ -76,6 +88,8 @@ def test_it_is_opened_like_a_run(file: Path) -> None:
     assert float(loaded.render(front()).accumulation.max()) > 0.99
     with pytest.raises(ConfigError, match="photographs are unknown"):
         loaded.evaluate()
+    with pytest.raises(ConfigError, match="bake that again"):
+        loaded.keep_scale()
 
 
 @pytest.mark.medium
@@ -88,6 +102,18 @@ def test_commands_open_it(file: Path) -> None:
     assert frames.min() < 60
     done = called("ns-render", "orbit", file, "--up=z", "--output-path", file.parent)
     assert "an octree knows which way is up" in done.stderr
+
+
+@pytest.mark.medium
+def test_normalised_device_coordinates_are_refused(
+    tmp_path: Path, shared_tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placement = load_dataparser("blender")().parse(shared_tiny, "train").placement
+    write_octree(tmp_path / "x.octree", replace(ball(), placement=placement))
+    warped = SimpleNamespace(scene=replace(ball().scene, warped=True))
+    monkeypatch.setattr("nerfloom.training.file_data.load_dataset", lambda *_: warped)
+    with pytest.raises(ConfigError, match="--ndc"):
+        nerfloom.load(tmp_path / "x.octree", data=shared_tiny)
 
 
 @pytest.mark.medium

@@ -81,12 +81,15 @@ def test_damaged_and_hostile_files(tmp_path: Path) -> None:
     refused("'cell'", cell=np.nan)
     refused("'cell'", cell=-1.0)
     refused("size", size=np.array([0, 4, 4]))
-    refused("too large", size=np.array([2**20, 2**20, 4]))
+    refused("too large", size=np.array([2**15, 2**15, 4]))
+    refused("'size'", size=np.array([2**17, 1, 1]))  # places have 16 bits
+    refused(f"its masks have {64 * good['masks'].size:,} leaves", masks=np.full_like(good["masks"], 2**64 - 1))
     refused("outside", places=good["places"] + np.uint16(60_000))
     refused("order", places=good["places"][::-1].copy(), masks=good["masks"][::-1].copy())
     refused("order", places=np.repeat(good["places"][:1], len(good["places"]), 0))
     refused("ends before", near=11.0)
     refused("rigid", transform=np.zeros((3, 4)))
+    refused("rigid", transform=np.diag([2.0, 0.5, 1.0, 0.0])[:3])  # its determinant is 1
     refused("'image_size'", image_size=0)
     refused("pickled", codes=np.array([{}] * count, object))
     file.write_bytes(b"PK\3\4 nothing")

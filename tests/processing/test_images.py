@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
+from nerfloom.base import extras
 from nerfloom.base.errors import DataError
+from nerfloom.data.image_files import image_size, read_image
 from nerfloom.processing.images import output_names, prepare, prepare_all
 from nerfloom.processing.listing import find_images
 
@@ -50,6 +52,35 @@ def test_avif_is_read(tmp_path: Path) -> None:
     assert find_images(tmp_path / "in") == [Path("a.avif")]
     (found,), unreadable = prepare_all(tmp_path / "in", [Path("a.avif")], tmp_path / "out")
     assert (found.name, found.width, found.height, unreadable) == ("a.png", 16, 12, [])
+
+
+@pytest.mark.parametrize("size", [(48, 32), (32, 48)])
+def test_heic_is_read_with_its_package(tmp_path: Path, size: tuple[int, int]) -> None:
+    """Photographs of phones are read as images of a data set, and prepared for a reconstruction."""
+    pillow_heif = pytest.importorskip("pillow_heif", reason="pillow-heif is not installed: pip install pillow-heif")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out").mkdir()
+    columns, rows = np.meshgrid(*(np.linspace(0, 255, count) for count in size))
+    pixels = np.stack([columns, rows, 0.5 * columns], -1).round().astype(np.uint8)
+    path = tmp_path / "in" / "a.HEIC"
+    pillow_heif.from_pillow(Image.fromarray(pixels)).save(path, quality=100, chroma=444)
+    assert image_size([path]) == size
+    read = read_image(path)
+    assert read.shape == (size[1], size[0], 4)
+    assert (read[..., 3] == 255).all()
+    assert np.abs(read[..., :3].astype(int) - pixels).max() <= 4
+    (found,), unreadable = prepare_all(tmp_path / "in", [Path("a.HEIC")], tmp_path / "out")
+    assert (found.width, found.height, unreadable) == (*size, [])
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError, match=r"a\.HEIC is not a readable image: (?!HEIC needs)"):
+        read_image(path)
+
+
+def test_heic_without_its_package_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(64))
+    with pytest.raises(DataError, match="HEIC needs another package: pip install pillow-heif"):
+        read_image(tmp_path / "a.heic")
 
 
 def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:

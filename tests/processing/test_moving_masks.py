@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.cli import process_data
 from nerfloom.cli.process_data import ImagesFlags
 from nerfloom.data.dataset import load_dataset
 from nerfloom.processing.moving_masks import mask_moving
@@ -52,6 +53,29 @@ def test_what_moves_is_masked_in_files_that_the_format_reads(tmp_path: Path) -> 
     assert len(shares) == len(dataset)
     assert 0 < max(shares) < 0.8
     assert (tmp_path / "data" / "masks_2" / "00.png.png").is_file()
+
+
+def test_a_run_that_was_stopped_before_its_masks_goes_on_with_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Poses are finished then, so nothing else is done again; without --mask-moving nothing is done."""
+    made = list[Any]()
+    monkeypatch.setattr("nerfloom.processing.colmap.require", lambda: None)
+    monkeypatch.setattr(
+        "nerfloom.processing.moving_masks.mask_moving", lambda *given, **settings: made.append((*given, settings))
+    )
+    finished = tmp_path / "out" / "transforms.json"
+    finished.parent.mkdir()
+    finished.write_text(json.dumps({"frames": [{"file_path": "images/a.png"}]}))
+    flags = ImagesFlags(data=tmp_path, output_dir=tmp_path / "out", resume=True, mask_seconds=7, num_downscales=2)
+    with_masks = dataclasses.replace(flags, mask_moving=True)
+    process_data._process_images(flags)
+    assert made == []
+    process_data._process_images(with_masks)
+    assert made == [(tmp_path / "out", 2, {"max_seconds": 7})]
+    finished.write_text(json.dumps({"frames": [{"file_path": "images/a.png", "mask_path": "masks/a.png.png"}]}))
+    process_data._process_images(with_masks)
+    assert len(made) == 1
 
 
 def test_flags_that_exclude_each_other(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def build(folder: Path) -> tuple[Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     for old in [*folder.glob("*.whl"), *folder.glob("*.tar.gz")]:
         old.unlink()
-    run([sys.executable, "-m", "build", "--outdir", folder, ROOT], folder)
+    run([sys.executable, "-m", "build", "--outdir", folder, ROOT], folder, NERFLOOM_VARIANTS="all")
     (sdist,), (wheel,) = list(folder.glob("*.tar.gz")), list(folder.glob("*.whl"))
     return sdist, wheel
 

@@ -100,6 +100,7 @@ def test_pages_with_programs_are_executed() -> None:
         "plug-and-play",
         "guides/add-a-format",
         "guides/add-a-method",
+        "guides/edit",
         "guides/judge-geometry",
         "guides/measure",
         "interfaces",

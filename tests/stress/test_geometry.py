@@ -139,9 +139,12 @@ def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.entry(15)
-def test_the_only_srgb_curve_has_no_gradient_and_a_value_at_black() -> None:
-    """Colours are as stored; numpy's curve looks at photographs alone. Another one needs a test of its slope at 0."""
-    assert mentioned(r"\*\* *2\.4\b") == ["light_spread.py"]
+def test_srgb_curves_have_no_gradient_and_a_value_at_black() -> None:
+    """Colours are as stored; numpy has curves for the light of photographs and for glTF files, without a gradient.
+
+    A curve that is learnt through needs a test of its slope at 0.
+    """
+    assert mentioned(r"\*\* *2\.4\b") == ["gltf.py", "light_spread.py"]
     black = light_of(np.zeros((16, 16, 3), np.uint8))
     assert black.tolist() == [[-9.0] * len(QUANTILES), [0.0] * len(QUANTILES), [0.0] * len(QUANTILES)]
 

@@ -22,7 +22,7 @@ from tests.training.helpers import TINY, tiny_run, tiny_trainer
 BALL = ball_views()
 BUDGET = Budget(steps=75, seconds=None)
 SICK = " ".join(["sick", *TINY_NGP])
-WITHOUT_ALPHA = {"gaussian-splatting": {"start": "auto"}}
+WITHOUT_ALPHA = {"gaussian-splatting": {"start": "auto"}, "moving-gaussians": {"start": "auto"}}
 """Settings of tiny runs that suit images without alpha too, as those of some conditions."""
 
 

@@ -31,7 +31,7 @@ from tests.conftest import TICK
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
 KINDS = list(TINY)
-RAY_KINDS = [kind for kind in TINY if kind != "gaussian-splatting"]
+RAY_KINDS = [kind for kind in TINY if kind not in ("gaussian-splatting", "moving-gaussians")]
 """Those that render rays, in chunks."""
 
 

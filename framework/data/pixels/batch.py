@@ -47,7 +47,8 @@ class PixelBatch:
     clear: Tensor | None = None
     """(R,) distance from the camera that the pixel's image shows to be empty; None if unknown."""
     weights: Tensor | None = None
-    """(R,) factors of the pixels' losses, with mean 1, if pixels were not drawn uniformly or differ in size."""
+    """(R,) factors of the pixels' losses, with mean 1, if pixels were not drawn uniformly or differ in size; 0 for
+    pixels that do not count."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -86,10 +87,10 @@ def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """One whole training image."""
+    """One whole training image, or one that a teacher has rendered."""
 
-    index: int
-    """Index of the training image."""
+    index: int | None
+    """Index of the training image; None for a view of a teacher."""
     view: View
     """Its camera."""
     rgb: Tensor

@@ -80,7 +80,8 @@ function covarianceAt(cameras, eye, point) {
 /** Return the length between two points of a page as text, such as 0.213 m ± 0.001 m. */
 function lengthText(facts, [start, end]) {
   const between = add(end.point, start.point, -1), length = Math.hypot(...between), name = facts.unit && ` ${facts.unit}`;
-  const parts = [start, end].map(({ point, eye }) => facts.photographed && length > 0 && covarianceAt(facts.cameras, eye, point));
+  const known = facts.photographed && facts.relative_error !== null && length > 0;
+  const parts = [start, end].map(({ point, eye }) => known && covarianceAt(facts.cameras, eye, point));
   if (!parts.every(Boolean)) return `${(facts.unit_length * length).toPrecision(4)}${name}`;
   const [xx, xy, xz, yy, yz, zz] = parts[0].map((value, k) => value + parts[1][k]), [x, y, z] = between.map((value) => value / length);
   const square = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z);

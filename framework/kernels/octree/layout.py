@@ -24,6 +24,8 @@ MAX_DISTANCE = 16
 """Maximum recorded distance to a brick, in bricks."""
 MAX_BRICKS = 2**24
 """Maximum number of bricks in the box, empty ones included."""
+BRICKS_AT_ONCE = 2**12
+"""Number of bricks whose cells are listed together; each takes some kilobytes meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +142,13 @@ def cells_of(places: Tensor, masks: Tensor) -> Tensor:
         places: (B, 3) int64 coordinates of bricks, in bricks.
         masks: (B, 8) int64 leaves of their octants, as in `OctreeLayout`.
     """
-    bits = torch.arange(64, device=masks.device)
-    brick, octant, bit = ((masks[:, :, None] >> bits) & 1).nonzero().unbind(-1)
-    octants = torch.stack([octant & 1, octant >> 1 & 1, octant >> 2], -1)
-    return BRICK * places[brick] + OCTANT * octants + torch.stack([bit & 3, bit >> 2 & 3, bit >> 4], -1)
+    bits, found = torch.arange(64, device=masks.device), []
+    for some, theirs in zip(places.split(BRICKS_AT_ONCE), masks.split(BRICKS_AT_ONCE), strict=True):
+        brick, octant, bit = ((theirs[:, :, None] >> bits) & 1).nonzero().unbind(-1)
+        octants = torch.stack([octant & 1, octant >> 1 & 1, octant >> 2], -1)
+        within = torch.stack([bit & 3, bit >> 2 & 3, bit >> 4], -1)
+        found.append(BRICK * some[brick] + OCTANT * octants + within)
+    return torch.cat(found)
 
 
 def _with_distances(bricks: Tensor) -> Tensor:

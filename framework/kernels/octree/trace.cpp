@@ -19,7 +19,7 @@ struct Raw {
     int values;
     float value(int32_t leaf) const { return raw[leaf]; }
     static Floats depth(Floats x) {
-        const Floats low = exponential(smaller(x, splat(1)) - 1.0f);
+        const Floats low = exponential(smaller(splat(1), x) - 1.0f);  // NaN stays NaN
         return x > 1.0f ? x : low;
     }
     const float* row(int32_t leaf) const { return colors + int64_t(leaf) * values; }

@@ -13,6 +13,7 @@
 namespace octree {
 
 constexpr int BRICK = 8, OCTANT = 4;  // cells along an edge
+constexpr float FARTHEST = 1 << 20;   // largest coordinate of an origin, in cells; see ../walk.py
 
 struct Layout {
     const float* origin;    // (3) corner of the first cell
@@ -100,7 +101,7 @@ private:
             const float inv = 1 / along, one = (0 - from) * inv, two = (float(last[a] + 1) - from) * inv;
             begin = std::max(begin, std::min(one, two)), end = std::min(end, std::max(one, two));
             p[a][lane] = from, d[a][lane] = along, inverse[a][lane] = inv;
-            if (!(std::fabs(from) < 1e9f && std::fabs(along) < 1e9f)) return false;  // also NaN
+            if (!(std::fabs(from) < FARTHEST && std::fabs(along) < 1e9f)) return false;  // also NaN
         }
         if (!(begin < end)) return false;
         for (int a = 0; a < 3; a++) {

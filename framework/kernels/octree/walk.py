@@ -9,6 +9,9 @@ from torch.nn import functional
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.octree.layout import BRICK, OCTANT, OctreeLayout
 
+FARTHEST = 2.0**20
+"""Maximum coordinate of a ray's origin, in cells; a ray from further away meets no leaf. From there an octree of 1024
+cells is as large as a pixel. Where float32 does not tell cells apart, a walk could go in circles."""
 SMALLEST = 1e-12
 """Minimum magnitude of a direction's coordinate, in cells per scene unit; smaller ones are replaced by it."""
 
@@ -30,7 +33,7 @@ def leaf_samples(layout: OctreeLayout, rays: Rays) -> tuple[Samples, Tensor]:
     sides = torch.stack([-place / along, (top - place) / along])
     t = torch.maximum(sides.amin(0).amax(-1), rays.nears.to(kind)).clamp(min=0)
     far = torch.minimum(sides.amax(0).amin(-1), rays.fars.to(kind))
-    usable = (place.isfinite() & along.isfinite()).all(-1) & (t < far)
+    usable = ((place.abs() < FARTHEST) & along.isfinite()).all(-1) & (t < far)
     cell = (place + t[:, None] * along).nan_to_num().clamp(min=0).minimum(top - 1.0).long()
     walking = usable.nonzero()[:, 0]
     found: list[tuple[Tensor, ...]] = []
@@ -47,7 +50,6 @@ def leaf_samples(layout: OctreeLayout, rays: Rays) -> tuple[Samples, Tensor]:
         cell[walking], t[walking] = here, reach
         inside = ((here >= 0) & (here < top)).all(-1)
         walking = walking[inside & (reach < far[walking])]
-        cell[walking] = cell[walking].clamp(min=0)
     return _in_order(found, count, place)
 
 

@@ -1,0 +1,80 @@
+"""Flags of the part of space that edits and exports keep."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerfloom.base.errors import ConfigError, FlagError, shown
+
+if TYPE_CHECKING:
+    from nerfloom.geometry.regions import Box, Region, Sphere
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionFlags:
+    """The part of space that is kept, in the frame and unit of exports. Of several, what is in all of them is kept."""
+
+    crop_box: str | None = None
+    """Keep what is in a box: X,Y,Z,X,Y,Z, its minimum and its maximum corner. Default: everything."""
+    crop_sphere: str | None = None
+    """Keep what is in a sphere: X,Y,Z,RADIUS."""
+    region: Path | None = None
+    """Keep what is in the box or sphere of a file, such as 'sphere: {center: [0, 0, 0], radius: 1}'."""
+
+    def box(self) -> Box | None:
+        """Return the box of --crop-box; None if it is not given.
+
+        Raises:
+            FlagError: if it is no box.
+        """
+        from nerfloom.geometry.regions import Box
+
+        if self.crop_box is None:
+            return None
+        x0, y0, z0, x1, y1, z1 = _numbers("--crop-box", self.crop_box, "X,Y,Z,X,Y,Z", 6)
+        try:
+            return Box((x0, y0, z0), (x1, y1, z1))
+        except ConfigError as error:
+            raise FlagError(f"--crop-box: {error}") from error
+
+    def sphere(self) -> Sphere | None:
+        """Return the sphere of --crop-sphere; None if it is not given.
+
+        Raises:
+            FlagError: if it is no sphere.
+        """
+        from nerfloom.geometry.regions import Sphere
+
+        if self.crop_sphere is None:
+            return None
+        x, y, z, radius = _numbers("--crop-sphere", self.crop_sphere, "X,Y,Z,RADIUS", 4)
+        try:
+            return Sphere((x, y, z), radius)
+        except ConfigError as error:
+            raise FlagError(f"--crop-sphere: {error}") from error
+
+    def regions(self) -> list[Region]:
+        """Return all regions that are given.
+
+        Raises:
+            FlagError: if one of them is none.
+            ConfigError: if the file of one cannot be read.
+        """
+        from nerfloom.geometry.regions import read_region
+
+        file = None if self.region is None else read_region(self.region)
+        return [region for region in (self.box(), self.sphere(), file) if region is not None]
+
+
+def _numbers(flag: str, text: str, form: str, count: int) -> list[float]:
+    """Return the numbers in the value of a flag, which commas separate."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise FlagError(f"{flag} is {shown(text)}; it must be {count} numbers {form}")
+    return found

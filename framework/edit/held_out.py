@@ -1,0 +1,78 @@
+"""The cost of an edit: PSNR of the edited Gaussians on held-out photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from nerfloom.base.console import track
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.edit.edited import Edited
+from nerfloom.evaluation.evaluator import measure_view, views_to_judge
+from nerfloom.renderable import Renderable
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.gaussians import Gaussians, RendersGaussians
+from nerfloom.training.datasets import first_split
+from nerfloom.training.loaded import Loaded
+
+
+class Redrawn(Renderable):
+    """A model that draws other Gaussians instead of its own.
+
+    Args:
+        model: a model that can render given Gaussians.
+        gaussians: N Gaussians, float32, in the frame of its scene.
+    """
+
+    def __init__(self, model: Renderable, gaussians: Gaussians) -> None:
+        self.scene, self._model, self._gaussians = model.scene, model, gaussians
+
+    @property
+    def device(self) -> torch.device:
+        return self._model.device
+
+    @property
+    def background(self) -> Tensor:
+        return self._model.background
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        assert isinstance(self._model, RendersGaussians)
+        return self._model.render_gaussians(self._gaussians, view, background)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out photographs that edits are compared with."""
+
+    model: Renderable
+    """The model whose Gaussians are edited."""
+    dataset: Dataset
+    """The photographs, on its device."""
+    views: tuple[int, ...]
+    """The photographs that count."""
+
+    @classmethod
+    def of(cls, loaded: Loaded, max_images: int) -> HeldOut | None:
+        """Return the held-out photographs of a run or a file; None if they are not known, or show other moments.
+
+        Args:
+            loaded: the run or file.
+            max_images: maximum number of photographs, evenly spaced.
+        """
+        model = loaded.model
+        if loaded.source is None or model.scene.moving or not isinstance(model, RendersGaussians) or max_images < 1:
+            return None
+        dataset = first_split(loaded.source, ("test", "val"), max_images)
+        if dataset is None or not (views := views_to_judge(dataset)):
+            return None
+        return cls(loaded.model, dataset.to(loaded.model.device), tuple(views[:max_images]))
+
+    def psnr(self, edited: Edited) -> float:
+        """Return the mean PSNR of the `edited` Gaussians, dB."""
+        redrawn = Redrawn(self.model, edited.in_scene())
+        views = track(self.views, "Comparing with held-out photographs", total=len(self.views))
+        return fmean(measure_view(redrawn, self.dataset, index, redrawn.background).psnr for index in views)

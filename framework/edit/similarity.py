@@ -1,0 +1,73 @@
+"""Similarity transforms of Gaussians: rotations about an axis, turns, scales and shifts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nerfloom.base.errors import ConfigError
+from nerfloom.kernels.math import cross_matrix
+
+
+class Similarity(NamedTuple):
+    """The transform x -> scale * rotation @ x + shift."""
+
+    rotation: Tensor
+    """(3, 3) float64 proper rotation."""
+    scale: float
+    """New units per old unit, positive."""
+    shift: Tensor
+    """(3,) float64, new units."""
+
+
+def vector(values: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
+    """Return coordinates as a tensor float64.
+
+    Args:
+        values: three coordinates, or those of several points.
+    """
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def direction(values: Sequence[float], name: str) -> Tensor:
+    """Return a direction of unit length, (3,) float64.
+
+    Args:
+        values: the direction, of any length but 0.
+        name: name of the setting, for the message.
+
+    Raises:
+        ConfigError: if the length is 0.
+    """
+    found = vector(values)
+    length = float(found.norm())
+    if not length > 0:
+        raise ConfigError(f"{name} is {tuple(values)}, which is no direction; give one with a length")
+    return found / length
+
+
+def about(center: Tensor, rotation: Tensor | None = None, scale: float = 1.0) -> Similarity:
+    """Return the similarity that turns and scales space about a point, which stays.
+
+    Args:
+        center: (3,) float64 the point.
+        rotation: (3, 3) float64; None for none.
+        scale: new units per old unit.
+    """
+    turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
+    return Similarity(turn, scale, center - scale * (turn @ center))
+
+
+def axis_rotation(axis: Tensor, degrees: float) -> Tensor:
+    """Return the rotation (3, 3) about an axis, by Rodrigues' formula.
+
+    Args:
+        axis: (3,) float64 unit vector.
+        degrees: angle; counter-clockwise where the axis points to the viewer.
+    """
+    angle, cross = math.radians(degrees), cross_matrix(axis)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)

@@ -1,0 +1,61 @@
+"""Steps that are taken one after another, with a line on what each has removed and what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError
+from nerfloom.edit.edited import Edited
+from nerfloom.edit.held_out import HeldOut
+from nerfloom.edit.recipe import Step
+
+
+def take_steps(edited: Edited, steps: Sequence[Step], held_out: HeldOut | None = None) -> Edited:
+    """Take steps, and say what each does.
+
+    Args:
+        edited: Gaussians before the first step.
+        steps: the steps.
+        held_out: photographs that tell what a step costs; None for none.
+
+    Raises:
+        ConfigError: if a step cannot be taken, or leaves no Gaussians.
+        DataError: if a file of a step cannot be read.
+    """
+    psnr = held_out.psnr(edited) if held_out is not None and steps else None
+    for number, step in enumerate(steps, 1):
+        before, edited = edited, step(edited)
+        if not len(edited):
+            raise ConfigError(
+                f"step {number} ({step.name}) leaves none of {len(before):,} Gaussians; change its settings"
+            )
+        said = f"{number} {step.name}: {_change(before, edited)}"
+        if held_out is not None and psnr is not None and looks_different(before, edited):
+            was, psnr = psnr, held_out.psnr(edited)
+            said += f"; PSNR {was:.2f} to {psnr:.2f} dB ({psnr - was:+.2f}) on {len(held_out.views)} held-out images"
+        say(said)
+    return edited
+
+
+def looks_different(before: Edited, after: Edited) -> bool:
+    """Return whether photographs tell edits apart: not if Gaussians have only been moved together with the cameras.
+
+    Args:
+        before, after: Gaussians before and after a step.
+    """
+    return len(before) != len(after) or before.gaussians.degree != after.gaussians.degree
+
+
+def _change(before: Edited, after: Edited) -> str:
+    """Return a description of what a step has done."""
+    count, left = len(before), len(after)
+    if left > count:
+        return f"adds {left - count:,} to {count:,} Gaussians"
+    if left < count:
+        return f"removes {count - left:,} of {count:,} Gaussians"
+    if after.gaussians.degree < before.gaussians.degree:
+        return f"harmonics up to degree {after.gaussians.degree} of {before.gaussians.degree}"
+    if after.placement is not before.placement:
+        return f"moves {count:,} Gaussians"
+    return f"removes none of {count:,} Gaussians"

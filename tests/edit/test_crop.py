@@ -1,0 +1,141 @@
+"""Crops: what is inside and outside is known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfloom import edit
+from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.edit.crop import inside_polygon
+from nerfloom.edit.edited import Edited
+from nerfloom.geometry.regions import Box, Sphere, inside_all, read_region
+from nerfloom.splats.files import write_gaussians
+from nerfloom.training.load import load
+from tests.dataparsers.captures import HEIGHT, POINTS, WIDTH, poses, seen_at, write_capture
+from tests.edit.clouds import at, scattered
+
+
+def test_a_box_keeps_what_numpy_finds_in_it() -> None:
+    edited = scattered()
+    low, high = (-0.5, -1.0, 0.0), (1.0, 0.3, 2.0)
+    means = edited.gaussians.means.numpy()
+    truth = np.all((means >= low) & (means <= high), axis=1)
+    assert 0 < truth.sum() < len(truth)
+    np.testing.assert_array_equal(edit.crop_box(edited, low, high).gaussians.means, means[truth])
+    np.testing.assert_array_equal(edit.crop_box(edited, low, high, keep=False).gaussians.means, means[~truth])
+
+
+def test_a_sphere_keeps_what_numpy_finds_in_it() -> None:
+    edited, center = scattered(), (0.3, -0.2, 0.5)
+    means = edited.gaussians.means.numpy()
+    truth = np.linalg.norm(means - center, axis=1) <= 1.2
+    assert 0 < truth.sum() < len(truth)
+    np.testing.assert_array_equal(edit.crop_sphere(edited, center, 1.2).gaussians.means, means[truth])
+    np.testing.assert_array_equal(edit.crop_sphere(edited, center, 1.2, False).gaussians.means, means[~truth])
+
+
+def test_every_column_of_a_gaussian_stays_with_it() -> None:
+    edited = scattered(terms=8)
+    kept = edit.crop_box(edited, (-9, -9, 0), (9, 9, 9)).gaussians
+    index = (edited.gaussians.means[:, 2] >= 0).nonzero()[:, 0]
+    for name, values in edited.gaussians.columns.items():
+        assert torch.equal(kept.columns[name], values[index]), name
+
+
+def test_regions_of_files(tmp_path: Path) -> None:
+    (tmp_path / "box.json").write_text('{"box": {"low": [-1, -2, -3], "high": [1, 2, 3.5]}}')
+    (tmp_path / "ball.yml").write_text("sphere:\n  center: [0, 1e-3, 1]\n  radius: 2\n")
+    box, ball = read_region(tmp_path / "box.json"), read_region(tmp_path / "ball.yml")
+    assert box == Box((-1.0, -2.0, -3.0), (1.0, 2.0, 3.5))
+    assert ball == Sphere((0.0, 1e-3, 1.0), 2.0)
+    edited = scattered()
+    found = edit.crop_region(edited, tmp_path / "ball.yml").gaussians.means
+    assert torch.equal(found, edit.crop_sphere(edited, (0.0, 1e-3, 1.0), 2.0).gaussians.means)
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 3.4], [2, 0, 1]])
+    assert inside_all(points, [box, ball]).tolist() == [True, False, False]
+    assert inside_all(points, []).all()
+    with pytest.raises(ConfigError, match="nothing is in the region"):
+        inside_all(points + 100, [box])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("[]", "box: 3", "box: {low: [0, 0, 0]}", "cube: {}", "box: {low: [0, 0, 0], high: [1, 1, 0]}"),
+        *("sphere: {center: [0, 0], radius: 1}", "sphere: {center: [0, 0, 0], radius: -1}", "{"),
+        *("sphere: {center: [0, 0, .nan], radius: 1}", "sphere: {center: [0, 0, 0], radius: 1, side: 2}"),
+        "sphere: {center: [0, 0, 0], radius: 1}\nbox: {low: [0, 0, 0], high: [1, 1, 1]}",
+    ],
+)
+def test_files_that_hold_no_region_are_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "r.yml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_region(tmp_path / "r.yml")
+    assert "\n" not in str(error.value)
+
+
+def test_inside_of_a_polygon() -> None:
+    """An L, whose inside is the union of two rectangles, by brute force on a lattice of no corner's coordinates."""
+    corners = ((0.0, 0.0), (4.0, 0.0), (4.0, 1.0), (1.0, 1.0), (1.0, 3.0), (0.0, 3.0))
+    rows, columns = torch.meshgrid(torch.arange(-1.05, 5, 0.2), torch.arange(-1.05, 5, 0.2), indexing="ij")
+    x, y = columns.flatten().double(), rows.flatten().double()
+    truth = ((x > 0) & (x < 4) & (y > 0) & (y < 1)) | ((x > 0) & (x < 1) & (y > 0) & (y < 3))
+    assert torch.equal(inside_polygon(x, y, corners), truth)
+    assert torch.equal(inside_polygon(x, y, corners[::-1]), truth)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Edited:
+    """Four Gaussians at the known points of a capture, with its photographs."""
+    folder = tmp_path_factory.mktemp("seen")
+    data = write_capture(folder / "capture")
+    write_gaussians(folder / "four.ply", at(torch.from_numpy(POINTS)).map(torch.Tensor.float))
+    return Edited.of(load(folder / "four.ply", data=data))
+
+
+def pixels(image: int) -> np.ndarray:
+    """Columns and rows (4, 2) of the points in a photograph; (0, 0) is the centre of the top left pixel."""
+    return np.array([seen_at(poses()[image], point) for point in POINTS]) - 0.5
+
+
+def test_a_polygon_around_a_point_of_a_photograph_selects_it(seen: Edited) -> None:
+    """After the Gaussians have been moved and turned, too."""
+    (column, row), *others = pixels(2)
+    reach = 0.4 * min(np.linalg.norm(other - (column, row)) for other in others)
+    around = tuple((column + reach * dx, row + reach * dy) for dx, dy in ((-1, 0), (0, -1), (1, 0), (0, 1)))
+    moved = edit.scale(edit.rotate(edit.move(seen, (1.0, 2.0, 3.0)), (1.0, 1.0, 0.0), 70.0), 2.5)
+    for given in (seen, moved):
+        kept = edit.crop_polygon(given, "002.png", around)
+        assert torch.equal(kept.gaussians.means, given.gaussians.means[:1])
+        removed = edit.crop_polygon(given, "002.png", around, keep=False)
+        assert torch.equal(removed.gaussians.means, given.gaussians.means[1:])
+
+
+def test_a_mask_of_a_photograph_selects_what_is_white(seen: Edited, tmp_path: Path) -> None:
+    at_pixels = pixels(4).round().astype(int)
+    white = np.zeros((HEIGHT, WIDTH), np.uint8)
+    white[at_pixels[1, 1], at_pixels[1, 0]] = 255
+    white[at_pixels[3, 1], at_pixels[3, 0]] = 255
+    Image.fromarray(white).save(tmp_path / "mask.png")
+    truth = torch.tensor([bool(white[row, column]) for column, row in at_pixels])
+    assert truth[1]
+    assert truth[3]
+    kept = edit.crop_mask(seen, "004.png", tmp_path / "mask.png").gaussians
+    assert torch.equal(kept.means, seen.gaussians.means[truth])
+
+
+def test_what_cannot_be_cropped(seen: Edited, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no photograph is named 02\.png"):
+        edit.crop_polygon(seen, "02.png", ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+    with pytest.raises(ConfigError, match="3 corners"):
+        edit.crop_polygon(seen, "002.png", ((0.0, 0.0), (1.0, 0.0)))
+    with pytest.raises(ConfigError, match="--data DIR"):
+        edit.crop_polygon(scattered(), "002.png", ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+    Image.new("L", (7, 9)).save(tmp_path / "odd.png")
+    with pytest.raises(DataError, match="integer multiple"):
+        edit.crop_mask(seen, "002.png", tmp_path / "odd.png")
+    with pytest.raises(ConfigError, match="is empty"):
+        edit.crop_box(seen, (0.0, 0.0, 0.0), (1.0, 0.0, 1.0))

@@ -117,9 +117,7 @@ def read_table(
         for row in _rows(block, f"{path}: rows {number + 1}", root.resolve(), runs.resolve(), scale):
             row = replace(row, conditions=replace(row.conditions, lpips_weights=weights, num_threads=num_threads))
             if not re.fullmatch(r"[\w.-]+", row.name):
-                raise ConfigError(
-                    f"{path}: {shown(row.name)} is no name of a row; take letters, digits and hyphens for names"
-                )
+                raise ConfigError(f"{path}: {shown(row.name)} is not a name for a row; use letters, digits and hyphens")
             if row.name in rows:
                 raise ConfigError(f"{path}: two rows are called {row.name}; rename the data or method of one")
             rows[row.name] = row

@@ -45,7 +45,7 @@ from nerfloom.samplers.occupancy import OccupancySampler
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
 SHARPER = 50.0
-"""Multiple of the first inverse width that its bound has reached when it ends."""
+"""Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
 LONGEST, EVERY = 4.0, 16
@@ -107,16 +107,16 @@ class SurfaceConfig(
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
-    """Fraction of the budget after which that change has a weight: a surface has to find its place first."""
+    """Fraction of the budget after which --curvature-loss-mult applies: a surface has to find its place first."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
     start_sharpness: float = 20.0
-    """First inverse width of the surface, in halves of the box's shortest edge."""
+    """First inverse width of the surface; the width is in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
     step_widths: float = 2.0
-    """Length of a training step, in widths of the surface; from one to four steps of --num-steps. 0: one."""
+    """Length of a training step in widths of the surface, limited to one to four steps of --num-steps. 0: one step."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
     sharpen_until: float = 0.8
@@ -189,7 +189,7 @@ class SurfaceRenderer(VolumeRenderer):
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().shade(rays, samples, field, background)
-        if self.training:  # no term of the objective asks for them
+        if self.training:  # no term of the objective uses them
             return rendered
         assert samples.features is not None
         assert rendered.weights is not None
@@ -199,7 +199,7 @@ class SurfaceRenderer(VolumeRenderer):
 
 
 def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
-    """Return the sampler, whose pictures are traced if the settings say so."""
+    """Return the sampler. It traces pictures to the surface if --eval-rendering is surface."""
     sampler = occupancy_sampler(config, foreground(config, scene))
     assert isinstance(sampler, OccupancySampler)
     traced = FirstCrossing(sampler, config.eval_rendering == "surface")

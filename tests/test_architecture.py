@@ -166,7 +166,7 @@ LAYERS = (
     ("cli",),
     ("runs",),
 )
-"""Rooms of `framework`, each of which imports those above it only, at whatever place in a file."""
+"""Rooms of `framework`. Each imports only those above it, anywhere in a file."""
 
 
 def _room(module: str) -> int | None:

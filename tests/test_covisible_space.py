@@ -125,7 +125,7 @@ def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) ->
 
 
 def with_points(dataset: Dataset, distance: float) -> Dataset:
-    """The images, of which every 50th pixel is known to show something at that distance."""
+    """The images; every 50th pixel is known to show something at that distance."""
     pixels = torch.arange(0, dataset.cameras.ends[-1], 50)
     known = SparseDepth(pixels, torch.full((len(pixels),), distance), torch.full((len(pixels),), 0.01))
     scene = dataclasses.replace(dataset.scene, num_sparse_depths=len(pixels))

@@ -128,7 +128,7 @@ def test_a_seed_of_more_than_64_bits() -> None:
         ((4,), (0, 0)),
         ((4, 4), (0, 128, 64)),
         ((4,), (0, 2**33)),
-        ((64,), (0, 100)),  # hashed, but 100 is no power of two
+        ((64,), (0, 100)),  # hashed, but 100 is not a power of two
         ((4,) * 65, tuple(range(0, 66 * 128, 128))),
     ],
 )

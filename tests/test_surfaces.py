@@ -71,7 +71,7 @@ def test_training_starts_as_a_ball(name: str) -> None:
 
 @pytest.mark.parametrize("opened", [16.0, 2.5])
 def test_gradients_are_those_of_the_distance(opened: float) -> None:
-    """Central differences, with all levels of the grid and with some of them open; in a box that is no cube."""
+    """Central differences, with all levels of the grid and with some of them open; in a box that is not a cube."""
     scene = dataclasses.replace(ball_in_a_box().scene, box=torch.tensor([[-1.0, -1.5, -0.8], [1.0, 1.0, 1.2]]))
     method = load_method("neus")
     config = dataclasses.replace(method.config, **TINY["neus"], sparse_updates=False)
@@ -298,7 +298,7 @@ def test_silhouettes_are_weighted_as_the_pixels_are() -> None:
 
 
 def points_on_axes(radius: float) -> PixelBatch:
-    """Pixels of six cameras on the axes, each of which shows a point at `radius` before the centre."""
+    """Pixels of six cameras on the axes; each shows a point at `radius` before the centre."""
     towards = torch.cat([torch.eye(3), -torch.eye(3)])
     known, colors = torch.full((6,), 2 - radius), torch.ones(6, 3)
     rays = Rays(-2 * towards, towards)

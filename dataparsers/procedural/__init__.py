@@ -2,8 +2,8 @@
 
 It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, otherwise XDG_CACHE_HOME,
 otherwise ~/.cache), and read from there. `--num-scenes` renders many random scenes instead, for methods that learn from
-several scenes. `--courtyard True` photographs a courtyard instead, through which people walk (`--distractors`) and
-where light changes, and `--street N` a street, along which cars drive (`--cars`).
+several scenes. `--courtyard True` photographs a courtyard instead, where people walk through (`--distractors`) and
+light changes, and `--street N` a street with cars (`--cars`).
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ class Procedural(DataParser):
     courtyard: bool = False
     """Use a courtyard: the solids on paving between walls, so that every pixel shows a surface."""
     distractors: float = 0.0
-    """Share of the pixels of training images of the courtyard that show people and things which are in no other image,
-    from 0 to 0.4. Test images are clean."""
+    """Share of the courtyard's training pixels that show people and things found in no other image, from 0 to 0.4. Test
+    images are clean."""
     street: int = 0
-    """Number of houses on each side of a street with windows, signs and a sky, which is used instead. 0: no street."""
+    """Number of houses on each side of a street with windows, signs and a sky, used instead. 0: no street."""
     cars: int = 0
-    """Number of cars near the camera of each training image of the street, elsewhere in each, with true masks."""
+    """Number of cars near the camera of each training image of the street, at other places in each, with true masks."""
     changing_exposure: bool = False
     """Whether training images of the courtyard or the street differ in exposure, by up to a stop."""
     changing_white_balance: bool = False
     """Whether training images of the courtyard or the street differ in white balance."""
     changing_sun: bool = False
-    """Whether the sun stands elsewhere in each training image of the courtyard or the street."""
+    """Whether the position of the sun differs between training images of the courtyard or the street."""
     views_per_scene: int = 12
     """Images of each random scene. Of a held-out scene, every fourth is evaluated and the others are sources."""
     placement: Path | None = None
@@ -113,11 +113,11 @@ class Procedural(DataParser):
         if self.street and (self.moving or self.num_scenes > 1 or self.courtyard):
             raise DataError("--street is a scene of its own: leave out --moving, --num-scenes and --courtyard")
         if not self.courtyard and self.distractors:
-            raise DataError("--distractors are in the courtyard: add --courtyard True")
+            raise DataError("--distractors applies to the courtyard only: add --courtyard True")
         if not self.street and self.cars:
-            raise DataError("--cars are on the street: add --street 8")
+            raise DataError("--cars applies to the street only: add --street 8")
         if not (self.courtyard or self.street) and any(self._changing):
-            raise DataError("--changing-* are of the courtyard and the street: add --courtyard True or --street 8")
+            raise DataError("--changing-* apply to the courtyard and the street: add --courtyard True or --street 8")
 
     def _rendered_folder(self) -> Path:
         """Return the scene's folder; render the scene first if it is not in the cache."""

@@ -144,8 +144,8 @@ class TrainConfig:
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
-    # Values of settings that a method lacks, so that shared code need not know the class of its settings. Without
-    # annotation they are no fields, and so no flags.
+    # Values of settings that a method lacks, so that shared code need not know the class of its settings. They have no
+    # annotations, so they are neither fields nor flags.
     sampler, bounded_sampler, time_slices, robust_factor = "", "occupancy", 1, 2.0
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = robust = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
@@ -162,7 +162,7 @@ class TrainConfig:
         for name, value in defaults.items():
             owner = next((base for base in cls.__mro__[1:] if name in inspect.get_annotations(base)), None)
             if owner is None:
-                raise TypeError(f"{cls.__name__} inherits no setting '{name}', whose default it changes")
+                raise TypeError(f"{cls.__name__} inherits no setting '{name}', but changes its default")
             cls.__annotations__[name] = typing.get_type_hints(owner, include_extras=True)[name]
             setattr(cls, name, value)
 

@@ -1,4 +1,4 @@
-"""The command `ns-eval`: metrics of a trained run, or of a file of Gaussians, on held-out views."""
+"""The command `ns-eval`: metrics of a trained run, a file of Gaussians or an octree on held-out views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerfloom.training.run_path import check_writable
 
 @dataclass(frozen=True, kw_only=True)
 class EvalFlags(GeometryFlags, RunFlags):
-    """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views.
+    """Compute PSNR, SSIM and LPIPS of a run, or with --data of a file of Gaussians or an octree, on held-out views.
 
     With --reference-mesh or --reference-points, also compare its surface with the true one."""
 
@@ -118,7 +118,7 @@ def _command(arguments: list[str]) -> None:
 
 
 def _beside(run: Path) -> Path:
-    """Return the default results file for a run's config.yml, a blocks.yml or a file of Gaussians."""
+    """Return the default results file for a run's config.yml, a blocks.yml, a file of Gaussians or an octree."""
     is_run = run.suffix == ".yml" and not is_blocks_file(run)
     return run.parent / "eval.json" if is_run else run.with_suffix(".eval.json")
 

@@ -23,8 +23,8 @@ paths:
 
   ns-render interpolate RUN_FOLDER --output-path walk.mp4
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): orbit and camera-path need no data,
-others --data DIR [FORMAT [format flags]], as in
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat) or an octree (.octree): orbit and
+camera-path need no data, others --data DIR [FORMAT [format flags]], as in
 
   ns-render orbit splat.ply --output-path orbit.mp4
   ns-render interpolate splat.ply --data DIR --output-path walk.mp4
@@ -71,7 +71,7 @@ class PathFlags:
     """Flags of every path."""
 
     run: RunFlags
-    """The trained run, or the file of Gaussians."""
+    """The trained run, the file of Gaussians, or the octree."""
     outputs: ViewFlags = field(default_factory=ViewFlags)
     """Outputs of a view, and their colours."""
     files: FileFlags = field(default_factory=FileFlags)

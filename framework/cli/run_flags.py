@@ -31,7 +31,7 @@ class OpenFlags:
     """Device to render on."""
 
     def check(self) -> Path:
-        """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
+        """Check that all files exist, without torch, and return the run's config.yml or the file.
 
         Raises:
             ConfigError, CheckpointError, DataError: if something is missing.

@@ -38,7 +38,7 @@ from nerfloom.training.trainer import BetweenSteps, Trainer
 MAX_PICTURES = 4
 """Maximum number of held-out views whose pictures are written at the end."""
 MAX_TRAINING = 3
-"""Maximum number of training images whose pictures are written, if the method shows what they have alone."""
+"""Maximum number of training images with pictures, if the method shows what only one image contains."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
 
@@ -204,7 +204,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     if any(output.of_training for output in trainer.model.outputs):
         folder = run.folder / "pictures" / "training"
         evaluate(trainer.model, trainer.train_set, max_images=MAX_TRAINING, pictures=folder, title="Training images")
-        say(f"what training images have alone: {folder}")
+        say(f"pictures of training images, with what only one image contains: {folder}")
 
 
 def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:

@@ -87,8 +87,8 @@ def fitted_appearance(model: Renderable, dataset: Dataset, index: int, backgroun
 def nearest_camera(scene: Scene, view: View) -> int:
     """Return the training image whose camera is nearest to that of a view.
 
-    Compared are the cameras' positions and the points half the box's edge in front of them, so that directions count
-    too.
+    Cameras are compared by their positions and by the points half the box's edge in front of them, so that directions
+    count too.
 
     Args:
         scene: the scene, with the poses of the training cameras.
@@ -110,7 +110,7 @@ def nearest_camera(scene: Scene, view: View) -> int:
 
 @contextmanager
 def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]:
-    """Render views that are no training images with an appearance vector, within a `with` block.
+    """Render views other than training images with an appearance vector, within a `with` block.
 
     Args:
         model: the model.

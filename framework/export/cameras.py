@@ -36,7 +36,7 @@ def refined_cameras(model: Renderable, cameras: Cameras) -> Cameras:
 
 
 def propagated_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
-    """Return cameras that were not refined, moved as the training cameras around them were.
+    """Return unrefined cameras, moved like the training cameras around them.
 
     Args:
         cameras: M cameras of other images.
@@ -49,7 +49,7 @@ def propagated_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Ca
 
 
 def all_cameras(scenes: Mapping[str, ParsedScene], given: Cameras, refined: Cameras) -> dict[str, Cameras]:
-    """Return the cameras of each split: refined ones of the training images, and others carried along.
+    """Return the cameras of each split: the refined training cameras, and the others moved along with them.
 
     Args:
         scenes: split -> its images, with the cameras as they are given.

@@ -1,4 +1,4 @@
-"""The web page of a run or a file: its Gaussians or those fitted to it, the page, and how close that comes."""
+"""The web page of a run or a file: its own or fitted Gaussians, the page, and its closeness to the method."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ class Closeness:
     """Metrics of a page's Gaussians compared with the model, drawn by Nerfloom."""
 
     views: str
-    """What was compared, for people."""
+    """The compared views, as text."""
     method: float
     """PSNR against the method's own pictures, dB."""
     photographs: float | None
-    """PSNR against the photographs, dB; None if they are of other moments, or of a lens that Gaussians are not drawn
-    for."""
+    """PSNR against the photographs, dB; None if they are of other moments, or have a lens for which Gaussians cannot be
+    drawn."""
     method_itself: float | None
     """PSNR of the method's own pictures against the photographs, dB; None likewise."""
 
     def line(self) -> str:
-        """Return a line for people."""
+        """Return the metrics as a line of text."""
         text = f"on {self.views}: PSNR {self.method:.2f} dB against the method's own pictures"
         if self.photographs is None:
             return text
@@ -77,7 +77,7 @@ def export_page(
     splatting: Method,
     regions: Sequence[Region] = (),
 ) -> None:
-    """Write the web page of a run or a file of Gaussians, and say its size and how close it comes.
+    """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 
     Args:
         loaded: the run or file.
@@ -154,7 +154,7 @@ def _closeness_to(
 def _gaussians(
     loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None, splatting: Method
 ) -> tuple[Gaussians, Look]:
-    """Return the Gaussians of a run or file, or some that are fitted to its field, and how they are drawn."""
+    """Return the Gaussians of a run or file, or Gaussians fitted to its field, and how they are drawn."""
     model = loaded.model
     if isinstance(model, HasGaussians):
         return model.gaussians(moment), model.look()
@@ -259,4 +259,4 @@ def _about(loaded: Loaded, moment: float | None) -> str:
         parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")
-    return " ".join([*parts, "The page works offline and asks no host for anything."])
+    return " ".join([*parts, "The page works offline and requests nothing from any host."])

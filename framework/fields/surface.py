@@ -25,7 +25,7 @@ from nerfloom.kernels.surfaces.opacity import laplace_density
 from nerfloom.kernels.surfaces.samples import PLACED, Ball, Intervals, ball_distance, surface_samples, unit_normals
 
 ROUNDING = 1e-3
-"""Radius within which the first ball is rounded off at its centre, in radii; a distance has no gradient there."""
+"""Radius around the first ball's centre within which its distance is smoothed, in radii of the ball."""
 FIRST_WEIGHTS = 1e-2
 """Size of the first weights of the distance's output; the field starts as a ball with a little noise."""
 DIRECTION_LEVELS = 4
@@ -75,7 +75,7 @@ class Sharpness(nn.Module):
 
 
 class AnnealedSharpness(Sharpness):
-    """The inverse width of a surface, and how far the annealing of its slope has come (`surface_opacity`).
+    """The inverse width of a surface, and the progress of the annealing of its slope (`surface_opacity`).
 
     Args:
         first, rate: as in `Sharpness`.
@@ -114,7 +114,7 @@ class SurfaceField(BoxField):
         radius: radius of the first ball, as a fraction of half of the box's shortest edge.
         width: features of a hidden layer.
         num_features: number of features for the colour.
-        appearance: the images' appearance vectors, an input of the colour network; None without.
+        appearance: the images' appearance vectors, an input of the colour network; None if there are none.
     """
 
     centre: Tensor
@@ -145,7 +145,7 @@ class SurfaceField(BoxField):
         inputs = PLACED + num_features + DIRECTION_LEVELS**2 + (0 if appearance is None else appearance.size)
         self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
         self.cell = 0.0
-        """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
+        """Diagonal of the sampler's cells, scene units: the maximum distance between two positions in a cell."""
         self.progress = 0.0
         """Fraction of the training budget that is spent."""
 
@@ -189,10 +189,10 @@ class SurfaceField(BoxField):
         return Shape(*ball_distance(network, positions, self.ball), network[:, 1:-3])
 
     def reach(self, safety: float) -> Callable[[Tensor], Tensor]:
-        """Return the function from positions (N, 3) to how far rays may step from them (N,), negative inside.
+        """Return a function from positions (N, 3) to lengths (N,) that rays may step from there, negative inside.
 
         Args:
-            safety: factor by which the distance may be steeper on the way than at the position.
+            safety: maximum slope of the distance along a step, relative to its slope at the position.
         """
 
         def bound(positions: Tensor) -> Tensor:

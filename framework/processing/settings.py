@@ -27,7 +27,7 @@ class OutputFlags:
     num_downscales: int = 3
     """Number of folders of reduced images: 3 writes images_2, images_4 and images_8."""
     can_resume: ClassVar[bool] = False
-    """Whether a stopped run can go on where it stopped."""
+    """Whether a stopped run can continue where it stopped."""
 
     def check(self) -> None:
         """Check the values.
@@ -66,7 +66,7 @@ class ColmapFlags(OutputFlags):
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), for registered images only."""
     mask_moving: bool = False
-    """Train on the images for a short time with --robust, and write masks that leave out what moves."""
+    """Train on the images for a short time with --robust, and write masks that leave out moving things."""
     mask_seconds: float = 120.0
     """Seconds of this training."""
     device_type: Literal["cpu", "cuda"] = "cpu"

@@ -58,8 +58,8 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
     vertex, chunk = header.elements["vertex"], header.elements.get("chunk")
     if chunk is None or chunk.count * CHUNK < vertex.count or chunk.order == "ascii":
         raise DataError(
-            f"{file} is a compressed PLY file whose header states {0 if chunk is None else chunk.count} chunks of"
-            f" {CHUNK} for {vertex.count:,} Gaussians, or is no binary file; export it again"
+            f"{file} is a compressed PLY file with {0 if chunk is None else chunk.count} chunks of"
+            f" {CHUNK} for {vertex.count:,} Gaussians, or is not a binary file; export it again"
         )
     rows = np.arange(vertex.count) // CHUNK
     position, rotation, scale, color = (word.astype("<u4") for word in _columns(file, vertex, _WORDS))

@@ -1,4 +1,4 @@
-"""Renderables whose pictures are drawings of Gaussians, and fixed Gaussians, such as those of a file."""
+"""Renderables that draw Gaussians, and fixed Gaussians, such as those of a file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
 
 
 class DrawsGaussians(Renderable):
-    """A renderable whose pictures are drawings of Gaussians."""
+    """A renderable that draws Gaussians."""
 
     cameras: ClassVar[tuple[str, ...] | None] = DRAWN
     rasteriser: ClassVar[Rasteriser] = RASTERISER

@@ -54,7 +54,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file: of Gaussians, of an octree, or of a scene in blocks."""
+        """True for a run, False for a file: of Gaussians, an octree, or a scene in blocks."""
         return self.origin != self.checkpoint
 
     @property
@@ -197,7 +197,7 @@ class Loaded:
         unit: str = "m",
         time: float | None = None,
     ) -> Loaded:
-        """Return this with the scale in which two points have a given distance; `keep_scale` keeps it.
+        """Return this in a scale that gives two points a known distance; `keep_scale` writes the scale to the run.
 
         Args:
             start, end: the points, as in `measure`.
@@ -223,12 +223,12 @@ class Loaded:
         """Write the scale to the run's folder, where whatever loads the run finds it.
 
         Raises:
-            ConfigError: for a file, whose coordinates are in a unit already.
+            ConfigError: for a file, because its coordinates are in a unit already.
             OSError: if it cannot be written.
         """
         if not self.is_run:
             raise ConfigError(
-                f"{self.origin} is not a run, and keeps its coordinates: set the scale of the run that it is from, and "
+                f"{self.origin} is not a run and keeps its coordinates: set the scale of the run that it is from, and "
                 "export or bake that again"
             )
         write_scale(self.folder, self.scale)

@@ -54,7 +54,7 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = None) -> Path:
-    """Return the config.yml of a trained run, or a file of Gaussians, after checking that all paths exist.
+    """Return the config.yml of a trained run, a file of Gaussians or an octree, after checking that all paths exist.
 
     Args:
         path: as for `config_file`, or a file of Gaussians.

@@ -20,7 +20,7 @@ SECONDS_PER_LOOK = 2.0
 
 
 def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
-    """Serve a run or a file of Gaussians to browsers until Ctrl-C.
+    """Serve a run, a file of Gaussians or an octree to browsers until Ctrl-C.
 
     Args:
         loaded: the run or file.

@@ -102,7 +102,7 @@ def test_the_grid_and_all_cameras_are_written(ball: Path, tmp_path: Path, monkey
 
 
 class Refining(torch.nn.Module):
-    """A model of which no more is known than that it refines poses."""
+    """A model that only refines poses."""
 
     def __init__(self, poses: PoseRefinement) -> None:
         super().__init__()
@@ -157,7 +157,7 @@ def test_what_cannot_be_exported_is_refused(ball: Path, tmp_path: Path, refused:
 
 
 def test_normals_are_turned_and_not_moved() -> None:
-    """A wall x = 2 of the scene, of which the input is a quarter turn about z away."""
+    """A wall x = 2 of the scene; the input is turned by a quarter about z."""
     quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7]]).double()
     placement = Placement(quarter, 2.0)
     normal = placement.original_directions(torch.tensor([[1.0, 0, 0]]).double())

@@ -156,7 +156,7 @@ def seen_through(model: str, right: float, down: float, ahead: float) -> tuple[f
         angle = math.atan2(off, ahead)
         bent = angle * (1 + K1 * angle**2 + K2 * angle**4 + K3 * angle**6 + K4 * angle**8)
         return bent * right / off, bent * down / off
-    if model == "EQUIRECTANGULAR":  # of which half the width of a whole panorama is nerfstudio's focal length
+    if model == "EQUIRECTANGULAR":  # nerfstudio's focal length is half the width of a whole panorama
         longitude = math.atan2(right, ahead)
         return longitude / math.pi, math.asin(down / math.hypot(right, down, ahead)) / math.pi
     return right, down

@@ -93,7 +93,7 @@ def test_damaged_and_hostile_files(tmp_path: Path) -> None:
     refused("'image_size'", image_size=0)
     refused("pickled", codes=np.array([{}] * count, object))
     file.write_bytes(b"PK\3\4 nothing")
-    with pytest.raises(DataError, match="no octree"):
+    with pytest.raises(DataError, match="not an octree"):
         read_octree(file)
     with pytest.raises(DataError, match="cannot read"):
         read_octree(tmp_path / "missing.octree")

@@ -106,7 +106,7 @@ class Checker:
         elif name in ("python", "python3"):
             check_python(rest)
         else:
-            assert name in UNCHECKED, f"{name} is no command that is known here"
+            assert name in UNCHECKED, f"{name} is not a command that is known here"
 
     def _ours(self, name: str, rest: list[str]) -> None:
         scripts = dict(re.findall(r'^(ns-[\w-]+) = "(.+):main"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))

@@ -254,7 +254,7 @@ def body(rotation: bytes, harmonics: bytes = b"") -> bytes:
 
 
 def test_version_2_by_hand(tmp_path: Path) -> None:
-    """The order of arrays, the axes, and the coefficients' order, of which red, green and blue are neighbours."""
+    """The order of arrays, the axes, and the order of coefficients: red, green and blue are neighbours."""
     harmonics = bytes([128 + 8 * index for index in range(9)])
     (tmp_path / "a.spz").write_bytes(packed(2, 1, 1, body(bytes([255, 127, 128]), harmonics)))
     g = gaussians_in(tmp_path / "a.spz")
@@ -556,7 +556,7 @@ def test_spz_of_other_programs_is_sorted_by_depth(tmp_path: Path, flags: int) ->
 
 
 class Splats:
-    """A model of which no more is known than that it has Gaussians."""
+    """A model that only has Gaussians."""
 
     scene = SimpleNamespace(warped=False, moving=False)
 

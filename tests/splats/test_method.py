@@ -41,7 +41,7 @@ def ball(logit: float = 20.0, **changes: Any) -> Gaussians:
 
 
 def test_cameras_that_cannot_be_drawn_are_refused_before_the_run_has_a_folder(tmp_path: Path) -> None:
-    """Panoramas, of which a method that casts rays learns."""
+    """Panoramas; a method that casts rays learns from them."""
     data = write_capture(tmp_path / "panoramas", 8, camera_model="EQUIRECTANGULAR")
     words = ("--data", data, "--output-dir", tmp_path / "out", "--vis", "none", "--max-num-iterations", 1)
     done = called("ns-train", "gaussian-splatting", *words)

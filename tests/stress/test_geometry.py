@@ -35,7 +35,7 @@ SOURCES = [file for name in ("framework", "methods") for file in (Path(__file__)
 
 
 def mentioned(pattern: str) -> list[str]:
-    """Files of the framework and its methods in which a pattern occurs."""
+    """Files of the framework and its methods that contain a pattern."""
     return [file.name for file in SOURCES if re.search(pattern, file.read_text(encoding="utf-8"), re.IGNORECASE)]
 
 

@@ -178,7 +178,7 @@ def test_cells_are_those_on_the_surface() -> None:
 
 
 def at_step_7(folder: Path) -> Loaded:
-    """A run without a model, of which no more is asked than what its panel says."""
+    """A run without a model; the tests only need the text of its panel."""
     placement = Placement(torch.eye(4)[:3].double(), 1.0)
     return Loaded(cast(Renderable, None), placement, "instant-ngp", folder, folder / "step-7.ckpt", 7)
 

@@ -1,12 +1,12 @@
-"""A network on a hash grid with the gradient of its first output, which can be learnt from.
+"""A network on a hash grid, with a differentiable gradient of its first output.
 
-The network has one hidden layer with ReLU, as in NeuS2 (Wang et al. 2023), whose second derivative is 0 almost
+The network has one hidden layer with ReLU, as in NeuS2 (Wang et al. 2023). The second derivative of ReLU is 0 almost
 everywhere. With features e(x) of the grid, h = W1 e, active units m = [h > 0] and outputs y = W2 (m h):
 
     dy_0 / de = W1^T (m w),      w the first row of W2
     n = dy_0 / dx = (de / dx)^T W1^T (m w)
 
-A loss with gradients dy by y and v by n has the gradients of dy . y + (dy_0 / dx) . v. With t = (de / dx) v:
+A loss with the gradients dy for y and v for n has the gradients of dy . y + (dy_0 / dx) . v. With t = (de / dx) v:
 
     by W2:  dy (m h)^T, and m W1 t added to the first row
     by W1:  (m W2^T dy) e^T + (m w) t^T
@@ -34,7 +34,7 @@ def distance_network_reference(
 ) -> Tensor:
     """Compute `distance_network` in PyTorch, for any device and float type, with derivatives of any order.
 
-    `positions`, `table`, `first`, `second`, `layout` and the result are as there.
+    `positions`, `table`, `first`, `second`, `layout` and the result are as in `distance_network`.
     """
     learns = torch.is_grad_enabled()
     with torch.enable_grad():

@@ -1,4 +1,4 @@
-"""Samples of a signed distance that is a ball plus a network's output: what stops light there, and its colour's inputs.
+"""Samples of a signed distance, a ball plus a network's output: their opacity or density, and inputs of their colour.
 
 With the outputs y and the gradient dy_0 / du of a network in the unit box (`distance.py`), u = (x - low) scale:
 
@@ -39,7 +39,8 @@ class Ball(NamedTuple):
     radius: float
     """Radius, scene units."""
     rounding: float
-    """Radius within which the ball is rounded off at its centre, scene units; a distance has no gradient there."""
+    """Radius around the centre within which the distance is smoothed, scene units, because it has no gradient at the
+    centre."""
 
 
 class Intervals(NamedTuple):
@@ -50,7 +51,7 @@ class Intervals(NamedTuple):
     lengths: Tensor
     """(N,) lengths, scene units."""
     annealing: float = 1.0
-    """Share of the slope's annealing that is done (`surface_opacity`)."""
+    """Fraction of the slope's annealing that is done (`surface_opacity`)."""
 
 
 def ball_distance(network: Tensor, positions: Tensor, ball: Ball) -> tuple[Tensor, Tensor]:

@@ -84,7 +84,7 @@ MUTANTS = {
         Mutant("se3-order", "PoseRefinement.forward", "A + B", "A - B",
             "poses are refined away from what is exported as refined",
             "test_pose_refinement.py::test_a_screw_turns_about_the_scenes_origin"),
-        Mutant("held-out-not-carried", "PoseRefinement.forward", "self.propagated(A)", "A",
+        Mutant("held-out-not-carried", "PoseRefinement.refined", "propagated_poses(A, B, C)", "A",
             "held-out cameras stay where they were while the learnt scene has drifted",
             "test_pose_refinement.py::test_held_out_cameras_follow_when_all_poses_drift_together"),
     ],

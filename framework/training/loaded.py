@@ -98,9 +98,8 @@ class Loaded:
             DataError: if the data cannot be read.
         """
         if split not in self._datasets:
-            dataset = load_split(self.run, split).to(self.model.device)
-            self._datasets[split] = with_refined_poses(self.model, dataset)
-        return self._datasets[split]
+            self._datasets[split] = load_split(self.run, split).to(self.model.device)
+        return with_refined_poses(self.model, self._datasets[split])  # which change while it trains
 
     def parsed(self, split: Split) -> ParsedScene:
         """Return the images of a split, not decoded, with their cameras.
@@ -281,7 +280,7 @@ class Loaded:
                 say(f"the errors of lengths are not known: {error}")
                 parsed = None
             self._cameras["train"] = None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
-        given = self._cameras["train"]  # and not their refined poses, which change in training
+        given = self._cameras["train"]
         return None if given is None else refined_cameras(self.model, given, training=True)
 
     def _view(self, camera: View | Cameras) -> View:

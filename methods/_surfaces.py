@@ -241,8 +241,9 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
     def __init__(
         self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
         # Meshes and crops cover what the field covers.
-        super().__init__(config, replace(scene, box=foreground(config, scene).box), field, sampler, renderer)
+        self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
         edges = self.surface.box[1] - self.surface.box[0]
         self.surface.cell = float((edges / config.grid_resolution).norm())

@@ -43,9 +43,8 @@ STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
 class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingConfigT]):
     """A model of Gaussians that are drawn onto whole images.
 
-    A method implements `start` and `loss`. It may override the colours of images (`lit`), their cameras (`camera`), the
-    parameters of Gaussians (`declared_columns`), their motion (`at_time`), the strategy (`make_strategy`) and the
-    rasteriser (`rasteriser`).
+    A method implements `start` and `loss`. It may override the colours of images (`lit`), the parameters of Gaussians
+    (`declared_columns`), their motion (`at_time`), the strategy (`make_strategy`) and the rasteriser (`rasteriser`).
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"

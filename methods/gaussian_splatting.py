@@ -13,7 +13,7 @@ from typing import ClassVar, Literal, TypeVar
 import torch
 from torch import Tensor
 
-from nerfloom import Cameras, Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
+from nerfloom import Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
@@ -24,7 +24,6 @@ from nerfloom.export.surfaces import found_surfaces
 from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, affine_colors
 from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.splats.blend import CHANNELS
-from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.losses.functions import mean_depth_error
 from nerfloom.method import DEPTH_REASONS
 from nerfloom.registry import load_method
@@ -159,7 +158,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
-        seen, pose = batch.view.camera, self._pose(batch)
+        seen, poses, index = batch.view.camera, self.poses, batch.index
+        pose = None if poses is None or index is None else poses.pose(index, seen.camera_to_worlds[0])
         octaves = self.sizes.next(self.progress)
         camera, target = splat_camera(seen, self.near, self.look(), pose, 1 << octaves), reduced(batch.rgb, octaves)
         gaussians = self.learnt_gaussians(batch.view.time)
@@ -217,25 +217,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
-    def _pose(self, batch: ViewBatch) -> Tensor | None:
-        """Return the refined pose (3, 4) of a batch's camera; None for its own."""
-        if self.poses is None:
-            return None
-        given = batch.view.camera.camera_to_worlds[0]
-        return self.poses.propagated_pose(given) if batch.index is None else self.poses.pose(batch.index, given)
-
-    def camera(self, camera: Cameras) -> SplatCamera:
-        """Return the camera of a view outside of training, corrected like the training cameras near it."""
-        pose = None if self.poses is None else self.poses.propagated_pose(camera.camera_to_worlds[0])
-        return splat_camera(camera, self.near, self.look(), pose)
-
-    def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras with refined poses.
-
-        Args:
-            cameras: M training cameras with the poses of the data.
-        """
-        return cameras if self.poses is None else self.poses.refined(cameras)
+    def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
+        return poses if self.poses is None else self.poses.refined(poses, training)
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

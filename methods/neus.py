@@ -2,7 +2,7 @@
 
 Wang et al., "NeuS: Learning Neural Implicit Surfaces by Volume Rendering for Multi-view Reconstruction", NeurIPS 2021.
 The hash grid and the network with ReLU are those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in
-Neuralangelo (Li et al. 2023).
+Neuralangelo (Li et al. 2023). `--encoding frequency` has the paper's networks.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """VolSDF: a signed distance on a hash grid; a Laplace distribution turns it into density.
 
 Yariv et al., "Volume Rendering of Neural Implicit Surfaces", NeurIPS 2021. The hash grid and the network with ReLU are
-those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neuralangelo (Li et al. 2023).
+those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neuralangelo (Li et al. 2023). `--encoding
+frequency` has the paper's networks.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> Non
     if isinstance(model, HasSignedDistance):
         if level is not None:
             raise FlagError(f"--isosurface-threshold: the surface of {loaded.method} is where its distance is 0")
-        cameras = loaded.run.parse("train").cameras
+        cameras = loaded.parsed("train").cameras
         _write(distance_mesh(model, lattice, cameras, cleaning, texturing), loaded.placement, path, start)
         return
     if not isinstance(model, HasDensity):
@@ -101,7 +101,7 @@ def marching_cubes(flags: MarchingCubesFlags, loaded: Loaded, path: Path) -> Non
     if level is None:
         level = default_level(model.scene.box)
         say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
-    cameras = loaded.run.parse("train").cameras
+    cameras = loaded.parsed("train").cameras
     mesh = density_mesh(model, lattice, level, flags.time, cameras, cleaning, texturing)
     _write(mesh, loaded.placement, path, start)
 

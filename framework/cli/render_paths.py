@@ -108,12 +108,12 @@ def path_views(
 
 
 def _interpolated(flags: InterpolateFlags, loaded: Loaded) -> Views:
-    parsed = loaded.run.parse("train")
+    parsed = loaded.parsed("train")
     return path_views(flags, loaded, parsed, walk_past(parsed, flags.num_frames))
 
 
 def _one_camera(flags: TimeFlags, loaded: Loaded) -> Views:
-    parsed = loaded.run.parse(flags.split)
+    parsed = loaded.parsed(flags.split)
     if not loaded.model.scene.moving:
         raise ConfigError("ns-render time: the photographs of this run have no times")
     if not 0 <= flags.camera_index < len(parsed.cameras):
@@ -129,7 +129,7 @@ def _circle(flags: OrbitFlags, loaded: Loaded) -> Views:
         middle, factor = scene.box.mean(0).cpu(), flags.outputs.downscale_factor
         cameras = orbit(around(scene), middle, flags.num_frames).scaled(1 / factor)
         return Views(cameras.to(loaded.model.device), None, flags.fps)
-    parsed = loaded.run.parse("train")
+    parsed = loaded.parsed("train")
     if scene.warped:
         raise ConfigError("ns-render orbit: this run knows what its cameras look at from the front only (--ndc)")
     # An object's centre is the box's; a capture's is the point that its cameras look at.
@@ -167,7 +167,7 @@ def walk_past(parsed: ParsedScene, num_frames: int) -> Cameras:
 
 
 def _spiral(flags: SpiralFlags, loaded: Loaded) -> Views:
-    model, parsed = loaded.model, loaded.run.parse("train")
+    model, parsed = loaded.model, loaded.parsed("train")
     middle = replace_poses(parsed.cameras, middle_pose(parsed.cameras)[None]).scaled(1 / parsed.downscale_factor)
     focus = focus_distance(model, middle.to(model.device), model.background)
     return path_views(flags, loaded, parsed, spiral(parsed.cameras, flags.num_frames, focus, flags.radius))

@@ -16,7 +16,6 @@ from nerfloom.base.console import say, track
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
-from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, fitted_colors, seen_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
@@ -68,8 +67,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     Raises:
         ConfigError: if an octree of a box cannot show what the run shows.
     """
-    model, dataset = _bakeable(loaded), loaded.dataset("train")
-    dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras)).to("cpu")
+    model, dataset = _bakeable(loaded), loaded.dataset("train").to("cpu")
     seed_step(loaded.run.config.machine.seed, 0)
     layout, raw, seen = _visible(model, dataset, settings.resolution)
     degree, kept = _chosen(seen.largest, settings)

@@ -19,7 +19,6 @@ from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import measure, spread, views_to_judge
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.evaluation.paths import around
-from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
     PageFacts,
@@ -33,7 +32,7 @@ from nerfloom.export.web import (
 )
 from nerfloom.geometry.regions import Region, inside_all
 from nerfloom.method import Method
-from nerfloom.renderable import Renderable, RendersRays
+from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
 from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
@@ -99,7 +98,7 @@ def export_page(
         cameras = around(model.scene)
         names = [f"view {number + 1}" for number in range(len(cameras))]
     else:
-        cameras, names = pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
+        cameras, names = pinhole(dataset.cameras), list(dataset.names)
     near = smallest_depth(model.scene)
     found, look = _gaussians(loaded, dataset, cameras, fit_seconds, moment, splatting)
     good = _finite(found)
@@ -146,7 +145,7 @@ def _closeness_to(
     """Compare Gaussians in the scene's frame with a run or file, on held-out views if there are any."""
     model = loaded.model
     held_out = None if loaded.source is None else first_split(loaded.source, ("test", "val"))
-    views = dataset if held_out is None else _at(held_out.to(model.device), moment)
+    views = dataset if held_out is None else _at(with_refined_poses(model, held_out.to(model.device)), moment)
     seen = cameras.to(model.device) if views is None else views.cameras
     return closeness(model, drawn.map(lambda values: values.to(model.device)), seen, views, near, look, moment)
 

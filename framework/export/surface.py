@@ -58,7 +58,7 @@ def surface_mesh(
     if kind == "tsdf":
         mesh = fused_mesh(model, loaded.dataset("train"), lattice, TRUNCATION, MOST_VIEWS, Cleaning())
     else:
-        cameras = loaded.run.parse("train").cameras
+        cameras = loaded.parsed("train").cameras
         if isinstance(model, HasSignedDistance):
             mesh = distance_mesh(model, lattice, cameras, Cleaning())
         else:

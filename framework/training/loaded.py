@@ -18,9 +18,10 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, write_scale
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.measuring import Length, measured, scale_of, surface_point
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, refined_cameras, with_refined_poses
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run
@@ -28,7 +29,10 @@ from nerfloom.training.run import Run
 
 @dataclass(frozen=True, repr=False)
 class Loaded:
-    """A renderable and its origin: the result of `nerfloom.load`."""
+    """A renderable and its origin: the result of `nerfloom.load`.
+
+    Cameras of its data stand where `Renderable.refined_poses` puts them, in the frame of the renderable's scene.
+    """
 
     model: Renderable
     """The renderable, on its device: a `nerfloom.Model` in evaluation mode, Gaussians, or an octree."""
@@ -95,7 +99,20 @@ class Loaded:
         """
         if split not in self._datasets:
             self._datasets[split] = load_split(self.run, split).to(self.model.device)
-        return self._datasets[split]
+        return with_refined_poses(self.model, self._datasets[split])  # which change while it trains
+
+    def parsed(self, split: Split) -> ParsedScene:
+        """Return the images of a split, not decoded, with their cameras.
+
+        Args:
+            split: train, val or test.
+
+        Raises:
+            ConfigError: for a file without data.
+            DataError: if the data cannot be read.
+        """
+        found = self.run.parse(split)
+        return replace(found, cameras=refined_cameras(self.model, found.cameras, split == "train"))
 
     def views(self, split: Split = "test") -> list[View]:
         """Return a view for each image of `split`: train, val or test."""
@@ -115,7 +132,7 @@ class Loaded:
         ending, known, found = Path(name).parts, set[str](), dict[Path, View]()
         for split in get_args(Split):
             try:
-                parsed = self.run.parse(split)
+                parsed = self.parsed(split)
             except DataError:
                 if split == "train":
                     raise
@@ -263,7 +280,8 @@ class Loaded:
                 say(f"the errors of lengths are not known: {error}")
                 parsed = None
             self._cameras["train"] = None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
-        return self._cameras["train"]
+        given = self._cameras["train"]
+        return None if given is None else refined_cameras(self.model, given, training=True)
 
     def _view(self, camera: View | Cameras) -> View:
         """Return a view as it is, or that of one camera on the model's device."""

@@ -87,9 +87,17 @@ MUTANTS = {
         Mutant("se3-order", "PoseRefinement.forward", "A + B", "A - B",
             "poses are refined away from what is exported as refined",
             "test_pose_refinement.py::test_a_screw_turns_about_the_scenes_origin"),
-        Mutant("held-out-not-carried", "PoseRefinement.forward", "self.propagated(A)", "A",
+        Mutant("held-out-not-carried", "PoseRefinement.refined", "propagated_poses(A, B, C)", "A",
             "held-out cameras stay where they were while the learnt scene has drifted",
             "test_pose_refinement.py::test_held_out_cameras_follow_when_all_poses_drift_together"),
+    ],
+    "nerfloom.fields.distance": [
+        Mutant("first-ball-not-fitted", "NetworkDistance._start", "now + A", "now",
+            "the papers' network starts as a potato",
+            "fields/test_distance.py::test_it_starts_as_a_ball"),
+        Mutant("distance-does-not-follow", "GridDistance.network", "found + A", "found",
+            "poses of neus are refined by the ball that it starts from alone",
+            "test_surfaces.py::test_distance_and_features_follow_the_position"),
     ],
     "nerfloom.fields.encoded": [
         Mutant("proposal-not-contracted", "BoxField._grid_density", "self.box if self.unbounded else None", "None",

@@ -8,9 +8,6 @@ MUTANTS = {
         Mutant("normals-in-scene-frame", "_points", "loaded.placement.original_directions(A)", "A.double()",
             "normals are in another frame than their points",
             "truth/test_export.py::test_exported_points_normals_and_colours_are_in_the_captures_frame"),
-        Mutant("exported-poses-unrefined", "_cameras", "refined_cameras(loaded.model, A)", "A",
-            "ns-export cameras writes the poses that came in",
-            "truth/test_export.py::test_refined_cameras_are_exported_where_they_are_believed_to_be"),
     ],
     "nerfloom.cli.render": [
         Mutant("frames-of-other-cameras", "_facts", "hash_of_tensors(*A, B)", '""',
@@ -113,7 +110,7 @@ MUTANTS = {
     ],
     "nerfloom.evaluation.measuring": [
         Mutant("picked-by-a-training-camera", "_first_surfaces", "replace(A, camera_indices=None)", "A",
-            "with refined poses, points at pixels are moved as the first training camera was",
+            "points at pixels are those of the first training image's own appearance",
             "evaluation/test_measuring.py::test_the_camera_of_a_picture_is_no_training_camera"),
     ],
     "nerfloom.evaluation.metrics": [
@@ -272,6 +269,12 @@ MUTANTS = {
         Mutant("error-of-stored-photographs", "Loaded._photographs", "A.scaled(B)", "A",
             "after training on reduced images, errors of lengths are too small by that factor",
             "evaluation/test_measuring.py::test_half_a_pixel_is_one_of_the_images_that_were_learnt_from"),
+        Mutant("exported-poses-unrefined", "Loaded.dataset", "with_refined_poses(self.model, A)", "A",
+            "ns-export cameras writes the poses that came in, and points are off the surfaces",
+            "truth/test_refined_poses.py::test_exported_cameras_stand_there_too"),
+        Mutant("lengths-by-given-cameras", "Loaded._photographs", "refined_cameras(A, B, training=True)", "B",
+            "errors of lengths are those of cameras that stand elsewhere",
+            "evaluation/test_measuring.py::test_lengths_are_measured_where_the_refined_cameras_stand"),
     ],
     "nerfloom.model": [
         Mutant("background-of-photographs", "Model.background",

@@ -29,6 +29,8 @@ MUTANTS = {
     "nerfloom.methods._captures": [
         Mutant("poses-refined-where-exact", "refinement_choice", "A == 'device'", "A != 'device'",
             "exact poses are refined, and a device's are not", "truth/test_run.py::test_cameras_are_the_captures"),
+        Mutant("rays-of-given-poses", "RefinedModel.loss", "replace(batch, rays=A)", "batch",
+            "poses are never refined", "truth/test_refined_poses.py::test_training_moves_rays_and_rendering_does_not"),
     ],
     "nerfloom.methods.instant_ngp": [
         Mutant("ngp-plan-of-longest", "plan", "A / FITTED_SECONDS", "FITTED_SECONDS / A",

@@ -179,6 +179,16 @@ TINY: dict[str, dict[str, Any]] = {
         "hidden_width": 32,
         "samples_per_batch": 4096,
     },
+    "neus+frequency": {
+        "encoding": "frequency",
+        "hidden_width": 32,
+        "position_frequencies": 2,
+        "grid_resolution": 16,
+        "num_steps": 48,
+        "samples_per_batch": 2048,
+        "learning_rate": 5e-3,
+        "start_radius": 0.6,
+    },
     "ref-nerf": {
         "num_levels": 4,
         "max_resolution": 64,
@@ -206,6 +216,16 @@ TINY: dict[str, dict[str, Any]] = {
         "num_steps": 64,
         "hidden_width": 32,
         "samples_per_batch": 4096,
+    },
+    "volsdf+frequency": {
+        "encoding": "frequency",
+        "hidden_width": 32,
+        "position_frequencies": 2,
+        "grid_resolution": 16,
+        "num_steps": 48,
+        "samples_per_batch": 2048,
+        "learning_rate": 5e-3,
+        "start_radius": 0.6,
     },
     "pixel-nerf": {
         "num_source_views": 3,

@@ -10,8 +10,9 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import read_object
+from nerfloom.processing.finite_numbers import UNUSABLE
 from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import UNUSABLE, evenly_spaced, undistorted_lens, write_folder
+from nerfloom.processing.phone import evenly_spaced, undistorted_lens, write_folder
 from nerfloom.processing.transforms import Lens
 
 

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfloom.base.errors import DataError
 from nerfloom.processing.transforms import Lens
 
 BAND = 256
 """Number of rows of a view that are computed at once, which bounds the memory."""
 MIN_SEEN = 0.25
 """Views with a smaller share of pixels inside the image are left out."""
-MIN_SIDE = 16
-"""Minimum side of a view, pixels."""
+MIN_SIDE, MAX_SIDE = 16, 16384
+"""Minimum and maximum side of a view, pixels."""
 _MODELS = {
     "OPENCV": ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4")),
     "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
@@ -75,10 +76,15 @@ def view_lens(lens: Lens, angle: float) -> Lens:
     Args:
         lens: lens of the image.
         angle: angle of view, degrees.
+
+    Raises:
+        DataError: if views would be too large.
     """
     density = lens.values["fl_x"] / (math.pi if lens.model == "EQUIRECTANGULAR" else 1)  # pixels per radian
     half = math.tan(math.radians(angle) / 2)
     side = max(2 * round(density * half), MIN_SIDE)
+    if side > MAX_SIDE:
+        raise DataError(f"views of {angle:g} degrees would have {side:.3g} pixels a side; use a smaller --view-angle")
     focal = side / 2 / half
     return Lens("OPENCV", {"w": side, "h": side, "fl_x": focal, "fl_y": focal, "cx": side / 2, "cy": side / 2})
 

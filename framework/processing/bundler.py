@@ -46,7 +46,8 @@ def read_capture(file: Path, listed: Path) -> Capture:
     names = [relative_name(_WITH_FOCAL.sub(r"\1", line.strip())) for line in _lines(listed)]
     if len(names) < cameras:
         raise DataError(f"{listed} lists {len(names)} images, but {file} has {cameras} cameras")
-    found, left_out = [], Counter[str]()
+    found: list[PosedCamera] = []
+    left_out: Counter[str] = Counter()
     for index in range(cameras):
         start = 2 + LINES_OF_CAMERA * index
         rows = [line.split() for line in lines[start : start + LINES_OF_CAMERA]]

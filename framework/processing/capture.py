@@ -37,7 +37,7 @@ class PosedCamera:
 
 @dataclass(frozen=True)
 class Capture:
-    """What a program found out about a set of photographs."""
+    """A set of photographs as a program placed it."""
 
     program: str
     """Name of the program, for messages."""

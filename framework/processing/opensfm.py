@@ -74,7 +74,8 @@ def read_capture(file: Path) -> Capture:
     largest = sizes.index(max(sizes))
     left_out = Counter({"in unconnected reconstructions": sum(sizes) - sizes[largest]})
     part = parts[largest]
-    lenses, cameras = part["cameras"], []
+    lenses: dict[str, Any] = part["cameras"]
+    cameras: list[PosedCamera] = []
     for name, shot in part["shots"].items():
         where = f"{file}: shot {shown(name)}"
         camera = _camera(name, shot, lenses, where)

@@ -87,7 +87,8 @@ def _with_lenses(
     prepared: Iterable[PreparedImage], placed: dict[Path, PosedCamera], frame: np.ndarray, images: Path
 ) -> tuple[list[_Posed], list[str]]:
     """Return the images whose size fits their camera, and messages about the others, which are removed."""
-    posed, misfits = [], []
+    posed: list[_Posed] = []
+    misfits: list[str] = []
     for image in prepared:
         camera = placed[Path(image.source)]
         try:

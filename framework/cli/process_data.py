@@ -1,4 +1,4 @@
-"""The command `ns-process-data`: conversion of images, a video or a phone's capture to a data folder."""
+"""The command `ns-process-data`: conversion of images, a video, or a capture with poses to a data folder."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.base.signals import Stopped, signal_of
 from nerfloom.cli.common import chosen_kind, run_command
 from nerfloom.cli.flags import read_flags
+from nerfloom.cli.process_programs import PROGRAMS
 from nerfloom.processing.settings import ColmapFlags, OutputFlags
+
+if TYPE_CHECKING:
+    from nerfloom.processing.reconstruction import Reconstruction
 
 USAGE = """\
 usage: ns-process-data KIND --data IN --output-dir OUT [flags]
@@ -23,8 +27,12 @@ kinds:
   images          a folder of images; COLMAP estimates their poses
   video           a video; COLMAP estimates the poses of its sharpest frames
                   (either kind accepts the other's input, and says so)
-  polycam         Polycam's raw export, with the phone's poses
-  record3d        Record3D's export with EXR and RGBD, with the phone's poses
+  polycam         Polycam's raw export, a folder or a zip file, with the phone's poses
+  record3d        Record3D's export with EXR and RGBD, or a recording (.r3d), with the phone's poses
+  metashape       photographs with the cameras of Agisoft Metashape (XML)
+  realitycapture  photographs with the cameras of RealityCapture or RealityScan (CSV)
+  odm             a project of OpenDroneMap or OpenSfM
+  bundler         photographs with the cameras of Bundler (bundle.out), which many programs write
 
 ns-process-data KIND --help shows its flags.
 """
@@ -43,6 +51,8 @@ class ImagesFlags(ColmapFlags):
             raise ConfigError("--masks-dir with --undistort: masks are not undistorted; leave one of them out")
         if self.masks_dir is not None and self.mask_moving:
             raise ConfigError("--masks-dir with --mask-moving: an image has one mask; leave one of them out")
+        if self.masks_dir is not None and self.camera_type == "equirectangular":
+            raise ConfigError("--masks-dir with --camera-type equirectangular: masks are not cut; leave out one")
         if self.masks_dir is not None and not self.masks_dir.is_dir():
             raise ConfigError(f"--masks-dir {self.masks_dir}: there is no such folder")
 
@@ -191,7 +201,8 @@ def _process_images(flags: ImagesFlags) -> None:
         return
     sources = find_images(flags.data, [flags.output_dir, *([] if flags.masks_dir is None else [flags.masks_dir])])
     begin(flags, sources)
-    process(Reconstruction(flags, ordered=is_sequence(sources)), flags.data, sources, flags.masks_dir)
+    state = Reconstruction(_with_lens(flags), ordered=is_sequence(sources))
+    process(state, *_as_views(state, flags.data, sources), flags.masks_dir)
 
 
 def _process_video(flags: VideoFlags) -> None:
@@ -205,29 +216,58 @@ def _process_video(flags: VideoFlags) -> None:
         return
     frame_count(flags.data)  # before anything is removed, check that the video can be read
     begin(flags, [Path(flags.data.name)])
-    state = Reconstruction(flags, ordered=True)
+    state = Reconstruction(_with_lens(flags), ordered=True)
     with state.timed("reading the video"):
         folder, sources = frames_of(flags.output_dir, flags.data, flags.num_frames_target)
-    process(state, folder, sources, None)
+    process(state, *_as_views(state, folder, sources), None)
+
+
+def _with_lens(flags: ColmapFlags) -> ColmapFlags:
+    """Return the flags with the camera model of the images: views of panoramas have no distortion."""
+    return flags if flags.camera_type == "perspective" else dataclasses.replace(flags, camera_model="PINHOLE")
+
+
+def _as_views(state: Reconstruction, folder: Path, sources: list[Path]) -> tuple[Path, list[Path]]:
+    """Return folder and paths of the images to reconstruct: the same ones, or the views of panoramas."""
+    if state.flags.camera_type == "perspective":
+        return folder, sources
+    from nerfloom.processing.panoramas import write_views
+    from nerfloom.processing.views import Views
+
+    flags = state.flags
+    with state.timed("cutting views"):
+        return write_views(
+            folder, sources, state.work, Views(flags.num_views, flags.view_angle, flags.views_up_and_down)
+        )
 
 
 def _convert_polycam(flags: PolycamFlags) -> None:
+    from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.output import claim
-    from nerfloom.processing.polycam import check, convert
+    from nerfloom.processing.polycam import check, convert, place
 
-    check(flags.data)
+    if flags.data.is_file():
+        check_archive(flags.data, place, "keyframes/images and keyframes/cameras; export Polycam's raw data")
+    else:
+        check(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
     crop = flags.crop_border_pixels
-    convert(flags.data, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
+    with unpacked(flags.data, flags.output_dir, place) as export:
+        convert(export, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
 
 
 def _convert_record3d(flags: Record3DFlags) -> None:
+    from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.output import claim
-    from nerfloom.processing.record3d import convert, find_root
+    from nerfloom.processing.record3d import convert, find_root, place
 
-    find_root(flags.data)
+    if flags.data.is_file():
+        check_archive(flags.data, place, "rgbd and metadata, which recordings of Record3D (.r3d) have")
+    else:
+        find_root(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
-    convert(flags.data, flags.output_dir, flags.num_downscales, flags.most)
+    with unpacked(flags.data, flags.output_dir, place) as export:
+        convert(export, flags.output_dir, flags.num_downscales, flags.most)
 
 
 KINDS: dict[str, tuple[type[OutputFlags], Callable[[Any], None]]] = {
@@ -235,6 +275,7 @@ KINDS: dict[str, tuple[type[OutputFlags], Callable[[Any], None]]] = {
     "video": (VideoFlags, _process_video),
     "polycam": (PolycamFlags, _convert_polycam),
     "record3d": (Record3DFlags, _convert_record3d),
+    **PROGRAMS,
 }
 
 

@@ -40,9 +40,30 @@ class OutputFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapFlags(OutputFlags):
+class ViewFlags(OutputFlags):
+    """Flags of the perspective views that panoramas are cut into."""
+
+    num_views: int = 8
+    """Number of views cut out of a panorama around the horizon, at equal angles; the first looks at its centre."""
+    view_angle: float = 90.0
+    """Angle of view of each, horizontal and vertical, degrees."""
+    views_up_and_down: bool = False
+    """Cut two further views that look straight up and straight down."""
+
+    def check(self) -> None:
+        super().check()
+        if not 1 <= self.num_views <= 64:
+            raise FlagError(f"--num-views is {self.num_views}; it must be from 1 to 64")
+        if not 10 <= self.view_angle <= 150:
+            raise FlagError(f"--view-angle is {self.view_angle}; it must be from 10 to 150 degrees")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapFlags(ViewFlags):
     """Flags of the estimation of poses."""
 
+    camera_type: Literal["perspective", "equirectangular"] = "perspective"
+    """Kind of the images: equirectangular ones are 360-degree panoramas, which are cut into perspective views."""
     camera_model: CameraModel = "OPENCV"
     """Lens model: OPENCV has distortion k1, k2, p1, p2; OPENCV_FISHEYE is for angles of view over about 120 degrees."""
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
@@ -83,6 +104,8 @@ class ColmapFlags(OutputFlags):
         super().check()
         if self.resume and self.overwrite:
             raise FlagError("--overwrite removes what --resume continues; leave out one of them")
+        if self.camera_type == "equirectangular" and self.camera_model == "OPENCV_FISHEYE":
+            raise FlagError("--camera-type equirectangular cuts perspective views; leave out --camera-model")
         minimums = {
             "exhaustive_limit": 0, "num_neighbors": 1, "sequential_overlap": 1,
             "max_image_size": 64, "max_num_features": 64,

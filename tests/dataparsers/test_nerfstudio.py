@@ -342,6 +342,19 @@ def test_rounded_matrices_are_rotations(capture: Path, digits: int) -> None:
     torch.testing.assert_close(rotations @ rotations.transpose(1, 2), unit, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("stated", ["none", "up", "pca", "vertical", 3])
+def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None:
+    """Entries of nerfstudio are followed where the flag leaves it to the data, and unknown ones are not."""
+    known = stated if stated in ("none", "up", "pca") else "auto"
+    expected = Nerfstudio(orientation_method=known).parse(capture, "train").transform
+    asked = Nerfstudio(orientation_method="pca").parse(capture, "train").transform
+    assert expected is not None
+    assert asked is not None
+    edit(capture, lambda content: content.update(orientation_override=stated))
+    assert torch.equal(Nerfstudio().parse(capture, "train").transform, expected)  # type: ignore[arg-type]
+    assert torch.equal(Nerfstudio(orientation_method="pca").parse(capture, "train").transform, asked)  # type: ignore[arg-type]
+
+
 def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (capture / "depth").mkdir()
     write_exr(capture / "depth" / "000.exr", {"Z": np.full((HEIGHT, WIDTH), 2.5, np.float32)})

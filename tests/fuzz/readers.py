@@ -53,9 +53,13 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.geometry.regions import read_region
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.octrees.files import read_octree, write_octree
-from nerfloom.processing import polycam, record3d
+from nerfloom.processing import bundler, metashape, opensfm, polycam, realitycapture, record3d
+from nerfloom.processing.capture import Capture
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
+from nerfloom.processing.named_images import placed_images
+from nerfloom.processing.posed_folder import write_capture as write_placed
+from nerfloom.processing.views import Views
 from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import MAX_BLUR, MIN_BLUR, Look
@@ -78,6 +82,7 @@ from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
 from tests.octrees.balls import ball
+from tests.processing.programs import write_bundler, write_metashape, write_odm, write_realitycapture
 from tests.splats.foreign_files import write_compressed, write_ksplat, write_splat
 from tests.training.helpers import tiny_run
 
@@ -318,6 +323,40 @@ def convert_record3d(folder: Path, scratch: Path) -> None:
     parse(Nerfstudio(), scratch / "data", scratch)
 
 
+# -- other programs -----------------------------------------------------------------------------------------------
+
+
+def convert(read: Callable[[Path], Capture], images: str, folder: Path, scratch: Path) -> None:
+    """Write and parse the data folder of a capture that another program placed."""
+    capture = read(folder)
+    placed = placed_images(folder / images, capture)
+    require(capture.total >= len(placed.cameras), "more images than cameras")
+    (scratch / "data").mkdir()
+    write_placed(folder / images, capture, placed, scratch / "data", 0, Views(4, 90.0))
+    parse(Nerfstudio(), scratch / "data", scratch)
+
+
+def read_metashape(folder: Path) -> Capture:
+    return metashape.read_capture(folder / "cameras.xml")
+
+
+def read_realitycapture(folder: Path) -> Capture:
+    return realitycapture.read_capture(folder / "cameras.csv")
+
+
+def read_odm(folder: Path) -> Capture:
+    return opensfm.read_capture(opensfm.find_reconstruction(folder))
+
+
+def read_bundler(folder: Path) -> Capture:
+    return bundler.read_capture(folder / "bundle.out", folder / "list.txt")
+
+
+OPENSFM = (
+    "projection_type", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots", "coordinates",
+)  # fmt: skip
+
+
 # -- runs ---------------------------------------------------------------------------------------------------------
 
 
@@ -537,6 +576,12 @@ READERS: dict[str, Reader] = {
     "record3d-raw": Reader(
         write_record3d_whole, convert_record3d, ("EXR_RGBD/metadata.json",), ("perFrameIntrinsicCoeffs", "K", "w")
     ),
+    "metashape": Reader(write_metashape, partial(convert, read_metashape, "photographs"), ("cameras.xml",)),
+    "realitycapture": Reader(
+        write_realitycapture, partial(convert, read_realitycapture, "photographs"), ("cameras.csv",)
+    ),
+    "odm": Reader(write_odm, partial(convert, read_odm, "images"), ("opensfm/reconstruction.json",), OPENSFM),
+    "bundler": Reader(write_bundler, partial(convert, read_bundler, "photographs"), ("bundle.out", "list.txt")),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
     "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius")),

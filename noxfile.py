@@ -90,7 +90,7 @@ def tests(session: nox.Session, torch: str) -> None:
 
 @nox.session(python=PYTHONS)
 def without_torch(session: nox.Session) -> None:
-    """Compile every file, and run the tests that need no torch: for a Python whose torch cannot be had here."""
+    """Compile every file, and run the tests that need no torch, for versions of Python without a torch here."""
     needs = ("numpy", "scipy", "tyro", "rich", "imageio", "pillow", "PyYAML", "pycolmap", "jinja2", "trimesh")
     session.install("-c", str(ROOT / "constraints.txt"), *needs, "pytest", "hypothesis")
     session.install("--no-deps", "-e", str(ROOT))

@@ -1,9 +1,9 @@
 """Builds the CPU kernels: plain shared libraries with a C interface, for one instruction set or for each.
 
-They know nothing of Python or torch, so one wheel a platform serves every Python and every torch version. Without a
-compiler the installation goes on without them, and a variant whose flags the compiler does not know is left out.
+They use neither Python nor torch, so one wheel per platform serves every version of both. Without a compiler, the
+installation continues without kernels, and it skips instruction sets that the compiler does not know.
 
-Only the variant that this machine chooses is built. With NERFLOOM_VARIANTS=all every one is, which takes five times as
+Only the library that this machine chooses is built. With NERFLOOM_VARIANTS=all every one is, which takes five times as
 long: for wheels, which other machines install.
 """
 
@@ -43,7 +43,7 @@ if platform.machine().lower() in ("x86_64", "amd64"):
 
 
 def fitting(variants: dict[str, list[str]]) -> dict[str, list[str]] | None:
-    """Return those of `variants` for whose flags -mNAME Linux lists this processor's NAME; None if it lists none."""
+    """Return the `variants` with flags -mNAME that Linux lists for this processor; None if it lists none."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

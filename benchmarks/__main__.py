@@ -109,7 +109,7 @@ def _tables(flags: TablesFlags) -> None:
     try:
         wanted = re.compile(flags.only)
     except re.error as error:
-        raise FlagError(f"--only {shown(flags.only)} is no regular expression: {error}") from error
+        raise FlagError(f"--only {shown(flags.only)} is not a regular expression: {error}") from error
     check_weights(flags.lpips_weights)
     tables = [
         read_table(path, flags.data_root, flags.run_dir, flags.seconds_scale, flags.lpips_weights, flags.num_threads)

@@ -21,13 +21,13 @@ from torch import Tensor
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.geometry.alignment import align_cameras, pose_errors
 from nerfloom.kernels.math import cross_matrix
+from nerfloom.methods._captures import ProposedConfig
 from nerfloom.registry import load_dataparser, load_method
-from nerfloom.samplers.choice import SamplingConfig
+from nerfloom.renderable import refined_cameras, with_refined_poses
 from nerfloom.training.machine import machine
 from nerfloom.training.run import Run, create_folder
 from nerfloom.training.trainer import Trainer
@@ -90,7 +90,7 @@ def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
 
 
 def refinable(method: str) -> Any:
-    """Return the settings of a method that refines poses; with proposals if it casts rays: marches have no gradient.
+    """Return the settings of a method that refines poses; with proposals if it needs them: marches have no gradient.
 
     Args:
         method: name of the method.
@@ -101,7 +101,7 @@ def refinable(method: str) -> Any:
     config = load_method(method).config
     if not hasattr(config, "camera_optimizer"):
         raise ConfigError(f"--method {method}: it cannot refine poses: it has no --camera-optimizer")
-    return replace(config, sampler="proposal") if isinstance(config, SamplingConfig) else config
+    return replace(config, sampler="proposal") if isinstance(config, ProposedConfig) else config
 
 
 def trained(method: str, data: Dataset, seconds: float, camera_optimizer: str) -> Trainer:
@@ -134,17 +134,17 @@ def errors(trainer: Trainer, data: Dataset, exact: Dataset, test: Dataset) -> di
         exact: training images with the true poses.
         test: test images with the true poses.
     """
-    refinement = next((m for m in trainer.model.modules() if isinstance(m, PoseRefinement)), None)
-    refined = data.cameras if refinement is None else refinement.refined(data.cameras)
+    refined = refined_cameras(trainer.model, data.cameras, training=True)
     truth = exact.cameras.camera_to_worlds
     before, after = pose_errors(data.cameras.camera_to_worlds, truth), pose_errors(refined.camera_to_worlds, truth)
     carried = carry(test.cameras, truth, data.cameras.camera_to_worlds)  # the model refines them further
+    shown = with_refined_poses(trainer.model, replace(test, cameras=carried))
     return {
         "median angle before, degrees": round(before.median_angle, 4),
         "median angle after, degrees": round(after.median_angle, 4),
         "median centre error before, of the extent": round(before.median_distance, 6),
         "median centre error after, of the extent": round(after.median_distance, 6),
-        "test PSNR, dB": round(evaluate(trainer.model, replace(test, cameras=carried)).results["psnr"], 2),
+        "test PSNR, dB": round(evaluate(trainer.model, shown).results["psnr"], 2),
         "steps": trainer.state.step,
     }
 

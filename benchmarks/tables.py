@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.curves import conditions
-from nerfloom.base.config import from_plain, read_yaml
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, shown
+from nerfloom.base.plain import from_plain, read_yaml
 from nerfloom.benchmarks.results import add_row, read_rows
 from nerfloom.comparison.measures import measure, read_json
 from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, PlannedRun, split_words
@@ -117,9 +117,7 @@ def read_table(
         for row in _rows(block, f"{path}: rows {number + 1}", root.resolve(), runs.resolve(), scale):
             row = replace(row, conditions=replace(row.conditions, lpips_weights=weights, num_threads=num_threads))
             if not re.fullmatch(r"[\w.-]+", row.name):
-                raise ConfigError(
-                    f"{path}: {shown(row.name)} is no name of a row; take letters, digits and hyphens for names"
-                )
+                raise ConfigError(f"{path}: {shown(row.name)} is not a name for a row; use letters, digits and hyphens")
             if row.name in rows:
                 raise ConfigError(f"{path}: two rows are called {row.name}; rename the data or method of one")
             rows[row.name] = row

@@ -55,7 +55,7 @@ class Blender(DataParser):
     """Distance from a camera where the scene ends, in the input's units. Default: 6 for NeRF-Synthetic, otherwise
     from cameras and cube."""
     placement: Path | None = None
-    """dataparser_transforms.json of a run whose placement to use instead of one from silhouettes and cameras."""
+    """dataparser_transforms.json of a run. Its placement is used instead of one from silhouettes and cameras."""
     multiscale: int = 1
     """Number of sizes of each image in use: 1, 1/2, 1/4, ... The loss is weighted by the area of pixels. 4 is
     Mip-NeRF's multiscale protocol."""

@@ -198,7 +198,7 @@ def _stated_size(matrix: Tensor | None) -> tuple[float, float] | None:
 
 
 def _sphere(file: Path, matrices: Mapping[int, Tensor], numbers: list[int], quiet: bool) -> StatedRegion | None:
-    """Return the sphere to which the scale_mat of the views map the unit sphere; None if they have none."""
+    """Return the unit sphere transformed by the views' scale_mat; None if they have none."""
     used = [(number, matrices[number]) for number in numbers if number in matrices]
     if not used:
         if not quiet:

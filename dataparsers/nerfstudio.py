@@ -33,6 +33,8 @@ TRANSFORMS = "transforms.json"
 """File that identifies the format."""
 EvalMode = Literal["interval", "fraction", "filename", "all"]
 """Rule for held-out images."""
+STATED_ORIENTATIONS = ("none", "up", "pca")
+"""Values of `orientation_override`, nerfstudio's entry, that are known here."""
 MILLIMETRE = 0.001
 """Default units of the input per unit of a stored depth, as in nerfstudio."""
 
@@ -67,9 +69,20 @@ class Nerfstudio(Captured):
         if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
             say("depths in EXR files are read as millimetres; use --depth-unit-scale-factor 1 if they are in metres")
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
-        scene = captured_scene(self, images, split, self._division(split, lists), _applied(content, file))
+        scene = captured_scene(
+            self._oriented(content), images, split, self._division(split, lists), _applied(content, file)
+        )
         scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
         return _from_original(_with_cube(scene, content, file, self.scene_scale), content, file)
+
+    def _oriented(self, content: dict[str, Any]) -> Nerfstudio:
+        """Return the flags with the up direction that the file states, if it is left to the data.
+
+        Devices and other programs know which way is up, also where cameras look straight down.
+        """
+        stated = content.get("orientation_override")
+        known = self.orientation_method == "auto" and stated in STATED_ORIENTATIONS
+        return replace(self, orientation_method=stated) if known else self
 
     def _division(self, split: Split, lists: dict[str, set[str]]) -> Division | None:
         if lists:

@@ -22,17 +22,18 @@ def image_names(folder: Path) -> list[str]:
 
 
 def last_number(name: str) -> str | None:
-    """Return the last number in `name` without leading zeros, its ending left out; None if there is none."""
+    """Return the last number in `name`, without leading zeros; None if there is none. The extension is ignored."""
     found = LAST_NUMBER.search(without_ending(name))
     return None if found is None else str(int(found[1]))
 
 
 def partners(names: Sequence[str], others: Sequence[str]) -> tuple[list[int | None], str]:
-    """Return which of N others belongs to each of M names, and the words for what they were matched by.
+    """Return the partner of each of M names among N others, and the word for how they were matched.
 
-    Names without ending are compared, then the last numbers in them. If neither finds a partner for every name, but
-    there are as many others, they may be matched by order: if their numbers differ by a constant, as those that start
-    at 0 and at 1, or if no name and no number agrees. Otherwise those without a partner have none.
+    Names without their extensions are compared, then the last numbers in them. If neither finds a partner for every
+    name and there are as many others as names, they may be matched by order: if their numbers differ by a constant,
+    such as when one list starts at 0 and the other at 1, or if no name and no number agrees. Otherwise, names without a
+    partner stay without one.
 
     Args:
         names: M names of images, in order.
@@ -54,7 +55,7 @@ def partners(names: Sequence[str], others: Sequence[str]) -> tuple[list[int | No
 
 
 KEYS: tuple[tuple[Callable[[str], str | None], str], ...] = ((without_ending, "name"), (last_number, "number"))
-"""What two names may have in common, and the word for it."""
+"""The parts that two names may share, and the word for each."""
 
 
 def _shifted(names: Sequence[str | None], others: Sequence[str | None]) -> list[int | None] | None:

@@ -25,8 +25,8 @@ class Captured(DataParser):
     scene_scale: float = 1.0
     """Half the side of the region of interest, a cube around the origin, scene units."""
     orientation_method: Orientation = "auto"
-    """Up direction: the cameras' mean up direction (up), of photographs that lie on their side what is up then (auto),
-    the axis of least spread of the cameras' positions (pca), or unchanged."""
+    """Up direction. up: the cameras' mean up direction; auto: the same, corrected for photographs that lie on their
+    side; pca: the axis of least spread of the cameras' positions; none: unchanged."""
     center_method: Center = "poses"
     """Origin: the cameras' mean position (poses), the point that they look at (focus), or unchanged. No effect on data
     that states a region of interest (dtu, sdfstudio), which becomes the cube."""
@@ -34,7 +34,7 @@ class Captured(DataParser):
     """Scale camera positions to fit the cube from -1 to 1. If long lenses show less than half a scene unit of what most
     cameras look at, it is enlarged until they show one. No effect on data that states a region of interest."""
     placement: Path | None = None
-    """dataparser_transforms.json of a run, ours or nerfstudio's, whose placement is taken instead of all of these."""
+    """dataparser_transforms.json of a run, ours or nerfstudio's. Its placement is used instead of all of these."""
     eval_interval: int = 8
     """Interval of held-out images, by sorted name, which are both val and test split; 0 holds out none."""
     near: float | None = None
@@ -56,7 +56,7 @@ class StatedRegion:
     half: Tensor
     """(3,) float64 half of the box's edges, which are parallel to the input's axes; of a ball, its radius."""
     is_ball: bool
-    """Whether it is a ball, whose box in the scene has edges parallel to the scene's axes."""
+    """Whether the region is a ball. The box around a ball has edges parallel to the scene's axes."""
 
 
 @dataclass(frozen=True)

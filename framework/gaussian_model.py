@@ -23,6 +23,7 @@ from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
 from nerfloom.splats.mcmc import Mcmc, shaken
 from nerfloom.splats.rasteriser import Projected
+from nerfloom.splats.relocation import Relocation
 from nerfloom.splats.resolution import ImageSizes, most_octaves
 from nerfloom.splats.settings import SplattingConfig, SplattingConfigT
 from nerfloom.splats.start import from_points, scene_size
@@ -34,6 +35,7 @@ MAX_NEW_GAUSSIANS = 1_000
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
     "mcmc": lambda config: Mcmc(),
+    "relocation": lambda config: Relocation(),
 }
 """Strategies by their name in the setting `strategy`."""
 
@@ -41,9 +43,8 @@ STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
 class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingConfigT]):
     """A model of Gaussians that are drawn onto whole images.
 
-    A method implements `start` and `loss`. It may override the colours of images (`lit`), their cameras (`camera`), the
-    parameters of Gaussians (`declared_columns`), their motion (`at_time`), the strategy (`make_strategy`) and the
-    rasteriser (`rasteriser`).
+    A method implements `start` and `loss`. It may override the colours of images (`lit`), the parameters of Gaussians
+    (`declared_columns`), their motion (`at_time`), the strategy (`make_strategy`) and the rasteriser (`rasteriser`).
     """
 
     batches: ClassVar[Literal["pixels", "views"]] = "views"

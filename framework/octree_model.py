@@ -1,4 +1,4 @@
-"""A model whose leaves of an octree are learnt from photographs."""
+"""A model of an octree that learns its leaves from photographs."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ class OctreeConfig(
 
 
 class LeafTable(nn.Module):
-    """A value of each leaf.
+    """Learnt values of the leaves.
 
     Args:
-        name: name in logs of the learning rate.
+        name: name of the learning rate in logs.
         rate: learning rate.
         width: number of values of a leaf.
     """
@@ -65,7 +65,7 @@ class LeafTable(nn.Module):
 
 
 class OctreeModel(Model[OctreeConfig], DrawsOctree):
-    """An octree whose density and colour are learnt; where its leaves are is set by `set_octree`.
+    """An octree with learnt density and colour; `set_octree` sets the positions of its leaves.
 
     Args:
         config: the settings.
@@ -82,7 +82,7 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
         self.layout = OctreeLayout.build(scene.box[0].cpu(), 1.0, (1, 1, 1), cells)[0]
 
     def set_octree(self, layout: OctreeLayout, raw: Tensor, coefficients: Tensor) -> None:
-        """Set leaves and their values.
+        """Set the leaves and their values.
 
         Args:
             layout: where the L leaves are.
@@ -93,7 +93,7 @@ class OctreeModel(Model[OctreeConfig], DrawsOctree):
         self.densities.table.data, self.colors.table.data = raw.contiguous(), coefficients.contiguous()
 
     def depths(self) -> Tensor:
-        """Return the optical depth (L,) of a cell's edge, of each leaf, without gradient."""
+        """Return the optical depth (L,) of a cell's edge in each leaf, without gradient."""
         return depths_of(self.densities.table.detach()[:, 0])
 
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:

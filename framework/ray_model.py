@@ -12,7 +12,6 @@ from torch import Tensor
 from nerfloom.base.config import RayConfig
 from nerfloom.base.step_kind import StepKind
 from nerfloom.cameras.cameras import subpixels
-from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.view import View
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
@@ -57,8 +56,6 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
-        self.poses: PoseRefinement | None = None
-        """Refinement of the training cameras' poses; None for fixed poses."""
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
         self.covisible_space = CovisibleSpace(scene.box) if starts else None
 
@@ -66,10 +63,9 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         """Render R rays.
 
         Args:
-            rays: the rays; R may be 0.
+            rays: the rays, in the frame of the scene; R may be 0.
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
-        rays = rays if self.poses is None else self.poses(rays)
         rays = rays if self.covisible_space is None else self.covisible_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
         return self.renderer.render(rays, samples, self.field, background)
@@ -78,7 +74,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         """Return the terms of `losses` on a batch.
 
         Args:
-            batch: pixels with their true colours.
+            batch: pixels with their true colours, and rays in the frame of the scene.
             step: number of training steps done.
         """
         factors = {term: term.factor(self.config, step) for term in self.losses}
@@ -96,7 +92,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:
         """Return the mean squared error of a batch's colours if a native call can compute it; else None."""
-        if not self.plain or self.poses is not None:
+        if not self.plain:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
         parts = self.sampler, self.field, self.renderer
@@ -160,8 +156,8 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
 
     @property
     def _renders_plainly(self) -> bool:
-        """True without refined poses, an overridden `render` or another renderer than `VolumeRenderer`."""
-        return self.plain and self.poses is None and type(self.renderer) is VolumeRenderer
+        """True without an overridden `render` or another renderer than `VolumeRenderer`."""
+        return self.plain and type(self.renderer) is VolumeRenderer
 
     def step_kind(self, step: int) -> StepKind:
         if not self.steps_repeat:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import ClassVar, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from nerfloom.base.protocols import SeesRegistered
 from nerfloom.cameras.cameras import Cameras
+from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
@@ -25,7 +27,10 @@ PartT = TypeVar("PartT")
 
 
 class Renderable(ABC):
-    """Something that can be rendered: a trained model, a file of Gaussians, an octree, or a combination of others."""
+    """Something that can be rendered: a trained model, a file of Gaussians, an octree, or a combination of others.
+
+    Views, rays and points are in the frame of its scene. Cameras of the data stand there after `refined_poses`.
+    """
 
     scene: Scene
     """The scene: its box, near and far distance, and whether it moves and images have alpha."""
@@ -42,9 +47,21 @@ class Renderable(ABC):
         """Render an image in evaluation mode, without gradient.
 
         Args:
-            view: the camera, on `device`.
+            view: the camera, on `device`, in the frame of the scene.
             background: (3,) colour in [0, 1] of the background.
         """
+
+    def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
+        """Return where cameras of the data stand in the scene: poses (M, 3, 4), by default the given ones.
+
+        A model that refines poses learns the scene as its moved training cameras see it.
+
+        Args:
+            poses: (M, 3, 4) camera-to-scene poses of the data, on any device.
+            training: whether they are those of all training images, in their order. Cameras of other images follow the
+                training cameras around them.
+        """
+        return poses
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
         """Render only the colours (H, W, 3) of an image, as `render_view` does. Override it with a faster way.
@@ -91,7 +108,7 @@ class RendersRays(Renderable):
         """Render R rays, within `Renderable.rendering`.
 
         Args:
-            rays: the rays; R may be 0.
+            rays: the rays, in the frame of the scene; R may be 0. Their camera indices choose the appearance alone.
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
 
@@ -121,15 +138,11 @@ class HasAppearance(Protocol, metaclass=SeesRegistered):
 
 
 @runtime_checkable
-class RefinesPoses(Protocol):
+class RefinesPoses(Protocol, metaclass=SeesRegistered):
     """A model that can refine the poses of the training cameras."""
 
-    def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras with their refined poses.
-
-        Args:
-            cameras: M training cameras with their given poses.
-        """
+    poses: PoseRefinement | None
+    """The refinement; None if the settings do not use it."""
 
 
 @runtime_checkable
@@ -146,6 +159,37 @@ class HasSignedDistance(Protocol):
 
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
         """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3)."""
+
+
+def refined_cameras(model: Renderable, cameras: Cameras, training: bool) -> Cameras:
+    """Return cameras of the data where they stand in the scene of a model (`Renderable.refined_poses`).
+
+    Args:
+        model: the model.
+        cameras: M cameras with the poses of the data.
+        training: whether they are those of all training images, in their order.
+    """
+    return replace(cameras, camera_to_worlds=model.refined_poses(cameras.camera_to_worlds, training))
+
+
+def with_refined_poses(model: Renderable, dataset: Dataset) -> Dataset:
+    """Return images of the data with their cameras where they stand in the scene of a model.
+
+    Args:
+        model: the model.
+        dataset: images with the poses of the data.
+    """
+    return replace(dataset, cameras=refined_cameras(model, dataset.cameras, dataset.training))
+
+
+def training_poses(model: Renderable) -> Tensor | None:
+    """Return where the training cameras stand in the scene, (M, 3, 4) poses; None if they are not known.
+
+    Args:
+        model: the model.
+    """
+    given = model.scene.camera_to_worlds
+    return None if given is None else model.refined_poses(given, training=True)
 
 
 def parts(whole: Renderable | nn.Module, kind: Callable[..., PartT]) -> list[PartT]:

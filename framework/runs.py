@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from nerfloom.base.arguments import arguments_of
-from nerfloom.base.config import from_plain, to_plain
 from nerfloom.base.errors import ConfigError, nearest
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.opened import Opened
 from nerfloom.registry import load_dataparser, load_method, registered, summary
@@ -30,11 +30,11 @@ def list_methods() -> dict[str, str]:
 
 
 def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Opened:
-    """Load a trained run, a file of Gaussians, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
 
     Args:
-        path: folder of the run, its config.yml, a folder above it (for its newest run), a file of Gaussians (.ply,
-            .spz, .splat), or an octree (.octree).
+        path: folder of the run, its config.yml, a folder above it (for its newest run), a blocks.yml or its folder, a
+            file of Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree).
         data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
 
@@ -50,9 +50,10 @@ def process(photographs: str | Path, output_dir: str | Path, kind: str = "images
     """Find the poses of photographs, as `ns-process-data` does, and return the data folder.
 
     Args:
-        photographs: folder of photographs, a video, or the export of a phone's app.
+        photographs: folder of photographs, a video, or the export of a phone's app or of another program.
         output_dir: folder to write; new or empty.
-        kind: images, video (each takes the other's input, too), polycam or record3d.
+        kind: images, video (each takes the other's input, too), polycam, record3d, metashape, realitycapture, odm or
+            bundler.
         settings: flags of `ns-process-data` by name, with underscores, as in `matching_method="sequential"`.
 
     Raises:

@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, Literal, TypeVar
 
+from torch import Tensor
+
 from nerfloom import (
-    Cameras,
     ConfigError,
     Decision,
     Field,
+    Loss,
+    PixelBatch,
     RayModel,
     Renderer,
     Sampler,
     Scene,
 )
-from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.refinement import POSE_REASONS, PoseRefinement
@@ -35,20 +38,25 @@ MARCHED_SAMPLES = 2**16
 
 
 @dataclass(frozen=True)
-class RefinedConfig(SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=AUTO):
+class RefinedConfig(RayConfig):
     """Settings of a method that may refine the poses of its training cameras."""
 
     RANGES: ClassVar[dict[str, Range]] = {"camera_learning_rate": AT_LEAST_0}
     """Allowed range of each numeric setting."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
-    """Refinement of the training cameras' poses. auto: SO3xR3 if a device tracked them and proposals choose the
-    samples, otherwise off."""
+    """Refinement of the training cameras' poses. auto: SO3xR3 if a device tracked them, otherwise off. A method that
+    learns a density needs --sampler proposal for it; with an occupancy grid, auto is off."""
     camera_learning_rate: float = 1e-3
     """Initial learning rate of the poses."""
 
 
 @dataclass(frozen=True)
-class CaptureConfig(RefinedConfig):
+class ProposedConfig(RefinedConfig, SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=AUTO):
+    """Settings of a method that refines poses with proposals, whose number of samples suits the time."""
+
+
+@dataclass(frozen=True)
+class CaptureConfig(ProposedConfig):
     """Settings of a method for captures."""
 
     RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0}
@@ -66,7 +74,7 @@ RefinedConfigT = TypeVar("RefinedConfigT", bound=RefinedConfig)
 CaptureConfigT = TypeVar("CaptureConfigT", bound=CaptureConfig)
 
 
-def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
+def refined_sampler_choice(config: ProposedConfig, contracted: bool) -> Choice:
     """Return the sampler from `sampler_choice`, or proposals if pose refinement is selected.
 
     Args:
@@ -78,15 +86,16 @@ def refined_sampler_choice(config: RefinedConfig, contracted: bool) -> Choice:
     return choice
 
 
-def refinement_choice(config: RefinedConfig, scene: Scene) -> Choice:
+def refinement_choice(scene: Scene, marched: bool) -> Choice:
     """Return whether to refine poses.
 
     Args:
-        config: the method's settings; the sampler is chosen.
+        scene: properties of the data.
+        marched: whether samples carry no gradient to rays.
     """
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
     reason = POSE_REASONS[scene.poses]
-    if config.sampler != "proposal" and refined != "off":
+    if marched and refined != "off":
         refined, reason = "off", MARCHED_REASON
     return Choice("camera_optimizer", refined, reason, "pose refinement")
 
@@ -114,7 +123,7 @@ def decide_capture(
         Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
         Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
         *own,
-        refinement_choice(config, scene),
+        refinement_choice(scene, config.sampler != "proposal"),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES) if config.contraction else (config, [])
     config, counts = fill(config, *samples_choices(config, proposals))
@@ -125,27 +134,36 @@ class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
     """A model whose training poses can be refined.
 
     Raises:
-        ConfigError: if poses are refined in normalised device coordinates or without proposals.
+        ConfigError: if poses are refined in normalised device coordinates, or by samples that carry no gradient to
+            rays.
     """
 
     def __init__(
         self, config: RefinedConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
         super().__init__(config, scene, field, sampler, renderer)
+        self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             if scene.warped:
                 raise ConfigError("--camera-optimizer: poses cannot be refined in normalised device coordinates")
-            if config.sampler != "proposal":
+            if not sampler.carries_gradients:
                 raise ConfigError(f"--camera-optimizer needs --sampler proposal: {MARCHED_REASON}")
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
             self.poses.optimised = Optimised(
                 "poses", config.camera_learning_rate, schedule="exponential", warmup_steps=POSE_WARMUP
             )
 
-    def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras with refined poses.
+    def loss(self, batch: PixelBatch, step: int) -> Loss:
+        """Return the terms of `losses` on a batch.
 
         Args:
-            cameras: M training cameras with the poses of the data.
+            batch: pixels with their true colours, and rays from the poses of the data. Rays without cameras, such as a
+                teacher's, are not moved.
+            step: number of training steps done.
         """
-        return cameras if self.poses is None else self.poses.refined(cameras)
+        if self.poses is not None and batch.rays.camera_indices is not None:
+            batch = replace(batch, rays=self.poses(batch.rays))
+        return super().loss(batch, step)
+
+    def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
+        return poses if self.poses is None else self.poses.refined(poses, training)

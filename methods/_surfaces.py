@@ -9,16 +9,19 @@ from typing import ClassVar, Generic, Literal, TypedDict, TypeVar
 import torch
 from torch import Tensor
 
-from nerfloom import ConfigError, Decision, Points, RayModel, Rays, Rendered, Samples, Scene
+from nerfloom import ConfigError, Decision, Points, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.fields.distance import Distance, GridDistance, NetworkDistance
 from nerfloom.fields.inverted import InvertedField
+from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.losses.surfaces import (
     Curvature,
@@ -29,6 +32,7 @@ from nerfloom.losses.surfaces import (
     SurfacePoints,
 )
 from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
+from nerfloom.methods._captures import RefinedConfig, RefinedModel, refinement_choice
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
@@ -38,6 +42,7 @@ from nerfloom.samplers.background import BackgroundConfig, decide_background, fo
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import decide_samples
 from nerfloom.samplers.choice import make_sampler as occupancy_sampler
+from nerfloom.samplers.evaluated_again import EvaluatedAgain
 from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.inside import inside_foreground
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -45,9 +50,11 @@ from nerfloom.samplers.occupancy import OccupancySampler
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
 SHARPER = 50.0
-"""Multiple of the first inverse width that its bound has reached when it ends."""
-SAMPLES = 2**15
+"""Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
+SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
 """Samples per training step with an occupancy grid."""
+COLOR_LAYERS = 4
+"""Hidden layers of the papers' colour network."""
 LONGEST, EVERY = 4.0, 16
 """Maximum length of a training step, in steps of `num_steps`, and the number of training steps between its changes."""
 
@@ -56,9 +63,10 @@ LONGEST, EVERY = 4.0, 16
 class SurfaceConfig(
     HashGridConfig,
     BackgroundConfig,
+    RefinedConfig,
     AppearanceConfig,
     max_num_iterations=20_000,
-    learning_rate=1e-2,
+    learning_rate=AUTO,
     lr_schedule="hold-exponential",
     lr_final=0.02,
     adam_beta2=0.99,
@@ -75,6 +83,8 @@ class SurfaceConfig(
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
         "hidden_width": (1, 2**14),
+        "position_frequencies": (0, MAX_FREQUENCIES),
+        "direction_frequencies": (0, MAX_FREQUENCIES),
         "eikonal_loss_mult": AT_LEAST_0,
         "silhouette_loss_mult": AT_LEAST_0,
         "points_loss_mult": AT_LEAST_0,
@@ -91,8 +101,17 @@ class SurfaceConfig(
     """Allowed range of each numeric setting."""
     appearance_embedding_dim: Auto[int] = AUTO
     """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
-    hidden_width: int = 64
-    """Features per hidden layer of the two networks."""
+    encoding: Literal["hash-grid", "frequency"] = "hash-grid"
+    """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
+    the colour, for GPUs."""
+    learning_rate: Auto[float] = AUTO
+    """Initial learning rate of Adam. auto: 0.01 on a hash grid, 0.0005 for the papers' networks."""
+    hidden_width: Auto[int] = AUTO
+    """Features per hidden layer of the two networks. auto: 64 on a hash grid, 256 for the papers' networks."""
+    position_frequencies: int = 6
+    """Number of frequencies in the encoding of positions (frequency)."""
+    direction_frequencies: int = 4
+    """Number of frequencies in the encoding of directions (frequency)."""
     color_loss: Auto[Literal["squared", "absolute"]] = AUTO
     """Error of colours. absolute: as in NeuS and VolSDF; edges and highlights that are still wrong count less, so that
     surfaces form where there is little texture. auto: absolute if there is a background, otherwise squared."""
@@ -107,23 +126,23 @@ class SurfaceConfig(
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
-    """Fraction of the budget after which that change has a weight: a surface has to find its place first."""
+    """Fraction of the budget after which --curvature-loss-mult applies: a surface has to find its place first."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
     start_sharpness: float = 20.0
-    """First inverse width of the surface, in halves of the box's shortest edge."""
+    """First inverse width of the surface; the width is in halves of the box's shortest edge."""
     sharpness_learning_rate: float = 5e-3
     """Learning rate of a tenth of the logarithm of the inverse width."""
     step_widths: float = 2.0
-    """Length of a training step, in widths of the surface; from one to four steps of --num-steps. 0: one."""
+    """Length of a training step in widths of the surface, limited to one to four steps of --num-steps. 0: one step."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
     sharpen_until: float = 0.8
     """Fraction of the budget over which the upper bound of the inverse width rises, exponentially, to 50 times the
     first value."""
     open_levels_until: float = 0.3
-    """Fraction of the budget during which levels of the hash grid open, from coarse to fine."""
+    """Fraction of the budget during which levels of the hash grid open, from coarse to fine (hash-grid)."""
 
 
 SurfaceConfigT = TypeVar("SurfaceConfigT", bound=SurfaceConfig)
@@ -136,7 +155,13 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     config, made = decide_background(config, scene, "sphere")
     if config.sampler not in config.samplers:
         raise ConfigError(f"--sampler {config.sampler}: take --sampler {' or '.join(config.samplers)}")
-    config, samples = decide_samples(config, SAMPLES)
+    config, samples = decide_samples(config, SAMPLES[config.encoding])
+    on_grid, suits = config.encoding == "hash-grid", f"--encoding is {config.encoding}"
+    config, _ = fill(
+        config,
+        Choice("learning_rate", 1e-2 if on_grid else 5e-4, suits),
+        Choice("hidden_width", 64 if on_grid else 256, suits),
+    )
     error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
     if config.background_model == "sphere":
         error, start, reason = "absolute", 0.5, "a background could explain what has no texture"
@@ -145,7 +170,7 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     light = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, own = fill(config, color, radius, light)
+    config, own = fill(config, color, radius, light, refinement_choice(scene, marched=False))
     return config, made + samples + own
 
 
@@ -153,11 +178,26 @@ class FieldParts(TypedDict):
     """Arguments of a field's constructor."""
 
     box: Tensor
-    encoding: HashGrid
+    distance: Distance
     sharpness: Sharpness
-    radius: float
     width: int
+    color_layers: int
+    color_bias: bool
+    direction_frequencies: int | None
     appearance: Appearance | None
+
+
+def make_distance(config: SurfaceConfig, box: Tensor) -> Distance:
+    """Return a distance that starts as a ball: a small network on a hash grid, or the papers' network.
+
+    Args:
+        config: the method's settings, decided.
+        box: (2, 3) corners of the box, scene units.
+    """
+    radius, width = config.start_radius, config.hidden_width
+    if config.encoding == "frequency":
+        return NetworkDistance(box, radius, width, num_frequencies=config.position_frequencies)
+    return GridDistance(box, HashGrid.of(config, config.open_levels_until), radius, width)
 
 
 def field_parts(config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] = Sharpness) -> FieldParts:
@@ -171,13 +211,15 @@ def field_parts(config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] 
     box, size, appearance = foreground(config, scene).box, config.appearance_embedding_dim, None
     if size:
         appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
-    half = float((box[1] - box[0]).min()) / 2
+    distance, large = make_distance(config, box), config.encoding == "frequency"
     return {
         "box": box,
-        "encoding": HashGrid.of(config, config.open_levels_until),
-        "sharpness": sharpness(config.start_sharpness / half, config.sharpness_learning_rate),
-        "radius": config.start_radius,
+        "distance": distance,
+        "sharpness": sharpness(config.start_sharpness / distance.size, config.sharpness_learning_rate),
         "width": config.hidden_width,
+        "color_layers": COLOR_LAYERS if large else 1,
+        "color_bias": large,
+        "direction_frequencies": config.direction_frequencies if large else None,
         "appearance": appearance,
     }
 
@@ -189,7 +231,7 @@ class SurfaceRenderer(VolumeRenderer):
 
     def shade(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().shade(rays, samples, field, background)
-        if self.training:  # no term of the objective asks for them
+        if self.training:  # no term of the objective uses them
             return rendered
         assert samples.features is not None
         assert rendered.weights is not None
@@ -199,20 +241,24 @@ class SurfaceRenderer(VolumeRenderer):
 
 
 def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
-    """Return the sampler, whose pictures are traced if the settings say so."""
+    """Return the sampler. Pictures are traced if --eval-rendering is surface, and samples follow refined poses."""
     sampler = occupancy_sampler(config, foreground(config, scene))
     assert isinstance(sampler, OccupancySampler)
-    traced = FirstCrossing(sampler, config.eval_rendering == "surface")
-    return inside_foreground(config, scene, traced)
+    chosen: Sampler = FirstCrossing(sampler, config.eval_rendering == "surface")
+    if config.camera_optimizer != "off":
+        chosen = EvaluatedAgain(chosen)
+    return inside_foreground(config, scene, chosen)
 
 
-def make_background(config: SurfaceConfig, scene: Scene) -> InvertedField:
+def make_background(config: SurfaceConfig, scene: Scene) -> Field:
     """Return a field for the outside of the sphere.
 
     Args:
         config: the method's settings, decided.
         scene: properties of the data; not used.
     """
+    if config.encoding == "frequency":
+        return NeRFField(config.hidden_width, dims=4)
     return InvertedField(HashGrid.of(config), config.hidden_width)
 
 
@@ -223,8 +269,8 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     )
 
 
-class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
-    """A model that learns the distance to a surface, and its colour."""
+class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
+    """A model that learns the distance to a surface, its colour, and the poses if asked for."""
 
     step_scale: Tensor
     losses = (
@@ -241,8 +287,9 @@ class SurfaceModel(RayModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True
     def __init__(
         self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
+        super().__init__(config, scene, field, sampler, renderer)
         # Meshes and crops cover what the field covers.
-        super().__init__(config, replace(scene, box=foreground(config, scene).box), field, sampler, renderer)
+        self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
         edges = self.surface.box[1] - self.surface.box[0]
         self.surface.cell = float((edges / config.grid_resolution).norm())

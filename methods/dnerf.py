@@ -28,7 +28,7 @@ from nerfloom.samplers.motion import MotionConfig, slices_choice
 NUM_STEPS, HASH_NUM_STEPS = 192, 384
 """Steps along the diagonal of the box: with networks, and with a hash grid."""
 HASH_SAMPLES_PER_BATCH = 2**13
-"""Samples per training step with a hash grid, whose networks are small, and an occupancy grid."""
+"""Samples per training step with an occupancy grid and a hash grid, which needs small networks only."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class DNeRFConfig(
     """Number of frequencies in the encoding of positions for the deformation network. auto: `position_frequencies`, or
     4 with a hash grid."""
     ambient_dims: Auto[int] = AUTO
-    """Further outputs of the deformation network, inputs of a hash grid's networks beside the displaced position. auto:
-    4 with a hash grid; otherwise none, as in the paper."""
+    """Further outputs of the deformation network, inputs of a hash grid's networks in addition to the displaced
+    position. auto: 4 with a hash grid; otherwise none, as in the paper."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grid and of the two networks on it."""
     max_resolution: int = 512

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
-from nerfloom import Cameras, Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
+from nerfloom import Decision, GaussianModel, Loss, Method, Optimised, Scene, ViewBatch
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
@@ -24,11 +24,11 @@ from nerfloom.export.surfaces import found_surfaces
 from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, affine_colors
 from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.splats.blend import CHANNELS
-from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.losses.functions import mean_depth_error
 from nerfloom.method import DEPTH_REASONS
 from nerfloom.registry import load_method
 from nerfloom.splats.drawing import splat_camera
+from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.guide import GUIDE, FoundDistances
 from nerfloom.splats.learning import open_degree
 from nerfloom.splats.resolution import enlarged, reduced, reduced_distances
@@ -74,7 +74,10 @@ class GaussianSplattingConfig(SplattingConfig):
     else 0."""
 
 
-def decide(config: GaussianSplattingConfig, scene: Scene) -> tuple[GaussianSplattingConfig, list[Decision]]:
+GaussianSplattingConfigT = TypeVar("GaussianSplattingConfigT", bound=GaussianSplattingConfig)
+
+
+def decide(config: GaussianSplattingConfigT, scene: Scene) -> tuple[GaussianSplattingConfigT, list[Decision]]:
     """Fill in the settings that depend on the budget and the scene.
 
     Args:
@@ -126,7 +129,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         """
         kind, count = self.config.start, self.config.start_gaussians
         if kind == "auto":
-            kind = "field" if dataset.points is None else "points"
+            kind = "points" if dataset.points is not None else self.start_without_points()
         if kind == "field":
             with torch.enable_grad():
                 seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
@@ -145,14 +148,18 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         self.found.fill_(kind == "field")
         say(f"  {len(first):,} Gaussians start {PLACES[kind]}")
 
+    def start_without_points(self) -> Literal["field", "silhouettes", "random"]:
+        """Return where Gaussians start by default if the data has no points of a reconstruction."""
+        return "field"
+
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
         self.progress = progress
 
     def loss(self, batch: ViewBatch, step: int) -> Loss:
         config = self.config
-        seen, poses = batch.view.camera, self.poses
-        pose = None if poses is None else poses.pose(batch.index, seen.camera_to_worlds[0])
+        seen, poses, index = batch.view.camera, self.poses, batch.index
+        pose = None if poses is None or index is None else poses.pose(index, seen.camera_to_worlds[0])
         octaves = self.sizes.next(self.progress)
         camera, target = splat_camera(seen, self.near, self.look(), pose, 1 << octaves), reduced(batch.rgb, octaves)
         gaussians = self.learnt_gaussians(batch.view.time)
@@ -169,10 +176,19 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             known = reduced_distances(known, octaves)
             terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0 and len(gaussians):
-            terms["opacity"] = weight * torch.sigmoid(gaussians.logits).mean()
+            terms["opacity"] = weight * self.penalised_opacities(gaussians, batch.view.time).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
         return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))
+
+    def penalised_opacities(self, gaussians: Gaussians, time: float | None) -> Tensor:
+        """Return the opacities (N,) whose mean is the opacity penalty.
+
+        Args:
+            gaussians: N Gaussians at a time, with gradient.
+            time: in [0, 1]; None for a still scene.
+        """
+        return torch.sigmoid(gaussians.logits)
 
     def _behind(self, batch: ViewBatch) -> Tensor:
         """Return the background (3,) of a step. For images without alpha it is random, so that Gaussians cannot rely on
@@ -201,18 +217,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
         return affine_colors(rgb, self.appearance(which, 1)[0])
 
-    def camera(self, camera: Cameras) -> SplatCamera:
-        """Return the camera of a view outside of training, corrected like the training cameras near it."""
-        pose = None if self.poses is None else self.poses.propagated_pose(camera.camera_to_worlds[0])
-        return splat_camera(camera, self.near, self.look(), pose)
-
-    def refined_cameras(self, cameras: Cameras) -> Cameras:
-        """Return the training cameras with refined poses.
-
-        Args:
-            cameras: M training cameras with the poses of the data.
-        """
-        return cameras if self.poses is None else self.poses.refined(cameras)
+    def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
+        return poses if self.poses is None else self.poses.refined(poses, training)
 
 
 METHOD = Method(GaussianSplattingConfig(), paper="arXiv:2308.04079", model=GaussianSplatting, decide=decide)

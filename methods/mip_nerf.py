@@ -23,7 +23,7 @@ from nerfloom.samplers.proposal import half_edge
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples per training step with the occupancy grid; the number of samples per ray varies a hundredfold."""
 OCCUPANCY_RATE = 2.0
-"""Factor of the learning rate with the occupancy grid, as in vanilla-nerf, whose steps have as many samples."""
+"""Factor of the learning rate with the occupancy grid; that of vanilla-nerf, which has as many samples per step."""
 
 
 @dataclass(frozen=True)

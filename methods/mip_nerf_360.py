@@ -29,7 +29,7 @@ from nerfloom.losses.terms import KNOWN_DISTANCES, ColorError, Distortion, Sampl
 from nerfloom.methods._captures import (
     MARCHED_SAMPLES,
     PAPER_SAMPLES,
-    RefinedConfig,
+    ProposedConfig,
     RefinedModel,
     refined_sampler_choice,
     refinement_choice,
@@ -56,7 +56,7 @@ PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 @dataclass(frozen=True)
 class MipNeRF360Config(
     GridsConfig,
-    RefinedConfig,
+    ProposedConfig,
     max_num_iterations=250_000,
     num_rays_per_batch=2_048,
     learning_rate=2e-3,
@@ -137,7 +137,7 @@ def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, li
         config,
         Choice("encoding", encoding, reason),
         Choice("distortion_loss_mult", DISTORTION if scene.unbounded else 0.0, around, "distortion loss"),
-        refinement_choice(config, scene),
+        refinement_choice(scene, config.sampler != "proposal"),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES)
     grids = config.encoding == "hash-grid"

@@ -1,9 +1,9 @@
-"""NeRF in the Wild: light that differs between photographs, and people and things that are in one of them only.
+"""NeRF in the Wild: photographs that differ in light and show people and things that appear in one of them only.
 
 Martin-Brualla et al., "NeRF in the Wild: Neural Radiance Fields for Unconstrained Photo Collections", CVPR 2021. Each
-training image has an appearance vector, an input of the static colours, and a transient vector. A second head turns
-the latter into density, colour and uncertainty that exist in that image alone. Where an image disagrees with the
-others, to say so costs less than to change the scene. Views that are no training images show the static part alone.
+training image has an appearance vector, an input of the static colours, and a transient vector. A second head turns the
+transient vector into density, colour and uncertainty that exist in that image alone. Where an image disagrees with the
+others, this costs less than changing the scene. Other views show the static part alone.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from nerfloom.samplers.proposal import half_edge
 APPEARANCE_SIZE = 48
 """Default length of appearance vectors if the appearance varies."""
 PAPER_WIDTH, GRID_WIDTH = 256, 64
-"""Features of a hidden layer, of the paper's networks and of those on a hash grid. The heads of the first have half."""
+"""Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""
 PAPER_RATE = 0.05
 """Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
 START = 0.05
@@ -78,7 +78,7 @@ class NerfWConfig(
     transient_embedding_dim: int = 16
     """Length of an image's transient vectors."""
     transient_resolution: int = 1
-    """Vectors along each side of an image, interpolated between; 1: one for each image, as in the paper."""
+    """Transient vectors along each side of an image, with interpolation. 1: one per image, as in the paper."""
     least_uncertainty: float = 0.1
     """Standard deviation of colours where nothing is transient; 0.03 in the paper."""
     transient_density_mult: float = 0.01
@@ -104,13 +104,13 @@ class TransientDensity(LossTerm):
         super().__init__("transient", "transient_density_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        density = shown.rendered.extras["transient_density"]
+        density = shown.rendered.extras.get("transient_density")  # None for the views of a teacher
         unit = 2 * shown.model.config.least_uncertainty**2 * half_edge(shown.model.scene.box)
-        return unit * density.mean() if len(density) else None
+        return None if density is None or not len(density) else unit * density.mean()
 
 
 class NerfW(RefinedModel[NerfWConfig], plain=True):
-    """A model that believes images only as far as others agree with them."""
+    """A model that gives less weight to an image where the others disagree with it."""
 
     losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
     renderer: TransientRenderer
@@ -150,7 +150,7 @@ def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decisio
     """
     if scene.warped and config.transient_resolution > 1:
         raise ConfigError("--transient-resolution: maps do not work in normalised device coordinates; use 1")
-    config, scaled = fill(config, Choice("gradient_scaling", True, "what is near one camera may be in its image alone"))
+    config, scaled = fill(config, Choice("gradient_scaling", True, "things near one camera may be in its image alone"))
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
@@ -174,7 +174,7 @@ def make_field(config: NerfWConfig, scene: Scene) -> EncodedField | NeRFField:
 
 
 def sampler(config: NerfWConfig, scene: Scene) -> Sampler:
-    """Return the configured sampler, which knows the static density alone."""
+    """Return the configured sampler; it uses the static density alone."""
     return make_sampler(config, replace(scene, unbounded=config.contraction))
 
 

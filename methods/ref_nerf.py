@@ -1,8 +1,8 @@
-"""Ref-NeRF: colours from reflected directions, roughness and predicted normals, for things that shine.
+"""Ref-NeRF: colours from reflected directions, roughness and predicted normals, for shiny surfaces.
 
 Verbin et al., "Ref-NeRF: Structured View-Dependent Appearance for Neural Radiance Fields", CVPR 2022. By default its
-parts stand on a hash grid (Mueller et al. 2022), which two CPU cores train in minutes; `--encoding frequency` has the
-paper's networks on Mip-NeRF's integrated encoding.
+networks are small and take features of a hash grid (Mueller et al. 2022); two CPU cores train them in minutes.
+`--encoding frequency` uses the paper's networks on Mip-NeRF's integrated encoding.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from nerfloom.samplers.proposal import half_edge
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**12}
 """Samples per training step with an occupancy grid."""
 DEPTH, DIRECTIONAL_SKIP = 8, 4
-"""Hidden layers of the paper's two networks, and those of the directional one before its input is repeated."""
+"""Hidden layers of each of the paper's networks, and of the directional one before its input is repeated."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class RefNeRFConfig(
     hidden_width: Auto[int] = AUTO
     """Features per hidden layer. auto: 64 on a hash grid, 256 for the paper's networks."""
     bottleneck_width: Auto[int] = AUTO
-    """Features that the directional network takes beside directions. auto: 16 on a hash grid, 128 otherwise."""
+    """Features that the directional network takes in addition to directions. auto: 16 on a hash grid, 128 otherwise."""
     direction_bands: int = MAX_BANDS
     """Bands of the directional encoding, of degrees 1, 2, 4, 8 and 16."""
     position_frequencies: int = 16
@@ -152,7 +152,7 @@ def sampler(config: RefNeRFConfig, scene: Scene) -> Sampler:
 
 
 def renderer(config: RefNeRFConfig, scene: Scene) -> Renderer:
-    """Return a renderer that also shows what colours are made of."""
+    """Return a renderer that also shows the parts of the colours."""
     return ReflectionRenderer(scaled_up_to(config, scene), config.thin_gradients)
 
 

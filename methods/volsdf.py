@@ -1,7 +1,8 @@
-"""VolSDF: a signed distance on a hash grid, whose density is a Laplace distribution's.
+"""VolSDF: a signed distance on a hash grid; a Laplace distribution turns it into density.
 
 Yariv et al., "Volume Rendering of Neural Implicit Surfaces", NeurIPS 2021. The hash grid and the network with ReLU are
-those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neuralangelo (Li et al. 2023).
+those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neuralangelo (Li et al. 2023). `--encoding
+frequency` has the paper's networks.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Allowed range of each numeric setting."""
     sampler: Auto[Literal["occupancy", "error-bounded"]] = AUTO  # type: ignore[assignment]
     """occupancy: march through the occupied cells of the box. error-bounded: draw --num-nerf-samples samples per ray
-    from an opacity whose error is bounded, as in the paper. auto: occupancy."""
+    from an opacity with a bounded error, as in the paper. auto: occupancy."""
     num_bound_steps: int = 64
-    """Distances that are looked up along a ray first, and how many each round adds until the bound holds
+    """Number of distances evaluated along a ray at first, and in each further round until the bound holds
     (error-bounded)."""
     opacity_error: float = EPSILON
-    """Largest error of the opacity that samples are drawn from (error-bounded)."""
+    """Maximum error of the opacity from which samples are drawn (error-bounded)."""
 
 
 class VolSDF(SurfaceModel[VolSDFConfig], plain=True):
@@ -56,7 +57,7 @@ def sampler(config: VolSDFConfig, scene: Scene) -> Sampler:
     """Return the configured sampler, inside the sphere if there is a background.
 
     Raises:
-        ConfigError: for pictures by the surface without an occupancy grid, whose cells they are traced through.
+        ConfigError: for pictures traced to the surface without an occupancy grid; rays are traced through its cells.
     """
     if config.sampler != "error-bounded":
         return make_sampler(config, scene)

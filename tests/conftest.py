@@ -104,7 +104,7 @@ def shared_tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def forks() -> Iterator[Forks]:
-    """Runs programs in processes of their own, in which torch is imported already."""
+    """Runs programs in separate processes that have imported torch already."""
     found = Forks()
     yield found
     found.close()

@@ -68,7 +68,7 @@ def _serve() -> None:
 
 
 def _begun(code: str, arguments: list[str], environment: dict[str, str]) -> tuple[int, list[IO[bytes]]]:
-    """A new process that runs the code: its number, and the files in which it says something, which `_ended` closes."""
+    """A new process that runs the code: its number, and the files of its output, which `_ended` closes."""
     files: list[IO[bytes]] = [tempfile.TemporaryFile() for _ in range(2)]  # noqa: SIM115
     process = os.fork()
     if process == 0:

@@ -11,7 +11,7 @@ from nerfloom.data.parsed_scene import ParsedScene
 
 
 def noise(width: int, height: int, seed: int, channels: int = 3) -> np.ndarray:
-    """(H, W, C) uint8 in which no two pixels are likely to be alike."""
+    """(H, W, C) uint8; probably no two pixels are the same."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, channels), dtype=np.uint8)
 
 

@@ -151,6 +151,7 @@ LAYERS = (
     ("plug_and_play",),
     ("losses",),
     ("splats", "octrees"),
+    ("blocks",),
     ("model",),
     ("ray_model", "gaussian_model", "octree_model"),
     ("moving_model",),
@@ -167,7 +168,7 @@ LAYERS = (
     ("cli",),
     ("runs",),
 )
-"""Rooms of `framework`, each of which imports those above it only, at whatever place in a file."""
+"""Rooms of `framework`. Each imports only those above it, anywhere in a file."""
 
 
 def _room(module: str) -> int | None:

@@ -99,7 +99,7 @@ class TinySampler(OccupancySampler):
 
 
 def of_parts(config: Any, *kinds: type) -> Method:
-    """A method that casts rays, one or more parts of which are of the given kinds."""
+    """A method that casts rays, with one or more parts of the given kinds."""
     chosen = {
         part: next((kind for kind in kinds if issubclass(kind, part)), default)
         for part, default in ((Field, TinyField), (Sampler, TinySampler), (Renderer, VolumeRenderer))

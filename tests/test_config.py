@@ -11,8 +11,9 @@ import pytest
 import tyro
 import yaml
 
-from nerfloom.base.config import RayConfig, TrainConfig, from_plain, to_plain
+from nerfloom.base.config import RayConfig, TrainConfig
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.registry import load_method, registered
 from nerfloom.training.run import read_run
 

@@ -15,7 +15,8 @@ from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.first_covisible import CELLS, LEVELS, REACH, STEPS, first_covisible_reference
 from nerfloom.methods.nerfacto import METHOD
-from nerfloom.registry import load_dataparser
+from nerfloom.ray_model import RayModel
+from nerfloom.registry import load_dataparser, load_method
 from nerfloom.scene.covisible_space import CovisibleSpace, share_cut_off, times_seen
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.preparation import decided
@@ -125,7 +126,7 @@ def test_training_leaves_out_what_one_image_shows_and_says_so(tmp_path: Path) ->
 
 
 def with_points(dataset: Dataset, distance: float) -> Dataset:
-    """The images, of which every 50th pixel is known to show something at that distance."""
+    """The images; every 50th pixel is known to show something at that distance."""
     pixels = torch.arange(0, dataset.cameras.ends[-1], 50)
     known = SparseDepth(pixels, torch.full((len(pixels),), distance), torch.full((len(pixels),), 0.01))
     scene = dataclasses.replace(dataset.scene, num_sparse_depths=len(pixels))
@@ -240,6 +241,26 @@ def test_known_points_decide_whether_rays_start_late(distance: float, least: int
     for chosen in (0, 2):  # what one asks for is done
         asked = dataclasses.replace(config, rays_shared_by=chosen)
         assert decided(METHOD, asked, dataset)[1].rays_shared_by == chosen
+
+
+@pytest.mark.parametrize(
+    ("name", "asked"), [("neus", {}), ("volsdf", {}), ("nerf-plus-plus", {"encoding": "hash-grid"})]
+)
+@pytest.mark.parametrize(("distance", "least"), [(50.0, 2), (0.06, 0)])
+def test_starts_before_a_sphere_are_checked_too(
+    name: str, asked: dict[str, Any], distance: float, least: int, tmp_path: Path
+) -> None:
+    """One grid marches the inside, and has no boxes around it: its rays start late, if this cuts nothing off."""
+    method, dataset = load_method(name), with_points(small(tmp_path).train_set, distance)
+    config = dataclasses.replace(method.config, log2_table_size=12, **asked)  # type: ignore[call-arg]
+    _, settings, _ = decided(method, config, dataset)
+    assert (settings.background_model, settings.sampler) == ("sphere", "occupancy")  # type: ignore[attr-defined]
+    assert settings.rays_shared_by == least
+    model = method.build(settings, dataset.scene)
+    assert isinstance(model, RayModel)
+    assert (model.covisible_space is not None) == bool(least)
+    if model.covisible_space is not None:  # cells of the box that the check looks at
+        assert torch.equal(model.covisible_space.box, dataset.scene.box)
 
 
 def test_the_share_of_what_is_cut_off() -> None:

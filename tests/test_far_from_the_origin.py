@@ -16,7 +16,7 @@ from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.ply import read_header, read_points, write_points
 from nerfloom.dataparsers.colmap_model import read_model
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.export.cameras import all_cameras, camera_list, posed_files
+from nerfloom.export.cameras import camera_list, posed_files
 from nerfloom.export.colmap_text import write_model
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import decimals, write_mesh
@@ -144,7 +144,7 @@ def test_exported_cameras_and_points_are_read_back(unit: float, shift: np.ndarra
     scenes = {split: Nerfstudio().parse(data, split) for split in ("train", "val")}  # type: ignore[arg-type]
     train = dataclasses.replace(scenes["train"], points=torch.tensor([[0.25, -0.5, 0.125], [0.0, 0.0, 0.0]]))
     scenes = {**scenes, "train": train}
-    posed = posed_files(scenes, all_cameras(scenes, train.cameras, train.cameras), train.placement)
+    posed = posed_files(scenes, train.placement)
     truth = {path.name: pose for path, pose in zip(posed.files, posed.poses.numpy(), strict=True)}
     every = moved(poses(), unit, shift)
     for name, pose in truth.items():

@@ -130,7 +130,7 @@ def test_matter_before_cameras_goes_away(shared_tiny: Path, tmp_path: Path) -> N
 
 
 def test_with_many_images_not_a_bit_changes(shared_tiny: Path, tmp_path: Path) -> None:
-    """Ten images with alpha are not few: a run is as one in which all is switched off, its random numbers too."""
+    """Ten images with alpha are not few: a run equals one with all terms switched off, random numbers included."""
     runs = [{}, {"few_images": False}, {"unseen_loss_mult": 0.0, "open_levels_until": 0.0, "occlusion_loss_mult": 0.0}]
     trainers = [tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(i), **run) for i, run in enumerate(runs)]
     for trainer in trainers:

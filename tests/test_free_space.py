@@ -46,7 +46,7 @@ def test_cameras_that_look_apart_are_alone_and_those_in_one_place_never() -> Non
 
 
 def test_a_single_image_tells_of_no_free_space() -> None:
-    """No other camera sees its scene either, all of which would be called empty."""
+    """No other camera sees its scene either, so all of it would be called empty."""
     assert distances_alone(row(0.0), 0.1, 2.0).tolist() == [0.0]
 
 

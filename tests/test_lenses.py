@@ -257,7 +257,7 @@ def test_compiled_rays_are_those_of_torch(model: str, lens: list[float] | None, 
 @pytest.mark.medium
 @needs_kernels
 def test_compiled_rays_of_any_lens() -> None:
-    """400 lenses, most of which fold the picture over somewhere."""
+    """400 lenses; most fold the picture over somewhere."""
     coefficients = lenses(400).float()
     camera = replace(cameras("opencv", count=400).scaled(1 / 8), lens=coefficients)
     flat = torch.arange(int(camera.offsets[-1]))

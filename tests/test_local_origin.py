@@ -35,7 +35,7 @@ def test_the_unit_does_not_matter_but_the_distance_does(unit: float) -> None:
 
 
 def test_the_error_is_that_of_float32() -> None:
-    """Up to half a step, of which there are 2^24 or more to a value."""
+    """Up to half a step; a value has 2^24 steps or more."""
     for away in (1.0, 130.0, 5e6):
         points = cube() + torch.tensor([away, 0.0, 0.0], dtype=torch.float64)
         error = float((points.float().double() - points).abs().max())

@@ -33,7 +33,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Trainer:
-    """A trainer on the tiny data set, each photograph of which is there twice: red at time 0, and blue at time 1."""
+    """A trainer on the tiny data set with each photograph twice: red at time 0, and blue at time 1."""
     method, settings = VARIANTS[name]
     still = tiny_trainer("instant-ngp", data, folder / "still").train_set
     count = len(still)

@@ -197,6 +197,6 @@ def test_the_paper_network_contracts_space_if_asked(unbounded: bool, contraction
     assert (field.contracted is not None) == contraction
 
 
-@pytest.mark.medium
+@pytest.mark.slow
 def test_the_papers_networks_pass() -> None:
     assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))

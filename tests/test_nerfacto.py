@@ -154,7 +154,7 @@ def dimmed(folder: Path, out: Path, factors: torch.Tensor, **settings: object) -
 def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: Path, tmp_path: Path) -> None:
     """Trained on darker and lighter copies, a held-out dark photograph is found to be dark from its left half.
 
-    The mean vector is not trained here: each light comes from one direction, by which the mean would know it too.
+    The mean vector is not trained here: each light comes from one direction, so the mean would know it too.
     """
     factors = torch.linspace(0.1, 1.0, len(tiny_trainer("nerfacto", shared_tiny, tmp_path / "any").train_set))
     trainer = dimmed(shared_tiny, tmp_path, factors, max_num_iterations=150, mean_appearance_share=0.0)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.pose_propagation import propagated_poses
@@ -20,6 +21,13 @@ def some_rays() -> Rays:
     return Rays(
         torch.randn(6, 3), directions, torch.zeros(6), torch.ones(6), camera_indices=torch.tensor([0, 0, 1, 1, 2, 2])
     )
+
+
+def some_poses(count: int) -> Tensor:
+    """(count, 3, 4) cameras at random places with random rotations."""
+    rotations = torch.linalg.qr(torch.randn(count, 3, 3))[0]
+    rotations = rotations * torch.linalg.det(rotations)[:, None, None]
+    return torch.cat([rotations, torch.randn(count, 3, 1)], -1)
 
 
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
@@ -58,11 +66,9 @@ def test_a_screw_turns_about_the_scenes_origin() -> None:
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
 def test_refined_cameras_see_along_refined_rays(group) -> None:
     torch.manual_seed(0)
-    rotations = torch.linalg.qr(torch.randn(3, 3, 3))[0]
-    rotations = rotations * torch.linalg.det(rotations)[:, None, None]
     ones = torch.ones(3)
     cameras = Cameras(
-        torch.cat([rotations, torch.randn(3, 3, 1)], -1),
+        some_poses(3),
         20 * ones,
         20 * ones,
         8 * ones,
@@ -73,27 +79,33 @@ def test_refined_cameras_see_along_refined_rays(group) -> None:
     torch.nn.init.normal_(poses.tangents, std=0.3)
     flat = torch.randint(3 * 256, (40,))
     through = poses(cameras.pixel_rays(flat, 0.0, 1.0))
-    of_refined = poses.refined(cameras).pixel_rays(flat, 0.0, 1.0)
+    moved = replace(cameras, camera_to_worlds=poses.refined(cameras.camera_to_worlds, training=True))
+    of_refined = moved.pixel_rays(flat, 0.0, 1.0)
     torch.testing.assert_close(through.origins, of_refined.origins)
     torch.testing.assert_close(through.directions, of_refined.directions)
     assert bool((through.directions.norm(dim=-1) - 1).abs().max() < 1e-5)
 
 
 def test_held_out_cameras_are_left_alone_where_no_pose_is_given() -> None:
-    poses, rays = PoseRefinement(3), some_rays()
+    poses, others = PoseRefinement(3), some_poses(4)
     torch.nn.init.normal_(poses.tangents)
-    alone = Rays(rays.origins, rays.directions, rays.nears, rays.fars)
-    assert poses(alone) is alone
+    assert torch.equal(poses.refined(others, training=False), others)
+    assert torch.equal(poses.refined(others, training=True), others)  # others, since they are one more
+
+
+def test_rays_of_no_training_camera_are_not_moved() -> None:
+    with pytest.raises(ValueError, match="training cameras"):
+        PoseRefinement(3)(replace(some_rays(), camera_indices=None))
 
 
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
 def test_held_out_cameras_follow_when_all_poses_drift_together(group) -> None:
-    """All training cameras are turned, moved and scaled by one similarity: whatever a ray sees stays where it is."""
+    """All training cameras are turned, moved and scaled by one similarity: so are the others."""
     torch.manual_seed(0)
     turn, scale, move = torch.tensor([0.2, -0.1, 0.3]), 1.2, torch.tensor([0.5, -0.2, 0.1])
     rotation = torch.linalg.matrix_exp(cross_matrix(turn))
     given = torch.cat([torch.eye(3).expand(5, 3, 3), torch.randn(5, 3, 1)], -1)
-    poses, rays = PoseRefinement(5, group, given), some_rays()
+    poses, others = PoseRefinement(5, group, given), some_poses(6)
     target = scale * given[:, :, 3] @ rotation.T + move
     with torch.no_grad():
         poses.tangents[:, 3:] = turn
@@ -103,21 +115,17 @@ def test_held_out_cameras_follow_when_all_poses_drift_together(group) -> None:
                 torch.linalg.matrix_power(cross_matrix(turn), k) / math.factorial(k + 1) for k in range(12)
             )
             poses.tangents[:, :3] = (target - given[:, :, 3] @ rotation.T) @ torch.linalg.inv(left_jacobian).T
-    held_out = replace(rays, camera_indices=None)
-    found = poses(held_out)
-    torch.testing.assert_close(found.origins, scale * rays.origins @ rotation.T + move, atol=5e-5, rtol=1e-5)
-    torch.testing.assert_close(found.directions, rays.directions @ rotation.T, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(found.fars, scale * rays.fars, atol=1e-5, rtol=1e-5)
+    found = poses.refined(others, training=False)
+    torch.testing.assert_close(found[:, :, 3], scale * others[:, :, 3] @ rotation.T + move, atol=5e-5, rtol=1e-5)
+    torch.testing.assert_close(found[:, :, :3], rotation @ others[:, :, :3], atol=1e-5, rtol=1e-5)
     with torch.autocast("cpu", torch.bfloat16):
-        torch.testing.assert_close(poses(held_out).origins, found.origins)
+        torch.testing.assert_close(poses.refined(others, training=False), found)
 
 
 def test_without_refinement_other_cameras_stay_though_all_are_in_one_place() -> None:
     given = torch.cat([torch.eye(3).expand(3, 3, 3), torch.ones(3, 3, 1)], -1)
-    rays = replace(some_rays(), camera_indices=None)
-    found = PoseRefinement(3, "SO3xR3", given)(rays)
-    torch.testing.assert_close(found.origins, rays.origins)
-    torch.testing.assert_close(found.directions, rays.directions)
+    others = some_poses(6)
+    torch.testing.assert_close(PoseRefinement(3, "SO3xR3", given).refined(others, training=False), others)
 
 
 def test_held_out_cameras_follow_those_around_them_where_poses_drift_along_the_way() -> None:
@@ -131,7 +139,7 @@ def test_held_out_cameras_follow_those_around_them_where_poses_drift_along_the_w
     given = torch.cat([torch.eye(3).expand(41, 3, 3), centers[:, :, None]], -1)
     refined = torch.cat([turns, (centers + shifts)[:, :, None]], -1)
     between = torch.arange(41) % 8 == 4
-    found, _ = propagated_poses(given[between], given[~between], refined[~between])
+    found = propagated_poses(given[between], given[~between], refined[~between])
     apart = (found - refined[between]).flatten(1).norm(dim=1)
     scale, rotation, translation = align_cameras(given[~between], refined[~between])
     alike = torch.cat(
@@ -153,8 +161,7 @@ def test_far_from_all_cameras_other_cameras_follow_the_similarity_alone() -> Non
     refined = torch.cat([turns, given[:, :, 3:] + 0.1 * torch.randn(9, 3, 1)], -1)
     far = torch.cat([torch.eye(3), torch.tensor([[3e4], [2e4], [-1e4]])], -1)[None]
     scale, rotation, translation = align_cameras(given, refined)
-    found, grown = propagated_poses(far, given, refined)
-    assert grown == scale
+    found = propagated_poses(far, given, refined)
     torch.testing.assert_close(found[0, :, :3], rotation.float(), atol=1e-4, rtol=0)
     expected = (scale * rotation @ far[0, :, 3].double() + translation).float()
     torch.testing.assert_close(found[0, :, 3], expected, atol=0.02, rtol=0)
@@ -167,26 +174,21 @@ def test_one_camera_and_many_at_one_place_carry_others_too() -> None:
         refined[:, 0, 3] += 0.5
         for place in (torch.ones(3), torch.zeros(3)):
             pose = torch.cat([torch.eye(3), place[:, None]], -1)[None]
-            found, _ = propagated_poses(pose, given, refined)
+            found = propagated_poses(pose, given, refined)
             expected = pose.clone()
             expected[:, 0, 3] += 0.5
             torch.testing.assert_close(found, expected)
 
 
-def test_rays_from_many_places_are_each_carried_as_alone() -> None:
+def test_cameras_are_each_carried_as_alone() -> None:
     torch.manual_seed(1)
     given = torch.cat([torch.eye(3).expand(7, 3, 3), torch.randn(7, 3, 1)], -1)
-    poses = PoseRefinement(7, "SO3xR3", given)
+    poses, others = PoseRefinement(7, "SO3xR3", given), some_poses(6)
     torch.nn.init.normal_(poses.tangents, std=0.1)
-    rays = replace(some_rays(), camera_indices=None)
-    together = poses(rays)
-    for index in range(len(rays)):
-        one = slice(index, index + 1)
-        alone = poses(Rays(rays.origins[one], rays.directions[one], rays.nears[one], rays.fars[one]))
-        torch.testing.assert_close(together.origins[one], alone.origins)
-        torch.testing.assert_close(together.directions[one], alone.directions)
-        pose = torch.cat([torch.eye(3), rays.origins[index][:, None]], -1)
-        torch.testing.assert_close(poses.propagated_pose(pose)[:, 3], alone.origins[0])
+    together = poses.refined(others, training=False)
+    for index in range(len(others)):
+        alone = poses.refined(others[index : index + 1], training=False)
+        torch.testing.assert_close(together[index : index + 1], alone)
 
 
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.pixels.contradicted import (

@@ -109,7 +109,7 @@ def test_a_true_length_scales_all_that_is_exported(run: Path, tmp_path: Path) ->
 @pytest.mark.medium
 def test_points_are_given_in_a_photograph(run: Path) -> None:
     """Of the ball of radius 1 at the origin."""
-    name = f"test/{load(run).dataset('test').names[0]}"
+    name = f"train/{load(run).dataset('train').names[0]}"
     done = called("ns-measure", run, "--between", "9.5,7", "9.5,12", "--image", name)
     assert done.returncode == 0, done.stderr
     points = [line.split(": ")[-1] for line in done.stderr.splitlines() if f"of {name}" in line]

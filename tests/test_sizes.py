@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.base.config import TrainConfig, from_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.errors import ConfigError, NerfloomError
 from nerfloom.base.machine_config import MachineConfig
+from nerfloom.base.plain import from_plain
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes
@@ -27,7 +28,7 @@ from tests.training.helpers import TINY
 
 SHARED_BY = type(load_method("instant-ngp").config)
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
+    "dnerf", "instant-ngp", "kilo-nerf", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
     "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
 )  # fmt: skip
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -127,7 +128,7 @@ def test_a_seed_of_more_than_64_bits() -> None:
         ((4,), (0, 0)),
         ((4, 4), (0, 128, 64)),
         ((4,), (0, 2**33)),
-        ((64,), (0, 100)),  # hashed, but 100 is no power of two
+        ((64,), (0, 100)),  # hashed, but 100 is not a power of two
         ((4,) * 65, tuple(range(0, 66 * 128, 128))),
     ],
 )

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.pixels.batch import PixelBatch, draw_batch
+from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.export.lattice import lattice_of
 from nerfloom.export.meshing import Cleaning, distance_mesh
+from nerfloom.fields.distance import GridDistance
 from nerfloom.fields.surface import NeuSField, SurfaceField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
@@ -34,8 +36,10 @@ from nerfloom.renderable import parts
 from nerfloom.rendering.background import SphereRenderer
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.samplers.background import foreground_sphere
+from nerfloom.samplers.evaluated_again import EvaluatedAgain
 from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.testing import assert_method
 from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.skipping import skip_report
@@ -50,6 +54,12 @@ def trainer_of(name: str, size: int = 24, **settings: object) -> Trainer:
     method: Method = load_method(name)
     known = {**TINY[name], "vis": "none", **settings}
     return Trainer(method, dataclasses.replace(method.config, **known), ball_in_a_box(size))
+
+
+def grid_of(field: SurfaceField) -> HashGrid:
+    """The hash grid of a field that has one."""
+    assert isinstance(field.distance, GridDistance)
+    return field.distance.grid
 
 
 def places(count: int = 500) -> Tensor:
@@ -71,16 +81,17 @@ def test_training_starts_as_a_ball(name: str) -> None:
 
 @pytest.mark.parametrize("opened", [16.0, 2.5])
 def test_gradients_are_those_of_the_distance(opened: float) -> None:
-    """Central differences, with all levels of the grid and with some of them open; in a box that is no cube."""
+    """Central differences, with all levels of the grid and with some of them open; in a box that is not a cube."""
     scene = dataclasses.replace(ball_in_a_box().scene, box=torch.tensor([[-1.0, -1.5, -0.8], [1.0, 1.0, 1.2]]))
     method = load_method("neus")
     config = dataclasses.replace(method.config, **TINY["neus"], sparse_updates=False)
     config, _ = method.decided(config, scene)
     field = method.field(config, scene).double()  # type: ignore[misc]
     assert isinstance(field, SurfaceField)
-    torch.nn.init.normal_(field.grid.table)
-    assert field.grid.opening is not None
-    field.grid.opening.opened.fill_(min(opened, 4.0))
+    grid = grid_of(field)
+    torch.nn.init.normal_(grid.table)
+    assert grid.opening is not None
+    grid.opening.opened.fill_(min(opened, 4.0))
     where, step = places(60).double(), 1e-6
     found = field.shape(where)
     for axis in range(3):
@@ -89,6 +100,89 @@ def test_gradients_are_those_of_the_distance(opened: float) -> None:
         difference = (field.shape(where + by).distances - field.shape(where - by).distances) / (2 * step)
         error = (difference - found.gradients[:, axis]).abs()
         assert error.quantile(0.9) < 1e-4  # a few steps cross a cell's face or switch a unit
+
+
+def test_distance_and_features_follow_the_position() -> None:
+    """Their gradients by positions that require one, against central differences."""
+    method = load_method("neus")
+    config, _ = method.decided(
+        dataclasses.replace(method.config, **TINY["neus"], sparse_updates=False), ball_in_a_box().scene
+    )
+    field = method.field(config, ball_in_a_box().scene).double()  # type: ignore[misc]
+    assert isinstance(field, SurfaceField)
+    torch.nn.init.normal_(grid_of(field).table)
+    where, step = places(60).double().requires_grad_(), 1e-6
+    weights = torch.randn(60, 16, dtype=torch.float64)
+
+    def seen(positions: Tensor) -> Tensor:
+        shape = field.shape(positions)
+        return (weights * torch.cat([shape.distances[:, None], shape.features], dim=-1)).sum(-1)
+
+    (found,) = torch.autograd.grad(seen(where).sum(), where)
+    for axis in range(3):
+        by = torch.zeros(3, dtype=torch.float64)
+        by[axis] = step
+        difference = (seen(where + by) - seen(where - by)).detach() / (2 * step)
+        error = (difference - found[:, axis]).abs() / difference.abs().clamp(min=1)
+        assert error.quantile(0.9) < 1e-4  # a few steps cross a cell's face or switch a unit
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("neus", {}),
+        ("volsdf", {}),
+        ("volsdf", {"sampler": "error-bounded", "num_rays_per_batch": 128}),
+        ("neus", TINY["neus+frequency"]),
+    ],
+)
+def test_poses_are_refined(name: str, settings: dict[str, object]) -> None:
+    trainer = trainer_of(name, **settings, camera_optimizer="SO3xR3")
+    for _ in range(3):
+        trainer.train_step()
+    assert trainer.state.skipped == 0
+    tangents = trainer.model.poses.tangents
+    assert bool(tangents.isfinite().all())
+    assert float((tangents != 0).any(-1).float().mean()) > 0.5
+
+
+def test_samples_of_refined_rays_are_those_of_others() -> None:
+    """The same samples and pictures; and each ray's colour has a gradient by where its camera stands."""
+    trainer = trainer_of("neus", camera_optimizer="SE3", start_radius=0.7)
+    model, background = trainer.model, torch.ones(3)
+    assert isinstance(model.sampler, EvaluatedAgain)
+    given = draw_batch(trainer.train_set, 64, "white").rays
+    origins = given.origins.clone().requires_grad_()
+    rays = dataclasses.replace(given, origins=origins)
+    plain = model.sampler.sample(given, model.field, False)
+    followed = model.sampler.sample(rays, model.field, False)
+    assert plain.alpha is not None
+    assert followed.alpha is None
+    assert torch.equal(followed.t_starts, plain.t_starts)
+    expected = model.renderer.render(given, plain, model.field, background)
+    found = model.renderer.render(rays, followed, model.field, background)
+    torch.testing.assert_close(found.rgb, expected.rgb, atol=1e-4, rtol=0)
+    found.rgb.square().sum().backward()
+    assert origins.grad is not None
+    assert bool(origins.grad.isfinite().all())
+    hit = found.accumulation > 0.5
+    assert int(hit.sum()) > 3
+    assert bool((origins.grad[hit] != 0).any(-1).all())
+
+
+def test_poses_of_a_device_are_refined_by_themselves(shared_tiny: Path, tmp_path: Path) -> None:
+    for number, (poses, choice) in enumerate({"device": "SO3xR3", "exact": "off"}.items()):
+        (tmp_path / str(number)).mkdir()
+        trainer = said_otherwise("neus", shared_tiny, tmp_path / str(number), {"poses": poses})
+        assert chosen(trainer)["pose refinement"] == choice
+        assert (trainer.model.poses is None) == (choice == "off")
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("name", METHODS)
+def test_the_papers_networks_pass_every_check(name: str) -> None:
+    method = load_method(name)
+    assert_method(method, name, dataclasses.replace(method.config, **TINY[f"{name}+frequency"]))
 
 
 def test_opacity_is_that_of_the_distance_and_its_slope() -> None:
@@ -244,7 +338,7 @@ def exact_ball() -> tuple[Trainer, SurfaceField]:
     field = trainer.model.field
     assert isinstance(field, SurfaceField)
     with torch.no_grad():
-        field.second[0] = 0
+        field.distance.second[0] = 0
     return trainer, field
 
 
@@ -267,7 +361,7 @@ def test_the_curvature_term_is_that_of_level_sets() -> None:
     nearest = min(abs(float(truth[first::EVERY].mean()) / float(found) - 1) for first in range(EVERY))
     assert nearest < 0.02
     found.backward()
-    assert float(field.second.grad.abs().max()) > 0  # type: ignore[union-attr]
+    assert float(field.distance.second.grad.abs().max()) > 0  # type: ignore[union-attr]
 
 
 def test_a_single_sample_has_a_curvature() -> None:
@@ -298,7 +392,7 @@ def test_silhouettes_are_weighted_as_the_pixels_are() -> None:
 
 
 def points_on_axes(radius: float) -> PixelBatch:
-    """Pixels of six cameras on the axes, each of which shows a point at `radius` before the centre."""
+    """Pixels of six cameras on the axes; each shows a point at `radius` before the centre."""
     towards = torch.cat([torch.eye(3), -torch.eye(3)])
     known, colors = torch.full((6,), 2 - radius), torch.ones(6, 3)
     rays = Rays(-2 * towards, towards)

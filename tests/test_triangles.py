@@ -51,7 +51,7 @@ def test_points_are_even_by_area_however_unequal_the_triangles() -> None:
 
 
 def test_points_are_even_within_a_triangle() -> None:
-    """Of 64 similar triangles into which one is divided, each holds as many points as chance allows."""
+    """If a triangle is divided into 64 similar ones, each holds as many points as chance allows."""
     corners = random_triangles(1)
     _, weights = draw_on_triangles(corners, 200_000)
     cells = (8 * weights).floor().long().clamp(max=7)

@@ -120,7 +120,7 @@ def test_poses_are_refined_along_rays_of_proposals_only(shared_tiny: Path, tmp_p
 
 
 def test_marched_samples_need_no_flag_about_poses(shared_tiny: Path, tmp_path: Path) -> None:
-    """Who asks for an occupancy grid alone must not be told that poses, of which nothing was asked, cannot be."""
+    """Users who ask for an occupancy grid alone must not be told that poses cannot be refined."""
     trainer = captured(shared_tiny, tmp_path, {"poses": "device"}, sampler="occupancy")
     assert chosen(trainer)["pose refinement"] == "off"
     assert trainer.model.poses is None

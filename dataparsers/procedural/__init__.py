@@ -2,8 +2,8 @@
 
 It is rendered once, in the blender format, to the user's cache folder (NERFLOOM_CACHE, otherwise XDG_CACHE_HOME,
 otherwise ~/.cache), and read from there. `--num-scenes` renders many random scenes instead, for methods that learn from
-several scenes. `--courtyard True` photographs a courtyard instead, through which people walk (`--distractors`) and
-where light changes.
+several scenes. `--courtyard True` photographs a courtyard instead, where people walk through (`--distractors`) and
+light changes, and `--street N` a street with cars (`--cars`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ VERSION = 1
 """Version of the scene's appearance; increase it with every change, so that old caches are not used."""
 MAX_DISTRACTORS = 0.4
 """Maximum share of pixels that distractors can cover on average."""
+MAX_HOUSES, MAX_CARS = 1000, 20
+"""Maximum number of houses on each side of the street, and of cars near a camera."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +45,22 @@ class Procedural(DataParser):
     courtyard: bool = False
     """Use a courtyard: the solids on paving between walls, so that every pixel shows a surface."""
     distractors: float = 0.0
-    """Share of the pixels of training images of the courtyard that show people and things which are in no other image,
-    from 0 to 0.4. Test images are clean."""
+    """Share of the courtyard's training pixels that show people and things found in no other image, from 0 to 0.4. Test
+    images are clean."""
+    street: int = 0
+    """Number of houses on each side of a street with windows, signs and a sky, used instead. 0: no street."""
+    cars: int = 0
+    """Number of cars near the camera of each training image of the street, at other places in each, with true masks."""
     changing_exposure: bool = False
-    """Whether training images of the courtyard differ in exposure, by up to a stop."""
+    """Whether training images of the courtyard or the street differ in exposure, by up to a stop."""
     changing_white_balance: bool = False
-    """Whether training images of the courtyard differ in white balance."""
+    """Whether training images of the courtyard or the street differ in white balance."""
     changing_sun: bool = False
-    """Whether the sun stands elsewhere in each training image of the courtyard."""
+    """Whether the position of the sun differs between training images of the courtyard or the street."""
     views_per_scene: int = 12
     """Images of each random scene. Of a held-out scene, every fourth is evaluated and the others are sources."""
+    placement: Path | None = None
+    """dataparser_transforms.json of a run whose placement the street takes. The other scenes are not moved."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:
@@ -69,8 +77,13 @@ class Procedural(DataParser):
             raise DataError("--num-scenes must be at least 1, and --views-per-scene at least 4")
         if self.num_scenes > 1 and self.moving:
             raise DataError("--moving is a variant of the embedded scene: leave out --num-scenes or --moving")
-        self._check_courtyard()
+        self._check_scenes()
         folder = self._rendered_folder()
+        if self.street:
+            from nerfloom.dataparsers.nerfstudio import Nerfstudio
+
+            parsed = Nerfstudio(placement=self.placement, poses="exact").parse(folder, split)
+            return replace(parsed, appearance_varies=any(self._changing))
         if self.courtyard:
             from nerfloom.dataparsers.procedural.courtyard import HALF
 
@@ -89,22 +102,33 @@ class Procedural(DataParser):
     def _changing(self) -> tuple[bool, bool, bool]:
         return self.changing_exposure, self.changing_white_balance, self.changing_sun
 
-    def _check_courtyard(self) -> None:
+    def _check_scenes(self) -> None:
+        """Refuse flags that do not fit the courtyard, the street, or the scene without them."""
         if not 0 <= self.distractors <= MAX_DISTRACTORS:
             raise DataError(f"--distractors is {self.distractors}; it must be from 0 to {MAX_DISTRACTORS}")
+        if not 0 <= self.street <= MAX_HOUSES or not 0 <= self.cars <= MAX_CARS:
+            raise DataError(f"--street must be from 0 to {MAX_HOUSES}, and --cars from 0 to {MAX_CARS}")
         if self.courtyard and (self.moving or self.num_scenes > 1):
             raise DataError("--courtyard is a scene of its own: leave out --moving and --num-scenes")
-        if not self.courtyard and (self.distractors or any(self._changing)):
-            raise DataError("--distractors and --changing-* are of the courtyard: add --courtyard True")
+        if self.street and (self.moving or self.num_scenes > 1 or self.courtyard):
+            raise DataError("--street is a scene of its own: leave out --moving, --num-scenes and --courtyard")
+        if not self.courtyard and self.distractors:
+            raise DataError("--distractors applies to the courtyard only: add --courtyard True")
+        if not self.street and self.cars:
+            raise DataError("--cars applies to the street only: add --street 8")
+        if not (self.courtyard or self.street) and any(self._changing):
+            raise DataError("--changing-* apply to the courtyard and the street: add --courtyard True or --street 8")
 
     def _rendered_folder(self) -> Path:
         """Return the scene's folder; render the scene first if it is not in the cache."""
         kind, count = "moving" if self.moving else "static", str(self.num_train)
         if self.num_scenes > 1:
             kind, count = f"{self.num_scenes}-scenes", str(self.views_per_scene)
+        differs = "".join(letter for letter, is_so in zip("ews", self._changing, strict=True) if is_so)
         if self.courtyard:
-            differs = "".join(letter for letter, is_so in zip("ews", self._changing, strict=True) if is_so)
             kind = f"courtyard{self.distractors:g}{differs}"
+        if self.street:
+            kind = f"street{self.street}-{self.cars}cars{differs}"
         folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{count}-seed{self.scene_seed}"
         if not folder.is_dir():
             say(f"rendering {'the embedded scene' if self.num_scenes == 1 else 'random scenes'} into {folder}")
@@ -126,6 +150,21 @@ class Procedural(DataParser):
             )
             return
         counts = {"train": self.num_train, "val": 8, "test": 16}
+        if self.street:
+            from nerfloom.dataparsers.procedural.photographs import Changing
+            from nerfloom.dataparsers.procedural.street import write_street
+
+            write_street(
+                folder,
+                houses=self.street,
+                size=self.size,
+                counts=counts,
+                cars=self.cars,
+                changing=Changing(*self._changing),
+                seed=self.scene_seed,
+                progress=track,
+            )
+            return
         if self.courtyard:
             from nerfloom.dataparsers.procedural.photographs import Changing, write_photographs
 

@@ -28,17 +28,24 @@ _HEIGHT, _THICK = 3.1, 0.05
 _MIDDLE = GROUND + _HEIGHT / 2
 
 
-def _tone(row: Tensor, column: Tensor) -> Tensor:
-    """Return a number in [0, 1) for each cell, hardly related between neighbours."""
+def tone(row: Tensor, column: Tensor) -> Tensor:
+    """Return a number in [0, 1) for each cell, given by `row` and `column`, hardly related between neighbours."""
     return (12.9898 * row + 78.233 * column).sin().mul(437.5453).frac().abs()
 
 
-def _masonry(light: Colour, dark: Colour, joint: Colour, size: tuple[float, float], u: Tensor, v: Tensor) -> Tensor:
-    """Return cells (3, R) of width and height `size` in rows that are shifted by half a cell, with joints between."""
+def masonry(light: Colour, dark: Colour, joint: Colour, size: tuple[float, float], u: Tensor, v: Tensor) -> Tensor:
+    """Return cells (3, R) of width and height `size` in rows that are shifted by half a cell, with joints between.
+
+    Args:
+        light, dark: colours between which cells vary.
+        joint: colour of the joints.
+        size: width and height of a cell.
+        u, v: (R,) coordinates along and across the rows.
+    """
     row = (v / size[1]).floor()
     across = u / size[0] + 0.5 * (row % 2)
     column = across.floor()
-    cell = blend(dark, light, _tone(row, column))
+    cell = blend(dark, light, tone(row, column))
     from_edge = torch.minimum(
         (0.5 - (across - column - 0.5).abs()) * size[0], (0.5 - (v / size[1] - row - 0.5).abs()) * size[1]
     )
@@ -46,11 +53,11 @@ def _masonry(light: Colour, dark: Colour, joint: Colour, size: tuple[float, floa
 
 
 def _bricks(light: Colour, dark: Colour, along: int, p: Tensor) -> Tensor:
-    return _masonry(light, dark, (0.55, 0.52, 0.47), (0.36, 0.16), p[along], p[2])
+    return masonry(light, dark, (0.55, 0.52, 0.47), (0.36, 0.16), p[along], p[2])
 
 
 def _paving(p: Tensor) -> Tensor:
-    return _masonry((0.52, 0.47, 0.40), (0.26, 0.25, 0.24), (0.12, 0.11, 0.10), (0.42, 0.42), p[0], p[1])
+    return masonry((0.52, 0.47, 0.40), (0.26, 0.25, 0.24), (0.12, 0.11, 0.10), (0.42, 0.42), p[0], p[1])
 
 
 def _wall(axis: int, sign: int, light: Colour, dark: Colour) -> Part:

@@ -1,4 +1,4 @@
-"""People and things that stand in one photograph only: distractors for methods that learn what all images share.
+"""People and things that are in one photograph only: distractors for methods that learn what all images share.
 
 The same few people are in many images, each time elsewhere. They are placed one after another, in view of the image's
 camera, until they cover the wanted share of it.
@@ -25,7 +25,7 @@ NUM_PEOPLE, NUM_THINGS = 8, 4
 """Number of people and of things that appear in the images of a data set."""
 PROBE = (64, 64)
 """Size of the images that measure coverage while placing, pixels."""
-_TRIES = 300  # of placing one more in an image
+_TRIES = 300  # attempts to place one more in an image
 _SLACK = 0.015  # largest difference of an image's coverage from the wanted one; the next images make up for it
 _NEAREST, _FURTHEST = 0.9, 6.0  # distance from the camera
 _PLINTH, _STEP = 1.15, 0.16  # radius and height of the plinth; people stand on it too
@@ -33,7 +33,7 @@ _SKIN, _HAIR = (0.62, 0.40, 0.28), (0.06, 0.045, 0.035)
 
 
 def _person(height: float, stride: float) -> Union:
-    """Return a figure that stands on the height 0."""
+    """Return a figure that stands at height 0."""
     h = height
     return Union(
         (
@@ -71,7 +71,7 @@ def _bright(random: np.random.Generator) -> Colour:
 
 
 def cast(seed: int) -> list[Part]:
-    """Return the people and things of a data set, standing at the origin on the height 0.
+    """Return the people and things of a data set, standing at the origin at height 0.
 
     Args:
         seed: seed of sizes and colours.

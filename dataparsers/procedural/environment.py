@@ -1,8 +1,8 @@
 """Light from far away in closed form, as sharp or as blurred as a surface reflects it.
 
 It is a sky that brightens upwards, and lamps: functions exp(kappa (cos - 1)) of the angle from a direction, those of
-von Mises and Fisher without their normalisation. Blurring one by a distribution of concentration k gives very nearly
-another, of concentration kappa k / (kappa + k) with the same total light; here it is defined so.
+von Mises and Fisher without their normalisation. A lamp blurred by a distribution of concentration k is very nearly
+another lamp, of concentration kappa k / (kappa + k) and the same total light; here this is the definition.
 """
 
 from __future__ import annotations

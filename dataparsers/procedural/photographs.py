@@ -32,8 +32,8 @@ from nerfloom.dataparsers.procedural.views import (
 from nerfloom.kernels.native import torch_on_one_thread
 
 SHOWN, TOUCHED = 255, 128
-"""Values of the truth: pixels whose centre shows a distractor, and others that one changes, by an edge, a shadow or the
-light that it takes away. All others are 0: they are those of the same data set without distractors."""
+"""Values of the truth: for pixels whose centre shows a distractor, and for others that a distractor changes, by its
+edge, its shadow or the light that it blocks. All others are 0; they are the same as without distractors."""
 STOPS = 1.0
 """Maximum exposure of an image above or below that of daylight; one stop doubles the light."""
 WARMTH = 0.4
@@ -49,11 +49,11 @@ class Changing:
     white_balance: bool = False
     """Whether the camera's white balance differs."""
     sun: bool = False
-    """Whether the sun stands elsewhere."""
+    """Whether the position of the sun differs."""
 
 
 def lights(count: int, changing: Changing, seed: int) -> list[Light]:
-    """Return the light of each training image. What does not change is that of daylight.
+    """Return the light of each training image: daylight, except for what changes.
 
     Args:
         count: number of images.

@@ -319,7 +319,12 @@ def _shade(
     sparkle = (dot(n, halfway) / dot(halfway, halfway).sqrt()).clamp(min=0.0) ** 90 * sun[shiny]
     mirror = _surroundings(v - 2.0 * slope * n) * fresnel + 1.2 * sparkle
     light[:, shiny] += g * mirror * (0.3 + 0.35 * room[shiny])
-    light = light * p.new_tensor(lit.gains)[:, None]
+    return displayed(light, lit)
+
+
+def displayed(light: Tensor, lit: Light) -> Tensor:
+    """Return the display colours (3, R) of `light` (3, R), as the camera of `lit` weighs it."""
+    light = light * light.new_tensor(lit.gains)[:, None]
     return (1.0 - (-1.35 * light).exp()).sqrt()  # compression of highlights, then display gamma
 
 

@@ -4,7 +4,7 @@
 et al. 2022): images in NeRF-Synthetic's format, and beside each a `*_normal.png` with its normals. Held-out views also
 have `*_light.npz` with diffuse and specular light and the roughness. Surfaces reflect the environment alone, not each
 other, so their colour depends on place and reflected direction in closed form. `--environment N` lights the same solids
-otherwise.
+with other lamps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from nerfloom.kernels.native import torch_on_one_thread
 SUPERSAMPLE = 3
 """Rays along each side of a pixel."""
 DIFFUSE_ROUGHNESS = 0.6
-"""Roughness whose mean light a matt surface shows: that of a distribution about as wide as the cosine's."""
+"""Roughness of the mean light on a matt surface: the distribution is about as wide as the cosine's."""
 
 
 class Material(NamedTuple):
@@ -254,7 +254,7 @@ class ShinyFlags:
     num_test: int = 20
     """Number of test images of a scene."""
     environment: int = 0
-    """Seed of the lamps; another one lights the same solids otherwise."""
+    """Seed of the lamps that light the solids."""
 
 
 def _command(arguments: list[str]) -> None:

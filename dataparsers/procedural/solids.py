@@ -1,9 +1,9 @@
 """Solids with an exact surface: a ball, a box, a ring, a thin plate, and a box with a hole, seen from all sides.
 
 `python -m nerfloom.dataparsers.procedural.solids FOLDER` writes images of them in NeRF-Synthetic's format, and
-`reference.ply`, their surface as a mesh with exact normals. Methods are trained on the folder like on any other, and
-judged by `ns-eval RUN --reference-mesh FOLDER/reference.ply`. The solids are matte and touch nothing, so that cameras
-see all of the surface.
+`reference.ply`, their surface as a mesh with exact normals. Train a method on the folder as on any other, and compare
+its surface with `ns-eval RUN --reference-mesh FOLDER/reference.ply`. The solids are matte and touch nothing, so that
+cameras see all of the surface.
 """
 
 from __future__ import annotations

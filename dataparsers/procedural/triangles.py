@@ -69,7 +69,7 @@ def of_bored_box(shape: BoredBox, deviation: float) -> Triangles:
     """Return the surface of the cuboid `shape` with a round hole along z; `deviation` as in `of_sphere`."""
     x, y, z = shape.half
     corner = math.atan2(y, x)
-    # The four corners are among the directions in which the faces around the hole are divided.
+    # The faces around the hole are divided at directions that include those of the four corners.
     ends = [-corner, corner, math.pi - corner, math.pi + corner]
     count = _divisions(shape.radius, deviation)
     angle = torch.cat([_between(a, b, count) for a, b in zip(ends, [*ends[1:], ends[0] + 2 * math.pi], strict=True)])

@@ -48,7 +48,7 @@ def check(site: Path) -> tuple[int, list[str]]:
         for link in page.links + page.loaded:
             count += 1
             problem = _problem(link, file, pages, link in page.loaded)
-            if problem is not None and where.name != "404.html":  # whose links are from the root of a server
+            if problem is not None and where.name != "404.html":  # its links are from the root of a server
                 wrong.append(f"{where}: {link}: {problem}")
     return count, wrong
 

@@ -86,7 +86,7 @@ def allowed_of(hint: Any, span: tuple[float, float] | None) -> str:
 
 
 def choices(hint: Any) -> tuple[Any, ...]:
-    """Return the words that a setting may be; none if it is no choice between words."""
+    """Return the words that a setting may be; none if it is not a choice of words."""
     if typing.get_origin(hint) is Literal:
         return typing.get_args(hint)
     found = [choices(argument) for argument in typing.get_args(hint) if argument not in NO_VALUES]

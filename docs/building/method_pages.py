@@ -21,7 +21,7 @@ PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
 
 
 def methods() -> dict[str, Entry]:
-    """Return the methods of this repository, sorted by name; plugins that are installed besides are no part of it."""
+    """Return the methods of this repository, sorted by name; installed plugins are left out."""
     entries = registered("methods").items()
     return {name: entry for name, entry in entries if entry.module.startswith("nerfloom.methods.")}
 

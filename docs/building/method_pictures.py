@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 COMMANDS = {
     "dnerf": "dnerf --canonical hash-grid {} procedural --moving True",
     "instant-ngp": "instant-ngp {}",
+    "kilo-nerf": "kilo-nerf {}",
     "kplanes": "kplanes {}",
     "mip-nerf": "mip-nerf --sampler occupancy {}",
     "mip-nerf-360": "mip-nerf-360 {}",
@@ -36,6 +37,7 @@ COMMANDS = {
     "ref-nerf": "ref-nerf {}",
     "pixel-nerf": "pixel-nerf {} procedural --num-scenes 200 --size 32",
     "gaussian-splatting": "gaussian-splatting {}",
+    "moving-gaussians": "moving-gaussians {} procedural --moving True",
     "tensorf": "tensorf {}",
     "vanilla-nerf": "vanilla-nerf --sampler occupancy {}",
     "zip-nerf": "zip-nerf {}",

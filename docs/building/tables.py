@@ -1,6 +1,6 @@
 """Fills in the tables of the pages from docs/results: `python -m docs.building.tables`.
 
-- A table whose last column is headed `result` names a row of a file of results in each line. Cells under headings of
+- A table with a last column headed `result` names a row of a file of results in each line. Cells under headings of
   `python -m benchmarks tables` become what that row says, with the mean and the spread over its seeds; all others stay.
 - A table behind `<!-- results: NAME: HEADING, HEADING -->` shows these headings in every cell, of the result called
   NAME. ROW is the first word in backticks of the line and COLUMN the heading of the column. With `best` behind

@@ -8,8 +8,8 @@ import typing
 from collections.abc import Callable
 from typing import Any
 
-from nerfloom.base.config import converted
 from nerfloom.base.errors import ConfigError, nearest, shown
+from nerfloom.base.plain import converted
 
 
 def arguments_of(function: Callable[..., Any], values: Any, where: str, given: int = 0) -> dict[str, Any]:

@@ -19,7 +19,7 @@ def checked(kind: type[T], values: Any) -> T:
         values: the field values by name; anything but a dictionary is refused.
 
     Raises:
-        ValueError: if `values` is no dictionary, or a value is missing, unknown or not of its field's type.
+        ValueError: if `values` is not a dictionary, or a value is missing, unknown or not of its field's type.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{kind.__name__} is {shown(values)}; it must be a mapping of names to values")

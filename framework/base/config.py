@@ -5,19 +5,14 @@ This module imports neither PyTorch nor any method, so that commands start quick
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import math
-import types
 import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, Union
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
-import yaml
-
-from nerfloom.base.errors import ConfigError, nearest, shown
-from nerfloom.base.from_nerfstudio import config_answer
+from nerfloom.base.errors import ConfigError, shown
 from nerfloom.base.machine_config import MachineConfig, ViewerConfig
 
 T = TypeVar("T")
@@ -63,6 +58,8 @@ class TrainConfig:
         "train_image_indices": AT_LEAST_0,
         "lr_warmup_steps": AT_LEAST_0,
         "viewer_share": (0.001, 1),
+        "teacher_share": (0, 1),
+        "teacher_until": (0, 1),
     }
     """Allowed ranges; a method's config adds or overrides some. Every range allows None; each number of a tuple is
     checked."""
@@ -114,6 +111,12 @@ class TrainConfig:
     """Address of the viewer."""
     mixed_precision: bool | None = None
     """Run networks in bfloat16, density and compositing in float32. Default: if the device multiplies bfloat16 fast."""
+    teacher: Path | None = None
+    """Trained run, file of Gaussians or octree, which renders views between the training cameras to learn from."""
+    teacher_share: float = 0.5
+    """Fraction of the steps that learn from --teacher, at the start; it falls linearly to 0 at --teacher-until."""
+    teacher_until: float = 0.8
+    """Fraction of the budget after which training uses photographs alone (--teacher)."""
     load_dir: Path | None = None
     """Start from the newest checkpoint in this folder."""
     load_checkpoint: Path | None = None
@@ -141,9 +144,10 @@ class TrainConfig:
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 
-    # Values of settings that a method lacks, so that shared code need not know the class of its settings. Without
-    # annotation they are no fields, and so no flags.
+    # Values of settings that a method lacks, so that shared code need not know the class of its settings. They have no
+    # annotations, so they are neither fields nor flags.
     sampler, bounded_sampler, time_slices, robust_factor = "", "occupancy", 1, 2.0
+    background_model = "contraction"
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = robust = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
@@ -159,7 +163,7 @@ class TrainConfig:
         for name, value in defaults.items():
             owner = next((base for base in cls.__mro__[1:] if name in inspect.get_annotations(base)), None)
             if owner is None:
-                raise TypeError(f"{cls.__name__} inherits no setting '{name}', whose default it changes")
+                raise TypeError(f"{cls.__name__} inherits no setting '{name}', but changes its default")
             cls.__annotations__[name] = typing.get_type_hints(owner, include_extras=True)[name]
             setattr(cls, name, value)
 
@@ -275,122 +279,3 @@ def _check_range(name: str, value: Any, least: float, most: float) -> None:
 
 def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
-
-
-def to_plain(value: Any) -> Any:
-    """Convert a config to numbers, strings, lists and dictionaries, which the safe YAML dumper writes.
-
-    Args:
-        value: a config, or a setting's value.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, (list, tuple)):
-        return [to_plain(item) for item in value]
-    return value
-
-
-def from_plain(default: T, values: dict[str, Any], where: str) -> T:
-    """Return a config with some fields replaced.
-
-    Args:
-        default: instance of a dataclass.
-        values: plain values by field name, as read from YAML.
-        where: name of the source in error messages.
-
-    Raises:
-        ConfigError: for an unknown key, with the nearest valid one, or a value of the wrong type.
-    """
-    hints = typing.get_type_hints(type(default))
-    names = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
-    changes = {}
-    for key, value in values.items():
-        if key not in names:
-            name = key if isinstance(key, str) else shown(key)
-            raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, names)}")
-        current = getattr(default, key)
-        if dataclasses.is_dataclass(current) and isinstance(value, dict):
-            changes[key] = from_plain(current, value, f"{where}: {key}")
-        else:
-            changes[key] = converted(value, hints[key], f"{where}: '{key}'")
-    return dataclasses.replace(default, **changes)  # type: ignore[type-var]
-
-
-def converted(value: Any, hint: Any, where: str) -> Any:
-    """Convert a plain value, such as one read from YAML, to an annotated type.
-
-    Args:
-        value: the value.
-        hint: the type: a class, `Path`, or a union, `Literal` or tuple of types.
-        where: name of the value in error messages.
-
-    Raises:
-        ConfigError: if the value is not of this type.
-    """
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        if Literal["auto"] in arguments and (value == AUTO or value is None):  # null in files of older runs
-            return AUTO
-        return converted(value, next(a for a in arguments if a not in (type(None), Literal["auto"])), where)
-    if origin is Literal:
-        if value in arguments:
-            return value
-        raise ConfigError(f"{where} is {shown(value)}; it must be one of {', '.join(map(str, arguments))}")
-    if origin is tuple and isinstance(value, (list, tuple)):
-        inner = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
-        if len(inner) == len(value):
-            return tuple(converted(item, kind, where) for item, kind in zip(value, inner, strict=True))
-    if hint is Path and isinstance(value, str) and "\0" not in value:
-        return Path(value)
-    if hint is float and isinstance(value, (str, int, float)) and not isinstance(value, bool):
-        try:
-            return float(value)  # YAML 1.1 reads 1e-3 as a string
-        except (ValueError, OverflowError):
-            pass
-    if isinstance(hint, type) and (_is_count(value) if hint is int else isinstance(value, hint)):
-        return value
-    raise ConfigError(f"{where} is {shown(value)}; it must be {getattr(hint, '__name__', hint)}")
-
-
-def _is_count(value: Any) -> bool:
-    """Return whether a value is an integer of at most 64 bits, and not a bool."""
-    return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
-
-
-class _PlainLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases: a few lines of aliases can expand beyond memory."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("it has an alias (*name); write the value out")
-        return super().compose_node(parent, index)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping, with the safe loader and without aliases.
-
-    Args:
-        path: the file.
-
-    Raises:
-        ConfigError: if the file is missing, is not YAML or does not hold a mapping.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-        if (answer := config_answer(text)) is not None:
-            raise ConfigError(f"{path} {answer}")
-        values = yaml.load(text, _PlainLoader)
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    except ConfigError:
-        raise
-    except Exception as error:  # not only YAMLError: bad text, dates and nesting raise others, `!!float ''` IndexError
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path} is not plain YAML: {reason}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} must hold keys and values, such as 'method: instant-ngp'")
-    return values

@@ -84,6 +84,15 @@ def num_cores() -> int:
     return len(allowed(0)) if allowed is not None else os.cpu_count() or 1
 
 
+def num_gpus(device_type: str) -> int:
+    """Return the number of GPUs that a process asks for: 1 if it computes with CUDA, else 0.
+
+    Args:
+        device_type: auto, cpu, cuda or mps.
+    """
+    return int(device_type == "cuda" or (device_type == "auto" and torch.cuda.is_available()))
+
+
 def has_bfloat16(device: torch.device) -> bool:
     """Return whether `device` multiplies bfloat16 matrices in hardware."""
     if device.type == "cuda":

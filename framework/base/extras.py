@@ -15,6 +15,7 @@ EXTRAS: dict[str, dict[str, str]] = {
     "lpips": {"lpips": "lpips", "torchvision": "torchvision"},
     "cluster": {"ray": "ray"},
     "heic": {"pillow_heif": "pillow-heif"},
+    "spz": {"zstandard": "zstandard"},
 }
 """Extra in pyproject.toml -> {imported module: name of its package for pip}."""
 

@@ -103,12 +103,8 @@ NO_FORMATS = (
 )  # fmt: skip
 """Data subcommands of nerfstudio without a data format here."""
 _MESH = "use 'marching-cubes' (methods with density) or 'tsdf' (all methods) for meshes"
-_OTHER_POSES = "export its cameras in COLMAP's format, and pass that folder to ns-train --data; no processing is needed"
 KINDS = {
     "poisson": _MESH,
-    "metashape": _OTHER_POSES,
-    "realitycapture": _OTHER_POSES,
-    "odm": _OTHER_POSES,
     "aria": "it is not supported here",
 }
 """Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent -> what to use instead."""

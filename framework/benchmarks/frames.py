@@ -63,7 +63,7 @@ def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count:
         count: number of pictures at each size, one held-out camera after another.
     """
     trained = load_trained(run, device_type="cpu")
-    model, cameras = trained.model, trained.run.parse("test").cameras
+    model, cameras = trained.model, trained.parsed("test").cameras
     gaussians = len(model.gaussians()) if isinstance(model, HasGaussians) else None
     background, name = model.background, "/".join(run.resolve().parts[-3:])
     rows = []

@@ -1,4 +1,4 @@
-"""Files of results: a JSON file a table, whose `rows` stand by name."""
+"""Files of results: one JSON file per table, with its `rows` by name."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def read_rows(file: Path) -> dict[str, Any]:
         return {}
     found = read_json(file)
     if not isinstance(found, dict) or not isinstance(rows := found.get("rows"), dict):
-        raise ConfigError(f"{file} is no file of results, which has rows by name; name another place")
+        raise ConfigError(f"{file} is not a file of results, because it has no rows by name; give another path")
     return rows
 
 
 def add_row(file: Path, name: str, result: Any) -> None:
-    """Add a row to a file of results, in place of one of that name.
+    """Add a row to a file of results; it replaces a row of that name.
 
     Args:
         file: the JSON file; it and its folder are created if missing.
@@ -36,7 +36,7 @@ def add_row(file: Path, name: str, result: Any) -> None:
         result: plain data.
 
     Raises:
-        ConfigError: if the file is there and holds something else.
+        ConfigError: if the file exists and holds something else.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     write_json(file, {"rows": dict(sorted({**read_rows(file), name: result}.items()))})

@@ -16,7 +16,7 @@ MAX_SPACING_CAMERAS = 64
 """Maximum number of cameras used to estimate the spacing."""
 
 
-def propagated_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Tensor, float]:
+def propagated_poses(poses: Tensor, given: Tensor, refined: Tensor) -> Tensor:
     """Move poses as the cameras near them were moved.
 
     Every pose follows the similarity from given to refined poses. It also gets the weighted mean of the remaining
@@ -29,7 +29,7 @@ def propagated_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Ten
         refined: (M, 3, 4) the same poses after refinement.
 
     Returns:
-        The moved poses (N, 3, 4), and the scale of the similarity, a factor for lengths.
+        (N, 3, 4) the moved poses.
     """
     before, after, others = (part.cpu().double() for part in (given, refined, poses))
     scale, rotation, translation = align_cameras(before, after)
@@ -39,7 +39,7 @@ def propagated_poses(poses: Tensor, given: Tensor, refined: Tensor) -> tuple[Ten
     turned = nearest_rotations((weights @ turns).view(-1, 3, 3)) @ others[:, :, :3]
     left_over = after[:, :, 3] - (scale * centers @ rotation.T + translation)
     moved = scale * positions @ rotation.T + translation + weights @ left_over
-    return torch.cat([turned, moved[:, :, None]], dim=-1).to(poses), scale
+    return torch.cat([turned, moved[:, :, None]], dim=-1).to(poses)
 
 
 def _nearness(positions: Tensor, centers: Tensor) -> Tensor:

@@ -24,6 +24,8 @@ SMALL_VIEW = 0.5
 """Scenes whose images show less than this where their cameras look are enlarged (`enlargement`), scene units."""
 MIN_SHARE_LOOKING = 0.9
 """Fraction of the cameras that must see the common point they look at, for a scene to be enlarged."""
+Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+"""Quarter turn about x, which turns +z to +y."""
 MAX_POINTS = 2000
 """Maximum number of sparse points used."""
 
@@ -79,6 +81,19 @@ class Placement:
         """Return rotation (3, 3), scale and shift (3,) of `original_points`: x -> scale * rotation @ x + shift."""
         return self._turned_back, 1 / self.scale, -self._turned_back @ self.transform[:, 3]
 
+    def similarity_to(self, other: Placement) -> tuple[Tensor, float, Tensor]:
+        """Return rotation (3, 3), scale and shift (3,) from this scene to another of the same input, both float64.
+
+        A point x of this scene is at scale * rotation @ x + shift in the other. The input's coordinates may be large;
+        they cancel before they are rounded.
+
+        Args:
+            other: placement of the same input in the other scene.
+        """
+        rotation = other.transform[:, :3] @ self._turned_back
+        shift = other.scale * (other.transform[:, 3] - rotation @ self.transform[:, 3])
+        return rotation, other.scale / self.scale, shift
+
     def about(self, origin: Tensor) -> Placement:
         """Return the same placement for input coordinates relative to `origin` (3,), a point in the input's frame."""
         rotation = self.transform[:, :3]
@@ -107,6 +122,21 @@ class Placement:
         moved = self.transform[:, :3] @ applied[:3].double()
         moved[:, 3] += self.transform[:, 3] / scale
         return Placement(moved, self.scale * scale)
+
+    def y_up(self) -> Placement:
+        """Return the placement for an input that is turned so that the scene's up direction, +z, is +y, as in glTF."""
+        applied = torch.eye(4, dtype=torch.float64)
+        applied[:3, :3] = self.to_y_up()
+        return self.after(applied, 1.0)
+
+    def to_y_up(self) -> Tensor:
+        """Return the rotation (3, 3) float64 of the input that turns the scene's up direction, +z, to +y.
+
+        It is the smallest rotation that turns the up direction to z, followed by a quarter turn about x. So it is
+        (x, y, z) -> (x, z, -y) where z is up in the input.
+        """
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        return Y_UP @ rotation_between(self.original_directions(up[None])[0], up)
 
     def original_poses(self, poses: Tensor) -> Tensor:
         """Transform `poses` (M, 3, 4) from the scene's frame to the input's, float64: the inverse of `poses`."""

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from nerfloom.base.optimised import Optimised
-from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.pose_propagation import propagated_poses
 from nerfloom.cameras.rigid_motion import rigid_motions
 from nerfloom.geometry.rays import Rays
@@ -26,6 +25,9 @@ POSE_REASONS = {
 
 class PoseRefinement(nn.Module):
     """A small rigid motion for each training camera, in the scene's frame; initially the identity.
+
+    The data give poses, and the scene is learnt as the moved cameras see it. So the moved poses are those in the
+    scene's frame.
 
     Args:
         count: number of cameras.
@@ -53,9 +55,16 @@ class PoseRefinement(nn.Module):
         return rigid_motions(self.tangents[chosen], self.group == "SE3")
 
     def forward(self, rays: Rays) -> Rays:
-        """Move the rays of training cameras by their refinements, and those of other cameras as their neighbours."""
+        """Move rays of training cameras from their given to their refined poses, with a gradient.
+
+        Args:
+            rays: R rays from the given poses.
+
+        Raises:
+            ValueError: if the rays have no camera indices.
+        """
         if rays.camera_indices is None:
-            return self.propagated(rays)
+            raise ValueError("poses are refined along rays of training cameras")
         # Not `motions[camera_indices]`: the order of summation of its gradient depends on the threads.
         motions = nn.functional.embedding(rays.camera_indices, self.motions().flatten(1)).view(-1, 3, 4)
         directions = (motions[:, :, :3] * rays.directions[:, None]).sum(-1)
@@ -63,34 +72,6 @@ class PoseRefinement(nn.Module):
         if self.group == "SE3":
             origins = (motions[:, :, :3] * origins[:, None]).sum(-1)
         return replace(rays, origins=origins + motions[:, :, 3], directions=directions)
-
-    @torch.no_grad()
-    def propagated(self, rays: Rays) -> Rays:
-        """Transform `rays` from the given poses' frame to the refined poses'; lengths are scaled too."""
-        if self.given is None:
-            return rays
-        origins = rays.origins
-        if bool((origins == origins[:1]).all()):  # rays of one view
-            origins = origins[:1]
-        axes = torch.eye(3).to(origins).expand(len(origins), 3, 3)
-        poses = torch.cat([axes, origins[:, :, None]], dim=-1)
-        moved, scale = propagated_poses(poses, self.given, self._moved(self.given))
-        return replace(
-            rays,
-            origins=moved[:, :, 3].expand_as(rays.origins),
-            directions=(moved[:, :, :3] * rays.directions[:, None]).sum(-1),
-            nears=scale * rays.nears,
-            fars=scale * rays.fars,
-        )
-
-    @torch.no_grad()
-    def propagated_pose(self, pose: Tensor) -> Tensor:
-        """Move the pose of another camera like nearby training cameras (`propagated_poses`).
-
-        Args:
-            pose: (3, 4) camera-to-scene pose.
-        """
-        return pose if self.given is None else propagated_poses(pose[None], self.given, self._moved(self.given))[0][0]
 
     def pose(self, index: int, given: Tensor) -> Tensor:
         """Return the refined pose (3, 4) of a training camera, with a gradient.
@@ -102,9 +83,20 @@ class PoseRefinement(nn.Module):
         return self._moved(given[None], slice(index, index + 1))[0]
 
     @torch.no_grad()
-    def refined(self, cameras: Cameras) -> Cameras:
-        """Return the training `cameras` (M) with refined poses."""
-        return replace(cameras, camera_to_worlds=self._moved(cameras.camera_to_worlds))
+    def refined(self, poses: Tensor, training: bool) -> Tensor:
+        """Return camera poses (M, 3, 4) of the data, refined, without a gradient.
+
+        Args:
+            poses: (M, 3, 4) given poses, on any device.
+            training: whether they are those of all training cameras, in their order. Other poses follow those of
+                nearby training cameras. So do poses of training cameras if some of them are missing.
+        """
+        here = poses.to(self.tangents)
+        if training and len(here) == len(self.tangents):
+            return self._moved(here).to(poses)
+        if self.given is None:
+            return poses
+        return propagated_poses(here, self.given, self._moved(self.given)).to(poses)
 
     def _moved(self, poses: Tensor, chosen: slice = slice(None)) -> Tensor:
         motions = self.motions(chosen)

@@ -1,8 +1,8 @@
 """The scale of a run: the unit of its lengths, once a true length in the scene has been given.
 
 Photographs do not tell a scene's size. The scale is a number and a name: lengths of the input times `factor` are in
-`unit`. It is kept in the file scale.json of a run's folder, and beside an exported file NAME of Gaussians, whose
-coordinates it has been applied to, in NAME.scale.json. Without such a file, lengths are in the input's own unit.
+`unit`. It is kept in the file scale.json of a run's folder. An exported file NAME of Gaussians has coordinates in that
+unit and the scale in NAME.scale.json. Without such a file, lengths are in the input's own unit.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def scale_file(path: Path) -> Path:
 
 
 def read_scale(path: Path) -> Scale:
-    """Read the scale of a run or of a file of Gaussians; that of the input if none is kept.
+    """Read the scale of a run, a file of Gaussians or an octree; that of the input if none is kept.
 
     Args:
         path: the run's folder, or the file.
@@ -114,7 +114,7 @@ def read_scale(path: Path) -> Scale:
 
 
 def write_scale(path: Path, scale: Scale) -> None:
-    """Write the scale of a run or of a file of Gaussians, or remove an earlier one if it is the input's own.
+    """Write the scale of a run, a file of Gaussians or an octree; remove an earlier one if it is the input's own.
 
     Args:
         path: the run's folder, or the file.

@@ -43,7 +43,7 @@ def unseen_patches(rays: Rays, poses: Tensor, side: int, stride: float = 1.0) ->
 
 
 def unseen_poses(poses: Tensor, near: Tensor) -> Tensor:
-    """Return random poses, each between and around a given camera and the two that stand nearest to it.
+    """Return random poses, each between and around a given camera and its two nearest neighbours.
 
     The position is uniformly distributed over a triangle, `REACH` times as large as the one of the three cameras. The
     rotation is the closest to the mean of their rotations, with the same weights.

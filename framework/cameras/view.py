@@ -26,7 +26,7 @@ class View:
     scene: int | None = None
     """Index of the scene if the images show several; None for the only one or the first."""
     image: int | None = None
-    """Index of the training image whose own content, which is in no other image, is shown; None for none."""
+    """Index of a training image, to show also what only that image contains; None: what all images share."""
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:

@@ -1,4 +1,4 @@
-"""The command `ns-bake`: a trained field becomes an octree, which is drawn in real time."""
+"""The command `ns-bake`: turn a trained field into an octree, which is drawn in real time."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ class BakeFlags(RunFlags):
     output_path: Path | None = None
     """File to write, NAME.octree. Default: scene.octree in the run's folder."""
     max_megabytes: float = 30.0
-    """Maximum size of the file, millions of bytes. It decides on the degree of harmonics, and then on the leaves."""
+    """Maximum size of the file, millions of bytes. It limits the degree of harmonics first, then the number of
+    leaves."""
     resolution: int = 512
     """Cells along the longest edge of the box of all matter, 16 to 1024."""
     degree: int | None = None
-    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, by the size."""
+    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes."""
     fine_tune_seconds: float = 30.0
     """Time to learn from the photographs; 0: none."""
 

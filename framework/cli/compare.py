@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def _command(arguments: list[str]) -> None:
-    from nerfloom.base.config import from_plain, read_yaml
+    from nerfloom.base.plain import from_plain, read_yaml
 
     recipe, arguments = _recipe(arguments)
     default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))

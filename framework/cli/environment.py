@@ -13,7 +13,7 @@ import nerfloom
 from nerfloom.base.extras import EXTRAS, install_command
 
 PACKAGES = ("numpy", "tyro", "rich", "imageio", "pillow", "PyYAML", "pycolmap", "tensorboard", "jinja2", "triton")
-"""Packages whose versions are listed beside torch's."""
+"""Packages with versions to list, in addition to torch."""
 VARIABLES = ("NERFLOOM_", "OMP_", "KMP_", "GOMP_", "MKL_", "CUDA_VISIBLE_DEVICES", "PYTORCH_")
 """Prefixes of environment variables that affect results."""
 

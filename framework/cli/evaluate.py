@@ -1,4 +1,4 @@
-"""The command `ns-eval`: metrics of a trained run, or of a file of Gaussians, on held-out views."""
+"""The command `ns-eval`: metrics of a trained run, a file of Gaussians or an octree on held-out views."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Literal
 
 from nerfloom.base.config import HeldOutAppearance, RaysPerPixel
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
+from nerfloom.blocks.files import is_blocks_file
 from nerfloom.cli.common import make_room, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
@@ -17,12 +18,12 @@ from nerfloom.training.run_path import check_writable
 
 @dataclass(frozen=True, kw_only=True)
 class EvalFlags(GeometryFlags, RunFlags):
-    """Compute PSNR, SSIM and LPIPS of a trained run, or of a file of Gaussians with --data, on held-out views.
+    """Compute PSNR, SSIM and LPIPS of a run, or with --data of a file of Gaussians or an octree, on held-out views.
 
     With --reference-mesh or --reference-points, also compare its surface with the true one."""
 
     output_path: Path | None = None
-    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside a file of Gaussians."""
+    """JSON file to write. Default: eval.json beside config.yml, or NAME.eval.json beside any other file."""
     render_output_path: Path | None = None
     """Folder for each view's render, true image, and comparison (image, render, error, depth, opacity)."""
     max_pictures: int | None = None
@@ -117,8 +118,9 @@ def _command(arguments: list[str]) -> None:
 
 
 def _beside(run: Path) -> Path:
-    """Return the default results file for a run's config.yml or a file of Gaussians."""
-    return run.parent / "eval.json" if run.suffix == ".yml" else run.with_suffix(".eval.json")
+    """Return the default results file for a run's config.yml, a blocks.yml, a file of Gaussians or an octree."""
+    is_run = run.suffix == ".yml" and not is_blocks_file(run)
+    return run.parent / "eval.json" if is_run else run.with_suffix(".eval.json")
 
 
 if __name__ == "__main__":

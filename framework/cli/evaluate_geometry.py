@@ -40,7 +40,7 @@ def evaluate_geometry(
         flags: the flags of the comparison.
         mesh: file of the mesh to judge; None to make one of the run.
         loaded: the run.
-        reference: what it is judged by.
+        reference: the surface to compare with.
 
     Returns:
         The content of eval.json, and a warning or None.
@@ -100,7 +100,7 @@ def _views(loaded: Loaded, least: int) -> Views:
 
 
 def _distances(found: Geometry) -> Table:
-    """Return distances as a table, in the input's unit and in per cent of the reference's side."""
+    """Return distances as a table, in the input's unit and in percent of the reference's longest side."""
     from rich.table import Table
 
     table = Table("", "mean", "% of side", "median")
@@ -127,7 +127,7 @@ def _f_scores(found: Geometry) -> Table:
 def _notes(
     flags: GeometryFlags, found: Geometry, surface: Surface, reference: Surface, source: str, unit: str
 ) -> list[str]:
-    """Return lines that say what was compared, in which unit, and what was left out."""
+    """Return lines about what was compared, the unit of lengths, and what was left out."""
     seen = "every point counts" if flags.min_views == 0 else f"what {flags.min_views} or more training cameras see"
     left_out, reference_left_out = found.left_out.describe(), found.reference_left_out.describe()
     lines = [
@@ -139,7 +139,7 @@ def _notes(
     ]
     if reference.faces is None:
         apart = point_spacing(reference.points)
-        lines.append(f"the reference's points are some {apart:.3g} apart; smaller distances cannot be told by them")
+        lines.append(f"the reference's points are about {apart:.3g} apart; they cannot resolve smaller distances")
     if found.normals is None:
         return ["normals: the reference has none", *lines]
-    return [f"normals: {found.normals.degrees:.2f} degrees in the mean, |cos| {found.normals.cosine:.4f}", *lines]
+    return [f"normals: {found.normals.degrees:.2f} degrees on average, |cos| {found.normals.cosine:.4f}", *lines]

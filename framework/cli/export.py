@@ -23,7 +23,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   tsdf            mesh.ply, .obj or .glb: a mesh of what the training cameras see; for captures, and every method
   marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
-  gaussian-splat  splat.ply or splat.spz: the Gaussians of gaussian-splatting, for other programs
+  gaussian-splat  splat.ply, .spz, .sog or .glb: the Gaussians of a run, for other programs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
                   refined them; transforms_train.json: the training cameras, in nerfstudio's format
@@ -31,12 +31,13 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): gaussian-splat and web need no data, others --data DIR.
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat and web need no data,
+others --data DIR.
 
   ns-export web splat.ply --output-dir exports
 
 ns-export WHAT --help shows its flags. All files use the frame and units of the input, or the unit that ns-measure
-has set.
+has set. In .glb files, y is up.
 """
 
 

@@ -52,10 +52,11 @@ class OccupancyFlags(OccupancySettings, ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class SplatFlags(SplatSettings, RegionFlags, ExportFlags):
-    """Write splat.ply or splat.spz: Gaussians for viewers and the code of 3D Gaussian Splatting."""
+    """Write splat.ply, .spz, .sog or .glb: Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
-    format: Literal["ply", "spz"] = "ply"
-    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth."""
+    format: Literal["ply", "spz", "sog", "glb"] = "ply"
+    """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth; sog: images
+    in a zip file, for PlayCanvas; glb: glTF with KHR_gaussian_splatting, y up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +72,7 @@ class MeshFlags(MeshSettings, ExportFlags):
     """Flags of every mesh."""
 
     format: Literal["ply", "obj", "glb"] = "ply"
-    """File format; ply is the smallest and fastest."""
+    """File format; ply is the smallest and fastest. In glb, y is up."""
 
 
 @dataclass(frozen=True, kw_only=True)

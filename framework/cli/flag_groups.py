@@ -44,6 +44,7 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     "appearance": (AppearanceConfig,),
     "few images": (FewImagesConfig,),
     "motion": (MotionConfig,),
+    "teacher": ("teacher", "teacher_share", "teacher_until"),
     "optimisation": (
         "learning_rate", "lr_schedule", "lr_final", "lr_warmup_steps", "adam_beta1", "adam_beta2", "adam_eps",
     ),

@@ -21,12 +21,13 @@ class GeometryFlags:
     """The reference, and how the surface is compared with it."""
 
     reference_mesh: Path | None = None
-    """Mesh of the true surface (.ply, .obj, .glb), in the input's frame and unit, to judge the run's surface by."""
+    """Mesh of the true surface (.ply, .obj, .glb), in the input's frame and unit. The run's surface is compared with
+    it."""
     reference_points: Path | None = None
     """Points on the true surface instead (.ply, normals optional)."""
     surface: Literal["auto", "marching-cubes", "tsdf"] = "auto"
-    """Export whose mesh is judged. auto: marching-cubes of a signed distance, or of a density in a bounded scene,
-    otherwise tsdf."""
+    """Export that makes the mesh to judge. auto: marching-cubes of a signed distance, or of a density in a bounded
+    scene, otherwise tsdf."""
     surface_resolution: int = 256
     """Number of cells along the longest edge of that export's box."""
     f_score_at: tuple[float, ...] = ()
@@ -59,7 +60,7 @@ class GeometryFlags:
         if self.reference is None:
             return
         if not self.reference.is_file():
-            raise ConfigError(f"{self.reference} is no file; name the mesh or the points to judge surfaces by")
+            raise ConfigError(f"{self.reference} is not a file; give the mesh or the points of the true surface")
         if (advice := install_command("export")) is not None:
             raise ConfigError(f"judging a surface needs packages that are not installed: {advice}")
 

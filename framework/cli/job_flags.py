@@ -17,11 +17,11 @@ class JobFlags:
     """Choose where jobs run, and how many at a time."""
 
     launcher: Literal["processes", "ray", "slurm"] = "processes"
-    """What runs the jobs: processes on this machine, a Ray cluster, or Slurm by a script that is written. All leave the
-    same files."""
+    """What runs the jobs: processes on this machine, a Ray cluster, or Slurm, for which a script is written. All
+    produce the same files."""
     jobs: int | None = None
-    """Number of simultaneous jobs. Processes have a GPU each, or --num-threads of the CPU's cores each. Default: 1 by
-    processes; as many as there is room for by ray and slurm."""
+    """Number of simultaneous jobs. Each process has one GPU, or --num-threads CPU cores. Default: 1 for processes; as
+    many as there is room for with ray and slurm."""
     ray_address: str | None = None
     """Address of a running Ray cluster, such as 10.0.0.1:6379 or auto. Default: one is started on this machine."""
 

@@ -1,4 +1,4 @@
-"""The command `ns-process-data`: conversion of images, a video or a phone's capture to a data folder."""
+"""The command `ns-process-data`: conversion of images, a video, or a capture with poses to a data folder."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ kinds:
   images          a folder of images; COLMAP estimates their poses
   video           a video; COLMAP estimates the poses of its sharpest frames
                   (either kind accepts the other's input, and says so)
-  polycam         Polycam's raw export, with the phone's poses
-  record3d        Record3D's export with EXR and RGBD, with the phone's poses
+  polycam         Polycam's raw export, a folder or a zip file, with the phone's poses
+  record3d        Record3D's export with EXR and RGBD, or a recording (.r3d), with the phone's poses
+  metashape       photographs with the cameras of Agisoft Metashape (XML)
+  realitycapture  photographs with the cameras of RealityCapture or RealityScan (CSV)
+  odm             a project of OpenDroneMap or OpenSfM
+  bundler         photographs with the cameras of Bundler (bundle.out), which many programs write
 
 ns-process-data KIND --help shows its flags.
 """

@@ -1,4 +1,4 @@
-"""The command `ns-render`: images, animations and videos of a trained run, or of a file of Gaussians."""
+"""The command `ns-render`: images, animations and videos of a trained run, a file of Gaussians or an octree."""
 
 from __future__ import annotations
 

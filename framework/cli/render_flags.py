@@ -30,8 +30,8 @@ paths:
   ns-render interpolate RUN_FOLDER --output-path walk.mp4
   ns-render orbit RUN_FOLDER --output-path orbit.mp4 --seconds 8 --width 1920 --height 1080
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .splat): orbit and camera-path need no data, others
---data DIR [FORMAT [format flags]], as in
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat) or an octree (.octree): orbit and
+camera-path need no data, others --data DIR [FORMAT [format flags]], as in
 
   ns-render orbit splat.ply --output-path orbit.mp4
   ns-render interpolate splat.ply --data DIR --output-path walk.mp4
@@ -45,7 +45,7 @@ class RenderFlags:
     """Flags of every path beside its settings."""
 
     run: RunFlags
-    """The trained run, or the file of Gaussians."""
+    """The trained run, the file of Gaussians, or the octree."""
     output_path: Path | None = None
     """File to write; its extension (.mp4, .gif, .webp, .png) is the format. Without one: a folder of images. Default:
     PATH.mp4, or PATH.gif without the extra [video]; of dataset: renders."""

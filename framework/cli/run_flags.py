@@ -1,4 +1,4 @@
-"""Flags of every command that opens a trained run, a file of Gaussians, or an octree."""
+"""Flags of every command that opens a trained run, a scene in blocks, a file of Gaussians, or an octree."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class OpenFlags:
     """The trained run or file, and the device that opens it."""
 
     load_config: Path
-    """RUN_FOLDER, its config.yml, a folder above (its newest run), a file of Gaussians (.ply, .spz, .splat), or an
-    octree (.octree). The flag's name may be omitted."""
+    """RUN_FOLDER, its config.yml, a folder above (its newest run), a blocks.yml of ns-blocks or its folder, a file of
+    Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree). The flag's name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None
@@ -31,7 +31,7 @@ class OpenFlags:
     """Device to render on."""
 
     def check(self) -> Path:
-        """Check that all files exist, without torch, and return the run's config.yml or the file of Gaussians.
+        """Check that all files exist, without torch, and return the run's config.yml or the file.
 
         Raises:
             ConfigError, CheckpointError, DataError: if something is missing.

@@ -22,6 +22,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.model import StartsFromImages
+from nerfloom.renderable import with_refined_poses
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.budget import evaluation_seconds
 from nerfloom.training.checkpoint import FOLDER, list_checkpoints, load_newest
@@ -38,7 +39,7 @@ from nerfloom.training.trainer import BetweenSteps, Trainer
 MAX_PICTURES = 4
 """Maximum number of held-out views whose pictures are written at the end."""
 MAX_TRAINING = 3
-"""Maximum number of training images whose pictures are written, if the method shows what they have alone."""
+"""Maximum number of training images with pictures, if the method shows what only one image contains."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
 
@@ -184,7 +185,7 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
     say(f"evaluating held-out images; the first ones are written to {run.folder / 'pictures'}")
     evaluation = evaluate(
         trainer.model,
-        test_set.to(trainer.device, with_pixels=False),
+        with_refined_poses(trainer.model, test_set.to(trainer.device, with_pixels=False)),
         max_images=run.config.max_eval_images,
         seconds=evaluation_seconds(run.config, trainer.state),
         pictures=run.folder / "pictures",
@@ -202,9 +203,9 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         say(f"warning: {evaluation.warning}")
     write_evaluation(run.folder / "eval.json", run, outcome.checkpoint, evaluation, trainer.device)
     if any(output.of_training for output in trainer.model.outputs):
-        folder = run.folder / "pictures" / "training"
-        evaluate(trainer.model, trainer.train_set, max_images=MAX_TRAINING, pictures=folder, title="Training images")
-        say(f"what training images have alone: {folder}")
+        folder, seen = run.folder / "pictures" / "training", with_refined_poses(trainer.model, trainer.train_set)
+        evaluate(trainer.model, seen, max_images=MAX_TRAINING, pictures=folder, title="Training images")
+        say(f"pictures of training images, with what only one image contains: {folder}")
 
 
 def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:

@@ -6,8 +6,9 @@ import os
 from itertools import pairwise
 from pathlib import Path
 
-from nerfloom.base.config import TrainConfig, read_yaml
-from nerfloom.base.errors import CheckpointError, DataError
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.errors import CheckpointError, ConfigError, DataError
+from nerfloom.base.plain import read_yaml
 from nerfloom.cli.flags import HELP
 from nerfloom.training.run_path import check_data, check_writable
 
@@ -21,7 +22,7 @@ def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | Non
         folder: folder of the run; None for a new one.
 
     Raises:
-        ConfigError: if the run's folder cannot be written, or the recipe cannot be read.
+        ConfigError: if the run's folder cannot be written, the recipe cannot be read, or the teacher is missing.
         DataError: if the data is missing.
         CheckpointError: if the checkpoint to start from is missing.
     """
@@ -37,6 +38,9 @@ def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | Non
         start = _value(flags, name)
         if start is not None and start != "None" and not os.path.exists(start):
             raise CheckpointError(f"{name} {start}: there is no such file or folder")
+    teacher = _value(flags, "--teacher") or settings.get("teacher")
+    if isinstance(teacher, str) and teacher != "None" and not os.path.exists(teacher):
+        raise ConfigError(f"--teacher {teacher}: there is no such run or file")
     output = _value(flags, "--output-dir") or settings.get("output_dir") or TrainConfig.output_dir
     check_writable(folder or Path(str(output)), "the run's folder")
 

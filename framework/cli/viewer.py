@@ -1,4 +1,4 @@
-"""The command `ns-viewer`: a trained run, or a file of Gaussians, in a browser."""
+"""The command `ns-viewer`: a trained run, a file of Gaussians or an octree in a browser."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerfloom.cli.run_flags import OPENS, RunFlags
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerFlags(RunFlags):
-    """View a trained run or a file of Gaussians in a browser. New checkpoints are shown at once; Ctrl-C ends it."""
+    """View a run, a file of Gaussians or an octree in a browser. New checkpoints are shown at once; Ctrl-C ends it."""
 
     websocket_host: str = ViewerConfig.websocket_host
     """Interface to listen on; 0.0.0.0: all, so that other machines can connect. There is no password."""

@@ -83,7 +83,7 @@ def write_report(plan: Plan, rows: Sequence[Row], sharing: str | None = None) ->
     Args:
         plan: the comparison.
         rows: results of the contenders.
-        sharing: what machines did besides a run, as a sentence; None if each run was alone.
+        sharing: what else machines did during a run, as a sentence; None if each run was alone.
     """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)

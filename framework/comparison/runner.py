@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from nerfloom.base.device import num_gpus
 from nerfloom.comparison.measures import read_json
 from nerfloom.comparison.plan import Conditions, Plan, PlannedRun
 from nerfloom.jobs.job import Failure, Job, Resources, Step
@@ -43,17 +44,8 @@ def job_of(planned: PlannedRun, conditions: Conditions) -> Job:
         steps=(train, Step(tuple(planned.eval_command(conditions)))),
         log=planned.log,
         finished=partial(is_done, planned),
-        resources=Resources(conditions.num_threads, _gpus(conditions.device_type)),
+        resources=Resources(conditions.num_threads, num_gpus(conditions.device_type)),
     )
-
-
-def _gpus(device_type: str) -> int:
-    """Return the number of GPUs of a run."""
-    if device_type != "auto":
-        return int(device_type == "cuda")
-    import torch
-
-    return int(torch.cuda.is_available())
 
 
 def is_done(planned: PlannedRun) -> bool:

@@ -62,7 +62,7 @@ class Dataset:
     opaque: PixelSet | None = None
     """Pixels that masks keep, if masked-out pixels are empty, with alpha 0; otherwise None."""
     light: Tensor | None = None
-    """(M, 3, Q) `light.light_of` each image; None if unknown, or if images have an alpha channel."""
+    """(M, 3, Q) `light_spread.light_of` each image; None if unknown, or if images have an alpha channel."""
     depths: Tensor | None = None
     """(P,) float16 depth of each pixel along its camera's axis, scene units, 0 where unknown; None if there are
     none."""
@@ -338,9 +338,9 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
 def _with_masks(
     parsed: ParsedScene, kept: PixelSet | None, masks: Masks
 ) -> tuple[ParsedScene, PixelSet | None, PixelSet | None]:
-    """Return the scene, its pixels that are kept and its pixels that are opaque, by the meaning of masks.
+    """Return the scene, its kept pixels and its opaque pixels, according to the meaning of masks.
 
-    A scene of which masks show the object ends at its box.
+    If masks show the object, the scene ends at the object's box.
     """
     shown = parsed.object_distances
     if kept is None or masks in ("ignored", "off"):

@@ -59,7 +59,7 @@ class Decoded:
     left: Tensor
     """(M',) int64 indices of the readable images in the split."""
     light: Tensor
-    """(M', 3, Q) `light_of` each image."""
+    """(M', 3, Q) `light_spread.light_of` each image."""
     kept: PixelSet | None
     """Pixels that are not masked out; None for all."""
     mapped: MappedPixels | None

@@ -93,8 +93,8 @@ class DataParser(ABC):
     """A data format. Subclasses are frozen dataclasses whose fields are the format's flags.
 
     A format that places a scene by all of its cameras should have the flag `placement: Path | None`: the
-    dataparser_transforms.json of a run whose placement to use. A trained run passes its own placement if its images
-    differ from those at training time.
+    dataparser_transforms.json of a run, to use that run's placement. A trained run passes its own placement if its
+    images differ from those at training time.
     """
 
     interface: ClassVar[int] = 2

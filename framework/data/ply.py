@@ -1,4 +1,4 @@
-"""Vertices in PLY files (Turk 1994), ascii or binary: points, and other numbers of theirs; triangles are written."""
+"""Vertices in PLY files (Turk 1994), ascii or binary: positions and other columns. Triangles are only written."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def _count(words: list[str]) -> int:
 def _placed(
     file: Path, order: str, described: list[tuple[str, int, list[tuple[str, str]]]], start: int
 ) -> dict[str, PlyElement]:
-    """Return the elements whose place is known, by name."""
+    """Return the elements, by name, for which the place in the file is known."""
     elements: dict[str, PlyElement] = {}
     for name, count, columns in described:
         wrong = [column for column, kind in columns if not kind]
@@ -244,7 +244,7 @@ def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor 
 
 
 def coordinate_columns(file: Path, positions: Tensor) -> list[tuple[str, np.ndarray]]:
-    """Return the columns x, y and z of positions: float32, or float64 where float32 is too coarse, which is said.
+    """Return the columns x, y and z of positions: float32, or float64 with a note where float32 is too coarse.
 
     Args:
         file: path of the PLY file, for the message.

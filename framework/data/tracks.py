@@ -21,7 +21,7 @@ DOUBTS = (
     f"seen by fewer than {MIN_TRACK_LENGTH} images",
     f"with a reprojection error above {MAX_ERROR:g} pixels",
 )
-"""Reasons not to use a point's distances, as indexed by `doubts_about`; the first entry stands for no reason."""
+"""Reasons not to use a point's distances, as indexed by `doubts_about`; the first entry means that there is none."""
 
 
 @dataclass(frozen=True)

@@ -189,4 +189,4 @@ DATASETS: dict[str, Dataset] = {
         (_TANKS_AND_TEMPLES,),
     ),
 }
-"""Name of a data set -> what there is to know of it. docs/data-sources.md says where addresses and sums are from."""
+"""Data sets by name. docs/data-sources.md says where addresses and sums are from."""

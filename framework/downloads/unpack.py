@@ -69,7 +69,7 @@ def unpack(archive: Path, folder: Path, place: Place) -> int:
         folder.mkdir(parents=True)
         if total > (free := shutil.disk_usage(folder).free):
             needed = f"{archive.name} needs {total / 1e9:.1f} GB unpacked, {free / 1e9:.1f} GB are free"
-            raise DataError(f"{folder.parent}: the disk is too small: {needed}; make room or use another --save-dir")
+            raise DataError(f"{folder.parent}: the disk is too small: {needed}; make room or use another folder")
         with track_bytes(f"unpacking {archive.name}", total) as advance:
             for entry, target in chosen:
                 _write(opened, entry, folder.joinpath(*target), archive, advance)

@@ -35,6 +35,8 @@ class Edited:
     """Placement of their frame in the scene of `loaded`."""
     loaded: Loaded | None = None
     """The run or file that they are from; None for others."""
+    is_level: bool = False
+    """Whether +z of their frame is up, as `set_up` and `align_floor` make it; if not, `placement` tells."""
 
     @classmethod
     def of(cls, loaded: Loaded, time: float | None = None) -> Edited:
@@ -85,6 +87,7 @@ class Edited:
             gaussians=transformed_in_float64(self.gaussians, rotation, scale, shift),
             placement=self.placement.after(applied, scale),
             scale=self.scale if scale == 1 else Scale(),
+            is_level=self.is_level and bool(rotation[2, 2] > 1 - 1e-12),
         )
 
     def in_scene(self) -> Gaussians:
@@ -101,7 +104,7 @@ class Edited:
         """Write the Gaussians in the format of the file's suffix, about a local origin if they are far from theirs.
 
         Args:
-            file: path of the file, .ply or .spz.
+            file: path of the file, with a suffix of `nerfloom.splats.files.SUFFIXES`.
             max_megabytes: maximum size of the file in millions of bytes; None for any.
 
         Returns:
@@ -111,7 +114,8 @@ class Edited:
             ConfigError: if the format cannot hold the Gaussians, or no file fits the size.
             OSError: if the file cannot be written.
         """
-        return write_placed(Path(file), self.gaussians, self.look, self.scale, max_megabytes)
+        placement = Placement.of(None, 1.0) if self.is_level else self.placement
+        return write_placed(Path(file), self.gaussians, self.look, self.scale, placement, max_megabytes)
 
     def photographed(self, step: str) -> Loaded:
         """Return the run or file whose photographs show the Gaussians.

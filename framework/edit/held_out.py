@@ -13,7 +13,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.edit.edited import Edited
 from nerfloom.evaluation.evaluator import measure_view, views_to_judge
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, with_refined_poses
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians, RendersGaussians
 from nerfloom.training.datasets import first_split
@@ -69,7 +69,8 @@ class HeldOut:
         dataset = first_split(loaded.source, ("test", "val"), max_images)
         if dataset is None or not (views := views_to_judge(dataset)):
             return None
-        return cls(loaded.model, dataset.to(loaded.model.device), tuple(views[:max_images]))
+        seen = with_refined_poses(model, dataset.to(model.device))
+        return cls(model, seen, tuple(views[:max_images]))
 
     def psnr(self, edited: Edited) -> float:
         """Return the mean PSNR of the `edited` Gaussians, dB."""

@@ -72,7 +72,8 @@ def set_up(edited: Edited, up: Vector) -> Edited:
     Raises:
         ConfigError: if it has no length.
     """
-    return edited.moved(about(vector(ORIGIN), rotation_between(direction(up, "up"), vector(Z))))
+    moved = edited.moved(about(vector(ORIGIN), rotation_between(direction(up, "up"), vector(Z))))
+    return replace(moved, is_level=True)
 
 
 def align_points(
@@ -129,4 +130,5 @@ def align_floor(
     tilt = math.degrees(2 * math.asin(min(float((floor.normal - vector(Z)).norm()) / 2, 1.0)))
     say(f"align_floor: {floor.share:.0%} of the opaque Gaussians are on the floor, which was tilted by {tilt:.2f}°")
     place = floor.center * vector((1.0, 1.0, 0.0))
-    return edited.moved(Similarity(rotation, 1.0, place - rotation @ floor.center))
+    moved = edited.moved(Similarity(rotation, 1.0, place - rotation @ floor.center))
+    return replace(moved, is_level=True)

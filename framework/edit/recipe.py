@@ -20,8 +20,9 @@ import yaml
 
 from nerfloom.base.arguments import arguments_of
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.config import Range, read_yaml, to_plain
+from nerfloom.base.config import Range
 from nerfloom.base.errors import ConfigError, nearest, shown
+from nerfloom.base.plain import read_yaml, to_plain
 from nerfloom.edit.contents import merge, reduce_to, set_degree
 from nerfloom.edit.crop import crop_box, crop_mask, crop_polygon, crop_region, crop_sphere
 from nerfloom.edit.drop import drop_faint, drop_floaters, drop_isolated, drop_large, drop_needles

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from nerfloom.base.console import track
 from nerfloom.evaluation.evaluator import spread
-from nerfloom.export.cameras import refined_cameras
 from nerfloom.kernels.splats.project import Record, SplatCamera
 from nerfloom.splats.drawing import smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
@@ -52,7 +51,7 @@ def training_views(loaded: Loaded, look: Look) -> list[SplatCamera]:
         ConfigError: if Gaussians cannot be drawn for such cameras.
     """
     scene = loaded.model.scene
-    cameras = refined_cameras(loaded.model, loaded.dataset("train").cameras)
+    cameras = loaded.dataset("train").cameras
     found = []
     for index in spread(len(cameras), MAX_VIEWS):
         reduced = -(-max(cameras.sizes[index]) // MAX_SIDE)

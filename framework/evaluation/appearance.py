@@ -21,7 +21,7 @@ from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
 from nerfloom.losses.functions import mean_squared_error
-from nerfloom.renderable import HasAppearance, Renderable, RendersRays
+from nerfloom.renderable import HasAppearance, Renderable, RendersRays, training_poses
 from nerfloom.samplers.proposal import half_edge
 
 STEPS, PIXELS, RATE = 60, 1024, 0.05
@@ -54,7 +54,7 @@ def held_out_appearance(model: Renderable, dataset: Dataset, index: int, backgro
 
     Args:
         model: a model; without appearance vectors, nothing is changed.
-        dataset: the held-out images.
+        dataset: the held-out images, with cameras in the frame of the model's scene.
         index: index of the image.
         background: (3,) colour behind transparent pixels.
     """
@@ -65,7 +65,8 @@ def held_out_appearance(model: Renderable, dataset: Dataset, index: int, backgro
         with fitted_appearance(model, dataset, index, background):
             yield
     else:
-        nearest = nearest_camera(model.scene, dataset.view(index))
+        known = replace(model.scene, camera_to_worlds=training_poses(model))
+        nearest = nearest_camera(known, dataset.view(index))
         with appearance.shown(appearance.vectors[nearest].detach()):
             yield
 
@@ -87,8 +88,8 @@ def fitted_appearance(model: Renderable, dataset: Dataset, index: int, backgroun
 def nearest_camera(scene: Scene, view: View) -> int:
     """Return the training image whose camera is nearest to that of a view.
 
-    Compared are the cameras' positions and the points half the box's edge in front of them, so that directions count
-    too.
+    Cameras are compared by their positions and by the points half the box's edge in front of them, so that directions
+    count too.
 
     Args:
         scene: the scene, with the poses of the training cameras.
@@ -110,7 +111,7 @@ def nearest_camera(scene: Scene, view: View) -> int:
 
 @contextmanager
 def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]:
-    """Render views that are no training images with an appearance vector, within a `with` block.
+    """Render views other than training images with an appearance vector, within a `with` block.
 
     Args:
         model: the model.
@@ -128,7 +129,7 @@ def fit_appearance(
 
     Args:
         model: the model; its parameters are not changed.
-        dataset: the images.
+        dataset: the images, with cameras in the frame of the model's scene.
         pixels: (P,) indices of the pixels, counted over all images; P may be 0.
         background: (3,) colour behind transparent pixels.
         start: (D,) initial vector. If None, a model that casts rays starts from the best of the training images'

@@ -231,7 +231,8 @@ def evaluate(
 
     Args:
         model: the trained model.
-        dataset: views with images, on the model's device.
+        dataset: views with images, on the model's device, with cameras in the frame of the model's scene
+            (`nerfloom.renderable.with_refined_poses`).
         max_images: maximum number of views, evenly spaced; all if None.
         seconds: time that the views may take by the time of the first, which is always evaluated; no limit if None.
         pictures: folder for renders, true images, `view_panels` and further outputs; no files if None.

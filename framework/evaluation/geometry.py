@@ -9,8 +9,8 @@ With S the points of the reconstruction and R those of the reference, each drawn
 - the normals' consistency is the mean |cos| of the angle between the normals of a point and of its nearest point
   (Mescheder et al. 2019, Occupancy Networks), and their error the mean of that angle, both averaged over S and R.
 
-Only what cameras see counts. Which points these are is decided on each surface by itself, so that a reconstruction
-which is far from the reference is judged and not left out.
+Only points that cameras see count. Each surface decides by itself which of its points they see, so that a
+reconstruction far from the reference is judged and not left out.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ NUM_POINTS = 100_000
 F_SCORE_AT = (0.0025, 0.01)
 """Default distances of F-scores, in sides of the reference's bounding box."""
 ELSEWHERE = 0.2
-"""A mean distance of this many sides means that the two surfaces are not of the same thing in the same frame."""
+"""Warn if a median distance is at least this many sides: the surfaces probably differ in frame or unit."""
 
 
 @dataclass(frozen=True)
 class Distances:
-    """Distances of points to the other surface, in the input's unit."""
+    """Distances from points to the other surface, in the input's unit."""
 
     mean: float
     """Their mean."""
@@ -56,7 +56,7 @@ class FScore:
     """Shares of points that are near to the other surface."""
 
     distance: float
-    """The distance that is near, in the input's unit."""
+    """Maximum distance that counts as near, in the input's unit."""
     precision: float
     """Share of the reconstruction's points, 0 to 1."""
     recall: float
@@ -98,7 +98,7 @@ class LeftOut:
         return self.beyond + self.outside + self.masked + self.hidden
 
     def describe(self) -> str:
-        """Return the shares in per cent for people."""
+        """Return the shares as text, in percent."""
         reasons = {
             "outside of --crop": self.beyond,
             "in too few images": self.outside,
@@ -111,7 +111,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Views:
-    """The cameras by which points count."""
+    """The cameras that decide which points count."""
 
     cameras: Cameras
     """The training cameras, on the CPU."""
@@ -120,8 +120,7 @@ class Views:
     kept: Shown
     """The pixels of their images that count for the reconstruction: those that masks keep."""
     opaque: Shown
-    """The pixels that count for the reference: those of `kept` that are not transparent, since the reference is
-    visible wherever it is not cut off."""
+    """The pixels that count for the reference: those of `kept` that are not transparent."""
     least: int = 1
     """Number of cameras that have to see a point."""
 
@@ -141,9 +140,9 @@ class Geometry:
     normals: NormalError | None
     """None if the reference has no normals."""
     left_out: LeftOut
-    """What does not count of the reconstruction."""
+    """Points of the reconstruction that do not count."""
     reference_left_out: LeftOut
-    """What does not count of the reference."""
+    """Points of the reference that do not count."""
 
     @property
     def chamfer(self) -> float:
@@ -181,9 +180,10 @@ def judge_surface(
     Args:
         surface: the reconstructed mesh.
         reference: a mesh, or points with or without normals.
-        views: cameras that decide what counts; if None, everything does.
+        views: cameras that decide which points count; if None, all do.
         f_score_at: distances of F-scores; if empty, `F_SCORE_AT` of the reference's side.
-        crop: if given, only what is in the reference's bounding box counts, enlarged on all sides by this many sides.
+        crop: if given, only points in the reference's bounding box count; the box is enlarged on all sides by this many
+            of its longest sides.
         count: number of points on each surface.
 
     Raises:

@@ -73,7 +73,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
         if uncompressed_size(path) > size + MAX_HEADERS:
             raise ConfigError(f"{where} is too large for LPIPS's weights with AlexNet: {size / 1e6:.1f} MB")
         with np.load(path, allow_pickle=False) as content:
-            arrays = {name: np.asarray(content[name]) for name in content.files}  # bytes, if it is no array
+            arrays = {name: np.asarray(content[name]) for name in content.files}  # bytes, if it is not an array
     except ConfigError:
         raise
     except OSError as error:

@@ -5,7 +5,7 @@ where the transmittance falls to one half.
 
 The error is a standard deviation and has three parts: the error of triangulation from all photographs that see a point
 (`cameras/triangulation.py`), half a pixel of the sharpest photograph for the choice of the point, and the error of the
-scale. Errors that photographs share, such as those of poses and lenses, are not in it.
+scale. It does not contain errors that photographs share, such as those of poses and lenses.
 """
 
 from __future__ import annotations
@@ -90,9 +90,9 @@ def surface_point(model: Renderable, view: View, column: float, row: float) -> T
 
 @torch.no_grad()
 def seeing_cameras(model: Renderable, cameras: Cameras, point: Tensor, time: float | None = None) -> Tensor:
-    """Return the indices (K,) of the cameras that see a point: it is inside their image, and nothing stands before it.
+    """Return the indices (K,) of the cameras that see a point: it is inside their image, and nothing is in front of it.
 
-    At most `MAX_CAMERAS` of those that have it inside their image are asked.
+    At most `MAX_CAMERAS` of those that have it inside their image are tried.
 
     Args:
         model: the model in evaluation mode.
@@ -161,11 +161,11 @@ def measured(
 
 
 def scale_of(found: Length, scale: Scale, distance: float, unit: str) -> Scale:
-    """Return the scale in which a measured length is the true one.
+    """Return the scale that makes a measured length equal to its true length.
 
     Args:
-        found: the measured length in the present scale, whose own error is left out; the new scale has the error of
-            the length.
+        found: the measured length in the present scale, without the error of the scale itself; the new scale has the
+            error of the length.
         scale: the present scale.
         distance: the true length.
         unit: name of its unit.

@@ -32,11 +32,11 @@ def read_mesh(file: Path) -> Surface:
     """
     kind = file.suffix.lower()
     if kind not in SUFFIXES:
-        raise DataError(f"{file} is no mesh: its name must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+        raise DataError(f"{file} is not a mesh: its name must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     positions, faces = _triangles(file, kind[1:])
     if not len(faces):
         hint = "; pass points as --reference-points" if kind == ".ply" else ""
-        raise DataError(f"{file} is no mesh: it has no faces{hint}")
+        raise DataError(f"{file} is not a mesh: it has no faces{hint}")
     normals = _normals(file) if kind == ".ply" else None
     if normals is not None and len(normals) != len(positions):
         normals = None
@@ -60,7 +60,7 @@ def _said(surface: Surface, file: Path) -> Surface:
     """Return the usable part of a surface, and say what is left out."""
     found, notes = usable(surface, str(file))
     if notes:
-        say(f"{file}: left out are {', '.join(notes)}")
+        say(f"{file}: left out: {', '.join(notes)}")
     return found
 
 

@@ -1,4 +1,4 @@
-"""Surfaces to be judged: triangle meshes, or points on a surface, and samples of them."""
+"""Surfaces to compare: triangle meshes or points on a surface, and samples of them."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ class Surface:
         return float((used.amax(0) - used.amin(0)).max())
 
     def without_normals(self) -> Surface:
-        """Return the surface with no normals but those of its faces."""
+        """Return the surface without normals of its points."""
         return replace(self, normals=None)
 
     def describe(self) -> str:
-        """Return a description of its size for people."""
+        """Return a description of its size, as text."""
         if self.faces is None:
             return f"{len(self.points):,} points" + ("" if self.normals is None else " with normals")
         return f"{len(self.faces):,} faces, {len(self.points):,} vertices"
@@ -99,7 +99,7 @@ class Samples:
 
 
 def usable(surface: Surface, name: str) -> tuple[Surface, list[str]]:
-    """Return a surface without unusable parts, and what they were: coordinates not finite, and faces without area.
+    """Return a surface without unusable parts, and notes on them: coordinates that are not finite, faces without area.
 
     Args:
         surface: vertices, faces and normals as read from a file.
@@ -155,7 +155,7 @@ def drawn(surface: Surface, count: int, seed: int = 0) -> Samples:
 def point_spacing(points: Tensor) -> float:
     """Return the distance between neighbours among `points` (N, 3) on a surface: twice the median to the nearest.
 
-    Points at random places, N in an area, are half of sqrt(area / N) from the nearest in the mean.
+    For N points at random positions in an area, the mean distance to the nearest is half of sqrt(area / N).
     """
     if len(points) < 2:
         return 0.0
@@ -164,16 +164,16 @@ def point_spacing(points: Tensor) -> float:
 
 
 def _some(points: Tensor) -> Tensor:
-    """Return at most `AT_ONCE` of points, evenly spaced in their order."""
+    """Return at most `AT_ONCE` of the points, evenly spaced in their order."""
     return points[:: -(-len(points) // AT_ONCE)]
 
 
 def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]:
     """Return the distances (N,) of positions to a surface, and its normals (N, 3) at the nearest points.
 
-    Of a mesh, the nearest of the faces at the `CANDIDATES` nearest of many points on it, at least one on each face. The
-    distance to that face is exact. It may exceed the distance to the mesh only where another face is nearer by less
-    than the points are apart: so the distance of a mesh to itself is small, and not exactly 0.
+    For a mesh, many points are drawn on it, at least one on each face. The faces of the `CANDIDATES` nearest points are
+    compared, and the distance to the nearest of them is exact. Another face of the mesh may be nearer, but by less than
+    the spacing of the points. So the distance of a mesh to itself is small, but not exactly 0.
 
     Args:
         positions: (N, 3) float64.

@@ -1,7 +1,7 @@
 """Visibility of the points of a surface to cameras.
 
 A camera sees a point that is inside its image, at a pixel that counts, and not hidden by the surface itself. Many
-points of the surface are drawn into a depth buffer of each camera, whose cells are wide enough to hold several. A point
+points of the surface are drawn into a depth buffer of each camera. Its cells are wide enough to hold several. A point
 is hidden if it lies behind the nearest in its cell by more than the surface's slope there explains.
 """
 
@@ -21,20 +21,21 @@ from nerfloom.evaluation.surfaces import Samples
 from nerfloom.geometry.lenses import project
 
 OCCLUDERS = 1_000_000
-"""Number of points that hide what is behind them."""
+"""Number of points that hide points behind them."""
 APART = 2.0
 """Width of a depth buffer's cells, in distances between neighbouring points."""
 MOST_CELLS = 4_000_000
 """Maximum number of cells of a depth buffer."""
 NEAR = 0.1
-"""Fraction of the points that are nearer than the distance for which cells are made."""
+"""Fraction of the points that are nearer than the distance used to choose the width of cells."""
 STEEPEST = 4.0
-"""Maximum change of depth across a ray, tangent of the angle between ray and normal: that of 76 degrees. Some of what
-cameras see at larger angles only counts as hidden; with a larger maximum, what is behind thin walls would not."""
+"""Maximum change of depth across a ray: the tangent of the angle between ray and normal, here 76 degrees. Points that
+cameras see only at larger angles may count as hidden. With a larger maximum, points behind thin walls would count as
+seen."""
 UNKNOWN_SLOPE = 2.0
-"""That tangent where it is unknown which side of a surface is its back."""
+"""The same tangent where the back of a surface is not known."""
 ORIENTED = 0.9
-"""If this fraction of what cameras see first faces them, what faces away is the back of something."""
+"""If this fraction of the nearest points faces the cameras, points that face away are on the back of something."""
 TRIED = 16
 """Number of cameras that decide which way normals point."""
 
@@ -49,7 +50,7 @@ class Sightings:
     inside: Tensor
     """(N,) number of cameras whose image contains the point."""
     shown: Tensor
-    """(N,) number of those at whose pixel the image counts."""
+    """(N,) number of those that show the point at a pixel that counts."""
     seen: Tensor
     """(N,) number of those from which the point is not hidden."""
 
@@ -58,7 +59,7 @@ def count_sightings(points: Samples, occluders: Samples, cameras: Cameras, shown
     """Count the cameras that see points of a surface.
 
     If normals point outwards, or all of them inwards, points are not seen from behind. If they point to both sides, as
-    those of a mesh whose faces have no common order, depth alone decides.
+    on a mesh without a common order of its faces, depth alone decides.
 
     Args:
         points: N points of the surface, scene coordinates.
@@ -145,7 +146,7 @@ class _DepthBuffer:
         nearest = distance.new_full((rows * columns,), torch.inf)
         nearest.scatter_reduce_(0, cells, distance, "amin")
         first = at.cosine[at.inside][distance == nearest[cells]]
-        # Closed, so that a cell without a point among others that have some is no hole.
+        # Closed, so that a cell without points is not a hole if its neighbours have some.
         near = max_pool2d(-nearest.view(1, 1, rows, columns), 3, 1, 1)
         return cls(camera, width, max_pool2d(-near, 3, 1, 1).reshape(-1), first)
 

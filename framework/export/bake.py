@@ -1,7 +1,7 @@
-"""Baking: a trained field becomes an octree, which a CPU draws in real time.
+"""Baking: turn a trained field into an octree, which a CPU draws in real time.
 
-As in PlenOctrees (Yu et al. 2021): cells with matter, less those that no training image sees; harmonics fitted to the
-field's colours; and then all leaves learn from the photographs.
+The steps are those of PlenOctrees (Yu et al. 2021): find the cells with matter that training images see, fit harmonics
+to the field's colours, then learn all leaves from the photographs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from nerfloom.base.console import say, track
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
-from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, fitted_colors, seen_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
@@ -33,15 +32,15 @@ from nerfloom.training.trainer import Trainer
 METHOD = Method(OctreeConfig(), paper="arXiv:2103.14024", model=OctreeModel, name="octree")
 """Learning of an octree from photographs."""
 MIN_WEIGHT = 0.02
-"""Minimum of a leaf's largest weight on training rays."""
+"""Leaves with a smaller largest weight on training rays are left out."""
 MAX_BYTES = 30e6
-"""Size of a file without another limit."""
+"""Default of the maximum size of a file, bytes."""
 COMPRESSED = 0.85
 """Expected size of a file, relative to its leaves' bytes."""
 DEGREES = (2, 1, 0)
-"""Degrees of harmonics to choose from, the best first."""
+"""Degrees of harmonics to choose from, best first."""
 FULL_SHARE = {2: 0.9, 1: 0.7, 0: 0.0}
-"""Share of the visible leaves that must fit for a degree to be chosen, before a smaller one is."""
+"""Share of the visible leaves that must fit into the file with each degree; otherwise a smaller degree is chosen."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +50,9 @@ class Baking:
     resolution: int = 512
     """Cells along the longest edge of the matter's box."""
     max_bytes: float = MAX_BYTES
-    """Maximum size of the file."""
+    """Maximum size of the file, bytes."""
     degree: int | None = None
-    """Degree of the harmonics, 0 to 3; None to choose it by the size."""
+    """Degree of the harmonics, 0 to 3; None to choose it by `max_bytes`."""
     seconds: float = 30.0
     """Time to learn from the photographs; 0 for none."""
 
@@ -68,8 +67,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     Raises:
         ConfigError: if an octree of a box cannot show what the run shows.
     """
-    model, dataset = _bakeable(loaded), loaded.dataset("train")
-    dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras)).to("cpu")
+    model, dataset = _bakeable(loaded), loaded.dataset("train").to("cpu")
     seed_step(loaded.run.config.machine.seed, 0)
     layout, raw, seen = _visible(model, dataset, settings.resolution)
     degree, kept = _chosen(seen.largest, settings)
@@ -91,7 +89,7 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     """Return the run's model; refuse what an octree of a box cannot show."""
     model, name = loaded.model, loaded.method
     if not isinstance(model, RayModel):
-        raise ConfigError(f"ns-bake: {name} has no field to bake; a run of a method that casts rays has")
+        raise ConfigError(f"ns-bake: {name} has no field to bake; take a run of a method that casts rays")
     reason = None
     if isinstance(model, RendersFromImages):
         reason = "it renders from images, and has no field without them"
@@ -100,7 +98,7 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     elif model.scene.warped:
         reason = "its rays are in normalised device coordinates; train without --ndc"
     elif model.scene.unbounded:
-        reason = "its scene goes on outside of its box, and an octree ends there"
+        reason = "its scene extends beyond its box, where an octree ends"
     if reason is not None:
         raise ConfigError(f"ns-bake: this run of {name} cannot be baked: {reason}; 'ns-export web' shows it in a page")
     return model

@@ -1,9 +1,9 @@
-"""Export of the cameras of all splits, with refined poses, in the frame and units of the input."""
+"""Export of the cameras of all splits in the frame and units of the input."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,52 +13,14 @@ from torch import Tensor
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras, join_cameras
-from nerfloom.cameras.pose_propagation import propagated_poses
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.geometry.lenses import LENSES
-from nerfloom.renderable import RefinesPoses, Renderable
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """Splits, in the order of their images in the file."""
 ORTHONORMAL_STEPS = 2
 """Newton steps that make a rotation orthonormal in float64; from float32, one is enough."""
-
-
-def refined_cameras(model: Renderable, cameras: Cameras) -> Cameras:
-    """Return a run's training cameras, refined where the model has refined them.
-
-    Args:
-        model: the run's.
-        cameras: M training cameras as they are given.
-    """
-    return model.refined_cameras(cameras) if isinstance(model, RefinesPoses) else cameras
-
-
-def propagated_cameras(cameras: Cameras, given: Cameras, refined: Cameras) -> Cameras:
-    """Return cameras that were not refined, moved as the training cameras around them were.
-
-    Args:
-        cameras: M cameras of other images.
-        given, refined: the training cameras before and after refinement.
-    """
-    if torch.equal(given.camera_to_worlds, refined.camera_to_worlds):
-        return cameras
-    poses, _ = propagated_poses(cameras.camera_to_worlds, given.camera_to_worlds, refined.camera_to_worlds)
-    return replace(cameras, camera_to_worlds=poses)
-
-
-def all_cameras(scenes: Mapping[str, ParsedScene], given: Cameras, refined: Cameras) -> dict[str, Cameras]:
-    """Return the cameras of each split: refined ones of the training images, and others carried along.
-
-    Args:
-        scenes: split -> its images, with the cameras as they are given.
-        given, refined: the training cameras of the images that could be read, before and after refinement.
-    """
-    found = {split: propagated_cameras(scene.cameras, given, refined) for split, scene in scenes.items()}
-    if "train" in found and len(found["train"]) == len(refined):
-        found["train"] = replace(found["train"], camera_to_worlds=refined.camera_to_worlds.cpu())
-    return found
 
 
 def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) -> list[dict[str, Any]]:
@@ -113,12 +75,11 @@ class PosedFiles:
     """Factor from pixels per scene unit to pixels per unit of the input, for orthographic cameras."""
 
 
-def posed_files(scenes: Mapping[str, ParsedScene], cameras: Mapping[str, Cameras], placement: Placement) -> PosedFiles:
+def posed_files(scenes: Mapping[str, ParsedScene], placement: Placement) -> PosedFiles:
     """Return the images of all splits; an image of several splits comes once, with the camera of the first.
 
     Args:
-        scenes: split -> its images.
-        cameras: split -> its cameras, which may be refined.
+        scenes: split -> its images and cameras.
         placement: the input's in the scene.
     """
     files: dict[Path, int] = {}
@@ -133,7 +94,7 @@ def posed_files(scenes: Mapping[str, ParsedScene], cameras: Mapping[str, Cameras
             members.append(files[path])
         splits[split] = tuple(members)
     parts = {split: [index for owner, index in chosen if owner == split] for split in scenes}
-    joined = join_cameras([cameras[split][torch.tensor(parts[split])] for split in scenes if parts[split]])
+    joined = join_cameras([scenes[split].cameras[torch.tensor(parts[split])] for split in scenes if parts[split]])
     moving = all(scene.times is not None for scene in scenes.values())
     points = next((scene.points for scene in scenes.values() if scene.points is not None), None)
     return PosedFiles(

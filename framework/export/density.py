@@ -29,13 +29,13 @@ COARSE_SHARE = 0.01
 """A block is searched if the coarse pass finds this fraction of the level in it."""
 LEVEL_SHARE = 1 / 32
 """At the default level, matter of this length is half opaque; a fraction of the longest edge of the scene's box. On
-the embedded scene (benchmarks/meshes.py) 1/16 to 1/48 are about as good; a cell of the lattice, 1/256, loses
+the embedded scene (benchmarks/meshes.py) 1/16 to 1/48 give similar results; a cell of the lattice, 1/256, loses
 translucent parts."""
 
 
 @dataclass
 class DensityRange:
-    """The densities that were met."""
+    """Statistics of the densities that were evaluated."""
 
     evaluated: int = 0
     """Number of positions that were evaluated."""
@@ -94,15 +94,15 @@ class LatticeDensity:
             yield block, self.values_of(sigma)
 
     def values_of(self, sigma: Tensor) -> Tensor:
-        """Return values (N,) in [-1, 1] of densities `sigma` (N,): 0 at the level, positive above it, NaN of NaN."""
-        # By the opacity of a length that is half opaque at the level. Densities themselves, or their logarithms, are
-        # unbounded, and a vertex between 1 and 10^4 would always lie beside the former.
+        """Return values (N,) in [-1, 1] of densities `sigma` (N,): 0 at the level, positive above it, NaN for NaN."""
+        # The values come from the opacity of a length that is half opaque at the level. Densities and their logarithms
+        # are unbounded: a vertex between densities of 1 and 10^4 would always lie next to the former.
         return 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)
 
     @staticmethod
     def _function(model: Renderable) -> Callable[[Points], Tensor]:
         if not isinstance(model, HasDensity):
-            raise ConfigError("this method has no density whose surface could be found; 'ns-export tsdf' makes a mesh")
+            raise ConfigError("this method has no density to find a surface in; 'ns-export tsdf' makes a mesh")
         return model.density
 
     def density(self, positions: Tensor) -> Tensor:

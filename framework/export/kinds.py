@@ -141,7 +141,7 @@ KINDS: dict[str, Kind] = {
     "pointcloud": Kind(PointSettings, (".ply",), _points, is_cropped=True),
     "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set),
     "tsdf": Kind(TsdfSettings, MESHES, _fused),
-    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz"), _gaussians, is_cropped=True),
+    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, is_cropped=True),
     "cameras": Kind(CameraSettings, (".json",), _cameras),
     "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
     "web": Kind(WebSettings, (".html",), _page, is_cropped=True),

@@ -82,10 +82,10 @@ def lattice_of(
         box: (2, 3) the scene's box, used if neither corner is given.
         resolution: cells along the longest edge; the other edges are rounded up to whole cells.
         placement: the input's in the scene; None if the two frames are the same.
-        low, high: corners of another box, whose edges are parallel to the axes of the input, in its units.
+        low, high: corners of another box, with edges parallel to the axes of the input, in its units.
 
     Raises:
-        ConfigError: if the resolution is out of range, or the corners are no corners of a box.
+        ConfigError: if the resolution is out of range, or the corners do not make a box.
     """
     if not 1 < resolution <= MAX_RESOLUTION:
         raise FlagError(f"--resolution is {resolution}; it must be from 2 to {MAX_RESOLUTION}")

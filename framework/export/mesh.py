@@ -113,10 +113,10 @@ def components(mesh: Mesh) -> Tensor:
 
 
 def cavities(mesh: Mesh, owners: Tensor, cameras: Tensor) -> Tensor:
-    """Return the components (C,) bool that bound a hollow within matter, which no camera can see.
+    """Return the components (C,) bool that bound a cavity within matter, which no camera can see.
 
-    The faces of a hollow are turned inwards, so that its signed volume is negative. A component with an open edge
-    bounds nothing, and a room that holds a camera is no hollow, though its volume is negative too.
+    The faces of a cavity face inwards, so its signed volume is negative. A component with an open edge bounds nothing.
+    A room that holds a camera is not a cavity, although its volume is negative too.
 
     Args:
         owners: (F,) int64 component of each face.

@@ -20,16 +20,16 @@ from nerfloom.export.texture import Texture
 from nerfloom.geometry.local_origin import local_origin
 
 MeshFormat = Literal["ply", "obj", "glb"]
-"""Suffix of a file that meshes are written to."""
+"""Suffix of a mesh file."""
 DECIMALS = 8
-"""Least number of decimals of a coordinate in an OBJ file."""
+"""Minimum number of decimals of a coordinate in an OBJ file."""
 
 
 def write_mesh(file: Path, mesh: Mesh) -> None:
     """Write a mesh in the format of the file's suffix, under a temporary name until it is complete.
 
-    Coordinates are written as they are: a GLB file too has the axes of the mesh, although viewers take its y for up. A
-    texture is inside a GLB file, and beside an OBJ file as NAME.mtl and NAME.png.
+    Coordinates are written unchanged. Viewers take y as up in a GLB file, so its mesh must be given with y up
+    (`Placement.y_up`). A texture is inside a GLB file, and beside an OBJ file as NAME.mtl and NAME.png.
 
     Far from the origin, where float32 is too coarse, PLY and OBJ files have double precision. A GLB file holds float32
     alone, and is written about a local origin with its offset beside it (`data.offsets`). A line says so.
@@ -98,7 +98,7 @@ def _write_colored(file: Path, mesh: Mesh) -> None:
 
 
 def _write_textured(file: Path, mesh: Mesh, texture: Texture) -> None:
-    """Write a mesh whose faces have corners of their own, as each has its place in the texture."""
+    """Write a mesh with separate corners for each face, because each face has its own place in the texture."""
     import trimesh
     from PIL import Image
 

@@ -217,7 +217,7 @@ def _finished(
     eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
     mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
     if not len(mesh.faces):
-        raise ConfigError("the surface bounds nothing but hollows; another --isosurface-threshold may find one")
+        raise ConfigError("the surface bounds only cavities; another --isosurface-threshold may find more")
     if dropped:
         say(f"{dropped:,} small or hidden pieces are left out (--num-components, --min-component-share)")
     if cleaning.target_num_faces is not None:

@@ -42,8 +42,7 @@ def plane_normals(points: Tensor, towards: Tensor) -> Tensor:
 
     Args:
         points: (K, 3) finite positions.
-        towards: (K, 3) directions, for example to the camera that saw the point, into whose half space a normal is
-            turned.
+        towards: (K, 3) directions, for example to the camera that saw the point; normals are flipped towards them.
     """
     positions = points.double()
     found, start = [torch.zeros(0, 3, dtype=torch.float64)], 0

@@ -1,4 +1,4 @@
-"""The cells where a trained model has matter, found octant by octant, so memory grows with surfaces."""
+"""The cells where a trained model has matter, searched octant by octant, so memory grows with the surface area."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerfloom.renderable import Renderable
 from nerfloom.samplers.base import SkipsCells
 
 MIN_DEPTH = 0.01
-"""Minimum optical depth of a cell's edge."""
+"""Cells of a smaller optical depth along an edge count as empty."""
 PROBES = 4
 """Positions in an octant where the density is evaluated, if the model has no occupancy grid."""
 COARSE = 64
@@ -31,7 +31,7 @@ class MatterSearch:
     """A search for a model's matter.
 
     Args:
-        model: the model, in evaluation mode, whose density can be evaluated.
+        model: the model, in evaluation mode.
 
     Raises:
         ConfigError: if the model has no density.

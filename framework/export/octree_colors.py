@@ -1,4 +1,4 @@
-"""Colours of an octree's leaves: what training images see of each, and harmonics fitted to the field's colours."""
+"""Colours of an octree's leaves: visibility in the training images, and harmonics fitted to the field's colours."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from nerfloom.ray_model import RayModel
 MAX_VIEWS = 48
 """Maximum number of cameras to fit colours from."""
 DIRECTIONS = {0: 4, 1: 8, 2: 14, 3: 24}
-"""Number of directions in which a leaf's colour is evaluated, by the degree of its harmonics."""
+"""Number of directions in which the field's colour is evaluated for a leaf, by the degree of its harmonics."""
 RIDGE = 0.03
-"""Penalty of harmonics that depend on the direction, relative to the sum of the weights: few directions tell little."""
+"""Penalty of harmonics that depend on the direction, relative to the sum of the weights, because directions are few."""
 LEAVES_AT_ONCE = 2**14
 """Leaves whose colours are evaluated together."""
 STOP = 1e-3
@@ -34,7 +34,7 @@ RAYS_AT_ONCE = 2**18
 
 @dataclass(frozen=True)
 class Seen:
-    """The L leaves of an octree as training images see them."""
+    """Visibility of the L leaves of an octree in the training images."""
 
     largest: Tensor
     """(L,) largest weight on any ray."""
@@ -48,7 +48,7 @@ class Seen:
 
 @torch.no_grad()
 def seen_leaves(layout: OctreeLayout, raw: Tensor, cameras: Cameras, near: float, far: float) -> Seen:
-    """Return what images see of the leaves of an octree, which needs one walk of each pixel's ray.
+    """Return how images see the leaves of an octree. Each pixel's ray is traced once.
 
     Args:
         layout: where the L leaves are.

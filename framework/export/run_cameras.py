@@ -7,7 +7,7 @@ from pathlib import Path
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.data.parsed_scene import ParsedScene
-from nerfloom.export.cameras import SPLITS, all_cameras, camera_list, posed_files, refined_cameras
+from nerfloom.export.cameras import SPLITS, camera_list, posed_files
 from nerfloom.export.colmap_text import images_folder, write_model
 from nerfloom.export.settings import CameraSettings
 from nerfloom.export.transforms import write_transforms
@@ -31,16 +31,15 @@ def export_cameras(loaded: Loaded, path: Path, settings: CameraSettings) -> None
     """
     # Load the images too: cameras of unreadable images are not in the model.
     dataset = loaded.dataset("train")
-    refined = refined_cameras(loaded.model, dataset.cameras)
-    write_json(path, camera_list(refined, dataset.names, loaded.placement))
-    say(f"{len(refined)} training cameras: {path}")
+    write_json(path, camera_list(dataset.cameras, dataset.names, loaded.placement))
+    say(f"{len(dataset)} training cameras: {path}")
     scenes: dict[str, ParsedScene] = {}
     for split in SPLITS:
         try:
-            scenes[split] = loaded.run.parse(split)
+            scenes[split] = loaded.parsed(split)
         except DataError as error:
             say(f"no '{split}' cameras: {error}")
-    posed = posed_files(scenes, all_cameras(scenes, dataset.cameras, refined), loaded.placement)
+    posed = posed_files(scenes, loaded.placement)
     file = path.parent / "nerfstudio" / "transforms.json"
     write_transforms(file, posed, settings.relative_paths)
     counts = ", ".join(f"{len(members)} {split}" for split, members in posed.splits.items())

@@ -20,30 +20,55 @@ def export_gaussians(loaded: Loaded, path: Path, settings: SplatSettings, region
 
     Args:
         loaded: the run or file.
-        path: file to write, .ply or .spz.
+        path: file to write, .ply, .spz, .sog or .glb; with `settings.num_frames`, NAME_0000.ply and so on beside it.
         settings: settings of the file.
         regions: Gaussians in all of these are kept, in the frame of exports.
 
     Raises:
         ConfigError: if there are no Gaussians, or a setting is out of range.
     """
+    frames, model = settings.num_frames, loaded.model
     if settings.max_megabytes is not None and not settings.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {settings.max_megabytes}")
-    if not isinstance(loaded.model, HasGaussians):
+    if frames is not None and frames < 1:
+        raise FlagError(f"--num-frames is {frames}; it must be at least 1")
+    if frames is not None and settings.time is not None:
+        raise FlagError("--num-frames writes all times, and --time one; leave out one of them")
+    if not isinstance(model, HasGaussians):
         raise ConfigError(
             f"ns-export gaussian-splat: {loaded.method} has no Gaussians; ns-train gaussian-splatting makes them"
         )
-    moment = moment_of(loaded.model.scene.moving, settings.time)
-    found = loaded.model.gaussians(moment).map(lambda values: values.detach().cpu())
+    if frames is None:
+        _write(loaded, model, moment_of(model.scene.moving, settings.time), path, settings, regions)
+        return
+    if not model.scene.moving:
+        raise ConfigError(f"--num-frames {frames}: the photographs of this run have no times")
+    for index in range(frames):
+        file = path.with_stem(f"{path.stem}_{index:04d}")
+        _write(loaded, model, index / max(frames - 1, 1), file, settings, regions)
+
+
+def _write(
+    loaded: Loaded,
+    model: HasGaussians,
+    moment: float | None,
+    path: Path,
+    settings: SplatSettings,
+    regions: Sequence[Region],
+) -> None:
+    """Write the Gaussians of a model at a moment, None of a static scene, to a file."""
+    found = model.gaussians(moment).map(lambda values: values.detach().cpu())
     good = found[found.finite()]
     if len(good) < len(found):
         say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
     if not len(good):
-        raise ConfigError("this run has no Gaussians left; train it again")
-    look = loaded.model.look()
-    placed = in_input(good, loaded.placement)
+        at = "" if moment is None else f" at time {moment:g}"
+        raise ConfigError(f"this run has no Gaussians left{at}; train it again")
+    look, placement = model.look(), loaded.placement
+    placed = in_input(good, placement)
     if regions:
         placed = placed[inside_all(placed.means, regions)]
-    for sentence in write_placed(path, placed, look, loaded.scale, settings.max_megabytes):
+    limit, version = settings.max_megabytes, settings.spz_version
+    for sentence in write_placed(path, placed, look, loaded.scale, placement, limit, version):
         say(sentence)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")

@@ -36,7 +36,7 @@ def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings
     if isinstance(model, HasSignedDistance):
         if level is not None:
             raise FlagError(f"--isosurface-threshold: the surface of {loaded.method} is where its distance is 0")
-        cameras = loaded.run.parse("train").cameras
+        cameras = loaded.parsed("train").cameras
         _write(distance_mesh(model, lattice, cameras, cleaning, texturing), loaded.placement, path, start)
         return
     if not isinstance(model, HasDensity):
@@ -48,7 +48,7 @@ def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings
     if level is None:
         level = default_level(model.scene.box)
         say(f"the surface is where the density is {level:.4g} per scene unit (--isosurface-threshold)")
-    cameras = loaded.run.parse("train").cameras
+    cameras = loaded.parsed("train").cameras
     mesh = density_mesh(model, lattice, level, settings.time, cameras, cleaning, texturing)
     _write(mesh, loaded.placement, path, start)
 
@@ -89,7 +89,7 @@ def _prepared(settings: MeshSettings, loaded: Loaded, path: Path) -> tuple[Latti
 
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:
-    """Write a mesh, and say what it is."""
-    write_mesh(path, in_input(mesh, placement))
+    """Write a mesh, in a .glb file with y up, and say what it is."""
+    write_mesh(path, in_input(mesh, placement.y_up() if path.suffix.lower() == ".glb" else placement))
     counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closedness(mesh).sentence()}"
     say(f"{counts}; {path.stat().st_size / 1e6:.1f} MB after {time.monotonic() - start:.1f} s: {path}")

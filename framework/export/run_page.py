@@ -1,4 +1,4 @@
-"""The web page of a run or a file: its Gaussians or those fitted to it, the page, and how close that comes."""
+"""The web page of a run or a file: its own or fitted Gaussians, the page, and its closeness to the method."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from nerfloom.evaluation.images import to_uint8
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.evaluation.paths import around
 from nerfloom.evaluation.videos import write_images
-from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.settings import WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
@@ -41,7 +40,7 @@ from nerfloom.export.web import (
 from nerfloom.geometry.regions import Region, inside_all
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.method import Method
-from nerfloom.renderable import Renderable, RendersRays
+from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
 from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
@@ -61,17 +60,17 @@ class Closeness:
     """Metrics of a page's Gaussians compared with the model, drawn by Nerfloom."""
 
     views: str
-    """What was compared, for people."""
+    """The compared views, as text."""
     method: float
     """PSNR against the method's own pictures, dB."""
     photographs: float | None
-    """PSNR against the photographs, dB; None if they are of other moments, or of a lens that Gaussians are not drawn
-    for."""
+    """PSNR against the photographs, dB; None if they are of other moments, or have a lens for which Gaussians cannot be
+    drawn."""
     method_itself: float | None
     """PSNR of the method's own pictures against the photographs, dB; None likewise."""
 
     def line(self) -> str:
-        """Return a line for people."""
+        """Return the metrics as a line of text."""
         text = f"on {self.views}: PSNR {self.method:.2f} dB against the method's own pictures"
         if self.photographs is None:
             return text
@@ -85,7 +84,7 @@ def export_page(
     splatting: Method,
     regions: Sequence[Region] = (),
 ) -> None:
-    """Write the web page of a run or a file of Gaussians, and say its size and how close it comes.
+    """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 
     A JPEG file of the start view, for link previews, is written beside it.
 
@@ -152,7 +151,7 @@ def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[
     if dataset is None:
         cameras = around(model.scene)
         return cameras, [f"view {number + 1}" for number in range(len(cameras))]
-    return pinhole(refined_cameras(model, dataset.cameras)), list(dataset.names)
+    return pinhole(dataset.cameras), list(dataset.names)
 
 
 def _write_picture(path: Path, gaussians: Gaussians, camera: SplatCamera, background: Tensor) -> None:
@@ -203,7 +202,7 @@ def _closeness_to(
     """Compare Gaussians in the scene's frame, on the model's device, on held-out views if there are any."""
     model = loaded.model
     held_out = None if loaded.source is None else first_split(loaded.source, ("test", "val"))
-    views = dataset if held_out is None else _at(held_out.to(model.device), moment)
+    views = dataset if held_out is None else _at(with_refined_poses(model, held_out.to(model.device)), moment)
     seen = cameras.to(model.device) if views is None else views.cameras
     return closeness(model, drawn, seen, views, near, look, moment)
 
@@ -211,7 +210,7 @@ def _closeness_to(
 def _gaussians(
     loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None, splatting: Method
 ) -> tuple[Gaussians, Look]:
-    """Return the Gaussians of a run or file, or some that are fitted to its field, and how they are drawn."""
+    """Return the Gaussians of a run or file, or Gaussians fitted to its field, and how they are drawn."""
     model = loaded.model
     if isinstance(model, HasGaussians):
         return model.gaussians(moment), model.look()
@@ -316,4 +315,4 @@ def _about(loaded: Loaded, moment: float | None) -> str:
         parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")
-    return " ".join([*parts, "The page works offline and asks no host for anything."])
+    return " ".join([*parts, "The page works offline and requests nothing from any host."])

@@ -42,10 +42,15 @@ class OccupancySettings:
 class SplatSettings:
     """Gaussians for viewers and the code of 3D Gaussian Splatting."""
 
+    spz_version: Literal[2, 3, 4] = 2
+    """Version of spz files. 2: read by most programs; 3: finer rotations; 4: newest, needs the package zstandard."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
     time: float | None = None
     """Time of a moving scene, 0 to 1. Default: 0."""
+    num_frames: int | None = None
+    """Write this many files of a moving scene, at times evenly spaced from 0 to 1: splat_0000.ply and so on. Default:
+    one file."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,6 @@ from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.data.sources import BatchSource, Request
-from nerfloom.export.cameras import refined_cameras
 from nerfloom.export.points import joined, surface_points
 from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.method import Method
@@ -131,7 +130,8 @@ def fit_gaussians(
     Args:
         model: the model in evaluation mode.
         splatting: the method gaussian-splatting.
-        dataset: the training split, on the model's device; the pictures have its times.
+        dataset: the training split, on the model's device, with the cameras where they stand in its scene; the
+            pictures have its times.
         cameras: M pinhole cameras of that split.
         seconds: time for pictures and steps together; more is taken where the fewest pictures take longer than theirs.
         machine: seed and device.
@@ -144,7 +144,7 @@ def fit_gaussians(
     most = number_for(seconds, MAX_GAUSSIANS)
     points, colors = _surfaces(model, dataset, most)
     shots = _shots(model, dataset, cameras, PICTURES_SHARE * seconds)
-    photographs = _photographs(model, dataset)
+    photographs = _photographs(dataset)
     height, width = shots[0].rgb.shape[:2]
     say(
         f"learning from {len(shots)} pictures of the field, of {width} x {height}, and from {len(photographs)}"
@@ -285,17 +285,16 @@ def _shot(model: RendersRays, camera: Cameras, moment: float | None) -> Shot:
     return Shot(view, rgb, through)
 
 
-def _photographs(model: RendersRays, dataset: Dataset) -> list[Callable[[], Shot]]:
+def _photographs(dataset: Dataset) -> list[Callable[[], Shot]]:
     """Return functions that load photographs; none if the field does not aim to reproduce them exactly."""
     if dataset.times is not None or dataset.cameras.model not in DRAWN or dataset.scene.appearance_varies:
         return []
-    cameras = refined_cameras(model, dataset.cameras)
-    return [partial(_photograph, dataset, cameras, index) for index in range(len(dataset))]
+    return [partial(_photograph, dataset, index) for index in range(len(dataset))]
 
 
-def _photograph(dataset: Dataset, cameras: Cameras, index: int) -> Shot:
+def _photograph(dataset: Dataset, index: int) -> Shot:
     """Return a photograph, or a random part of a large one."""
-    camera = cameras[index : index + 1]
+    camera = dataset.cameras[index : index + 1]
     height, width = int(camera.heights[0]), int(camera.widths[0])
     part = cropped(camera, min(1.0, MAX_SIDE / max(height, width)))
     left, top = round(float(camera.cx[0] - part.cx[0])), round(float(camera.cy[0] - part.cy[0]))

@@ -1,4 +1,4 @@
-"""The surface of a trained model as a mesh in the input's frame: the one that is judged unless another is asked for."""
+"""The surface of a trained model as a mesh in the input's frame, as `ns-eval` judges it by default."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerfloom.renderable import HasDensity, HasSignedDistance, Renderable
 from nerfloom.training.loaded import Loaded
 
 SurfaceKind = Literal["marching-cubes", "tsdf"]
-"""Export that finds a surface."""
+"""Export that makes the mesh."""
 TRUNCATION, MOST_VIEWS = 4.0, 200
 """Truncation of fused depth, cells, and the maximum number of views that are fused."""
 
@@ -44,7 +44,7 @@ def surface_mesh(
         loaded: the model and its data.
         kind: the export.
         resolution: number of cells along the longest edge of the box.
-        low, high: corners of another box than the scene's, in the frame and unit of the input.
+        low, high: corners of a box to use instead of the scene's, in the frame and unit of the input.
 
     Raises:
         ConfigError: if the model has no density, there is no surface, or it has no shape in space or time.
@@ -58,7 +58,7 @@ def surface_mesh(
     if kind == "tsdf":
         mesh = fused_mesh(model, loaded.dataset("train"), lattice, TRUNCATION, MOST_VIEWS, Cleaning())
     else:
-        cameras = loaded.run.parse("train").cameras
+        cameras = loaded.parsed("train").cameras
         if isinstance(model, HasSignedDistance):
             mesh = distance_mesh(model, lattice, cameras, Cleaning())
         else:

@@ -14,6 +14,7 @@ from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.points import SurfacePoints, joined, surface_points
 from nerfloom.method import Method
+from nerfloom.renderable import refined_cameras
 from nerfloom.training.trainer import Trainer
 
 MAX_PASSES = 16
@@ -67,6 +68,7 @@ def found_surfaces(
         if report.seconds >= seconds:
             break
     model = trainer.model.eval()
+    dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras, training=True))
     parts: list[SurfacePoints] = []
     while (left := count - sum(len(part.positions) for part in parts)) > 0 and len(parts) < MAX_PASSES:
         found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))

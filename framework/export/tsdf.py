@@ -159,7 +159,7 @@ class FusedDistance:
         self.cells, self.truncation = truncation, truncation * lattice.spacing
 
     def blocks(self) -> list[Tensor]:
-        """Return the blocks (3,) that a surface of some view comes as near to as the truncation."""
+        """Return the blocks (3,) within the truncation of a surface in any view."""
         counts = torch.tensor(self.lattice.block_counts(BLOCK))
         offsets = self.cells * (2.0 * torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3) - 1)
         met = torch.zeros(0, dtype=torch.int64)

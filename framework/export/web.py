@@ -1,7 +1,7 @@
 """A web page of Gaussians: one HTML file that opens from disk, offline, in any browser with WebGL 2.
 
-The page (`page/`) is our own: it draws as `framework/kernels/splats/project.py` does, asks no host for anything, and
-holds the Gaussians as an SPZ file (`framework/splats/spz.py`) in base64, and facts about them as JSON.
+The page (`page/`) is our own: it draws as `framework/kernels/splats/project.py` does, requests nothing from any host,
+and holds the Gaussians as an SPZ file (`framework/splats/spz.py`) in base64, and facts about them as JSON.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ DATA = re.compile(r'<script id="data" type="text/plain">([^<]*)</script>')
 
 @dataclass(frozen=True)
 class PageFacts:
-    """Facts that a page has about the scene besides its Gaussians."""
+    """Facts about the scene that a page holds in addition to its Gaussians."""
 
     title: str
     """Heading and title of the page."""
@@ -64,7 +64,7 @@ class PageFacts:
     focus: list[float]
     """Position x, y, z that the cameras look at, scene units."""
     cameras: list[list[Any]]
-    """Of each camera its name, its 12 numbers of camera-to-scene pose (OpenGL axes, row by row), and fx, fy, cx, cy,
+    """For each camera: name, the 12 numbers of its camera-to-scene pose (OpenGL axes, row by row), and fx, fy, cx, cy,
     width and height in pixels."""
     unit_length: float = 1.0
     """Length of a scene unit, in `unit`."""
@@ -73,7 +73,7 @@ class PageFacts:
     relative_error: float | None = 0.0
     """Standard deviation of `unit_length`, as a fraction of it; None if it is not known."""
     photographed: bool = True
-    """Whether `cameras` are those of photographs, which say how precise a length is."""
+    """Whether `cameras` are those of photographs, which determine how precise a length is."""
     start: int = 0
     """Number of the camera, of `cameras`, from which the page starts."""
     url: str = ""
@@ -83,9 +83,9 @@ class PageFacts:
 
 
 def upright(cameras: Cameras) -> Tensor:
-    """Return the rotation (3, 3), float64, after which the cameras' mean up direction is upwards, along z.
+    """Return the rotation (3, 3), float64, of the cameras' mean up direction to z.
 
-    It is the identity where z is up already, or where the cameras are held in all directions.
+    It is the identity if z is up already, or if the cameras are turned in all directions.
 
     Args:
         cameras: M cameras.
@@ -169,7 +169,7 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
     """Return a web page of limited size, and sentences about what was removed to fit it.
 
     Args:
-        gaussians: N Gaussians on the CPU, in a frame whose z is up.
+        gaussians: N Gaussians on the CPU, in a frame where z is up.
         facts: further data of the page.
         max_megabytes: maximum size of the page, in millions of bytes.
 

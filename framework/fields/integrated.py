@@ -18,7 +18,7 @@ DENSITY_BIAS = -1.0
 WIDENING = 1e-3
 """Margin of colours beyond 0 and 1, so that black and white are finite inputs (Mip-NeRF, supplement)."""
 BOTTLENECK, COLOR_WIDTH = 256, 128
-"""Maximum number of features that the colour network takes beside the direction, and of its hidden layer."""
+"""Maximum number of features that the colour network takes in addition to the direction, and of its hidden layer."""
 
 
 class IntegratedDensity(Field):

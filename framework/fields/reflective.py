@@ -1,4 +1,4 @@
-"""Fields of surfaces that reflect: Ref-NeRF (Verbin et al. 2022), on networks and on a hash grid.
+"""Fields of reflecting surfaces: Ref-NeRF (Verbin et al. 2022), with networks alone and with a hash grid.
 
 The colour of a point is its diffuse colour plus the light around the reflected viewing direction, blurred by the
 surface's roughness. That light changes slowly along a surface, so a network learns it more easily than the radiance
@@ -30,21 +30,23 @@ from nerfloom.kernels.networks.mlp import Activation
 from nerfloom.kernels.traced.trace import GridDensity
 
 NORMALS, DIFFUSE, TINT, ROUGHNESS = slice(1, 4), slice(4, 7), slice(7, 10), 10
-"""Columns of a point's outputs; the first is the log-density, or what softplus makes the density of."""
+"""Columns of a point's outputs. The first column is the log-density, or the input of softplus, which gives the
+density."""
 NUM_OUTPUTS = 11
-"""Number of these columns. The bottleneck, which the directional network takes, follows."""
+"""Number of these columns. The bottleneck, an input of the directional network, follows them."""
 DIFFUSE_BIAS, ROUGHNESS_BIAS = -3.0, -1.0
-"""Added before the activation functions: medium roughness at first, and diffuse colours so dim that reflections learn
-before them. With the paper's -log 3 on a hash grid, the diffuse colours learnt all and the reflections went out."""
+"""Added before the activation functions. Roughness starts at a medium value, and diffuse colours start so dim that
+reflections learn first. With the paper's -log 3 on a hash grid, diffuse colours learnt everything and reflections
+vanished."""
 TAP_DISTANCE = 1 / 512
-"""Distance along each axis of the places between which a grid's density is compared, in shortest edges of the box."""
+"""Distance along each axis from a point to the four positions of `ReflectiveGrid`, in shortest edges of the box."""
 
 
 class Light(NamedTuple):
     """Light of N points along their rays, linear, and the properties of their surfaces."""
 
     diffuse: Tensor
-    """(N, 3) light that leaves a surface in all directions alike."""
+    """(N, 3) light that leaves a surface equally in all directions."""
     specular: Tensor
     """(N, 3) reflected light, tinted."""
     roughness: Tensor
@@ -62,8 +64,8 @@ class Reflection(nn.Module):
     """Light of points from the outputs of a spatial network and the viewing direction: equations 3 to 9.
 
     Args:
-        network: from `num_inputs(bottleneck)` features to specular light (N, 3) in [0, 1]. Its parts are the encoded
-            reflected direction, the cosine between normal and viewing direction, and the bottleneck.
+        network: from `num_inputs(bottleneck, bands)` features to specular light (N, 3) in [0, 1]. The features are the
+            encoded reflected direction, the cosine between normal and viewing direction, and the bottleneck.
         bands: number of bands of the directional encoding.
     """
 
@@ -132,8 +134,8 @@ class ReflectiveField(Field):
 class ReflectiveGrid(ReflectiveField, BoxField):
     """A hash grid and a network with one hidden layer.
 
-    Its normals are differences of the log-density at four places around a point, as in Neuralangelo (Li et al. 2023,
-    section 3.2): they have a gradient by first derivatives alone, and the noise of single cells averages out.
+    Its normals are differences of the log-density at four positions around a point, as in Neuralangelo (Li et al. 2023,
+    section 3.2). Their gradients need first derivatives only, and the noise of single cells averages out.
 
     Args:
         box: (2, 3) corners of the box, scene units.

@@ -1,46 +1,27 @@
-"""Fields of a signed distance: NeuS (Wang et al. 2021) and VolSDF (Yariv et al. 2021), on a hash grid."""
+"""Fields of a signed distance: NeuS (Wang et al. 2021) and VolSDF (Yariv et al. 2021)."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from nerfloom.base.device import HostValue
 from nerfloom.base.optimised import Optimised
-from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.appearance import Appearance
-from nerfloom.fields.base import MLP
-from nerfloom.fields.encoded import BoxField
+from nerfloom.fields.base import MLP, Field
+from nerfloom.fields.distance import Distance, Shape
 from nerfloom.geometry.points import Points
+from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
-from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
-from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP
-from nerfloom.kernels.surfaces.distance import distance_network
 from nerfloom.kernels.surfaces.opacity import laplace_density
-from nerfloom.kernels.surfaces.samples import PLACED, Ball, Intervals, ball_distance, surface_samples, unit_normals
+from nerfloom.kernels.surfaces.samples import PLACED, Intervals, unit_normals
 
-ROUNDING = 1e-3
-"""Radius within which the first ball is rounded off at its centre, in radii; a distance has no gradient there."""
-FIRST_WEIGHTS = 1e-2
-"""Size of the first weights of the distance's output; the field starts as a ball with a little noise."""
 DIRECTION_LEVELS = 4
 """Bands of the spherical harmonics of viewing directions."""
-
-
-class Shape(NamedTuple):
-    """Values of a field at N positions."""
-
-    distances: Tensor
-    """(N,) signed distance, scene units, negative inside."""
-    gradients: Tensor
-    """(N, 3) gradient of the distance."""
-    features: Tensor
-    """(N, F) features of the network."""
 
 
 class Sharpness(nn.Module):
@@ -75,7 +56,7 @@ class Sharpness(nn.Module):
 
 
 class AnnealedSharpness(Sharpness):
-    """The inverse width of a surface, and how far the annealing of its slope has come (`surface_opacity`).
+    """The inverse width of a surface, and the progress of the annealing of its slope (`surface_opacity`).
 
     Args:
         first, rate: as in `Sharpness`.
@@ -102,82 +83,45 @@ class AnnealedSharpness(Sharpness):
         self._share.change(self.annealing, share)
 
 
-class SurfaceField(BoxField):
+class SurfaceField(Field):
     """A field of a signed distance, and a colour that depends on position, normal, direction and features.
-
-    The distance is that of a ball plus the output of a small network on a hash grid, in units of the box.
 
     Args:
         box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3.
+        distance: the distance, and features for the colour.
         sharpness: the learnt inverse width of the surface.
-        radius: radius of the first ball, as a fraction of half of the box's shortest edge.
-        width: features of a hidden layer.
-        num_features: number of features for the colour.
+        width: features of a hidden layer of the colour network.
+        color_layers: hidden layers of the colour network.
+        color_bias: whether its layers have biases.
+        direction_frequencies: number of frequencies of the encoded viewing direction; None for spherical harmonics.
         appearance: the images' appearance vectors, an input of the colour network; None without.
     """
 
-    centre: Tensor
+    box: Tensor
 
     def __init__(
         self,
         box: Tensor,
-        encoding: HashGrid,
+        distance: Distance,
         sharpness: Sharpness,
-        radius: float = 0.5,
         width: int = 64,
-        num_features: int = 15,
+        color_layers: int = 1,
+        color_bias: bool = False,
+        direction_frequencies: int | None = None,
         appearance: Appearance | None = None,
     ) -> None:
-        super().__init__(box, encoding)
-        self.sharpness = sharpness
-        if encoding.deferred is not None:  # gradients of this table are those of features and of their derivatives
-            encoding.deferred = TableGradient(LOOK_UP, encoding.layout)
-        self.size = float((box[1] - box[0]).min()) / 2
-        self.radius, self.num_features, self.appearance = radius * self.size, num_features, appearance
-        self.register_buffer("centre", box.mean(0), persistent=False)
-        self.first = nn.Parameter(torch.empty(width, encoding.num_features))
-        self.second = nn.Parameter(torch.empty(1 + num_features, width))
-        nn.init.kaiming_uniform_(self.first, nonlinearity="relu")
-        nn.init.kaiming_uniform_(self.second, nonlinearity="relu")
-        with torch.no_grad():
-            self.second[0].mul_(FIRST_WEIGHTS)
-        inputs = PLACED + num_features + DIRECTION_LEVELS**2 + (0 if appearance is None else appearance.size)
-        self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
+        super().__init__()
+        self.register_buffer("box", box.clone(memory_format=torch.contiguous_format))
+        self.distance, self.sharpness, self.appearance = distance, sharpness, appearance
+        self.size, self.direction_frequencies = distance.size, direction_frequencies
+        self.runs_on_kernels = distance.runs_on_kernels
+        directions = DIRECTION_LEVELS**2 if direction_frequencies is None else 3 + 6 * direction_frequencies
+        inputs = PLACED + distance.num_features + directions + (0 if appearance is None else appearance.size)
+        self.color_head = MLP(inputs, *[width] * color_layers, 3, bias=color_bias, activation="sigmoid")
         self.cell = 0.0
-        """Diagonal of the sampler's cells, scene units: no place in a cell is farther from another."""
+        """Diagonal of the sampler's cells, scene units: the maximum distance between two positions in a cell."""
         self.progress = 0.0
         """Fraction of the training budget that is spent."""
-
-    @property
-    def grid(self) -> HashGrid:
-        """The hash grid."""
-        assert isinstance(self.encoding, HashGrid)
-        return self.encoding
-
-    @property
-    def ball(self) -> Ball:
-        """The distance that the network's output is added to."""
-        return Ball(self.centre, self.scale, self.size, self.radius, ROUNDING * self.radius)
-
-    def network(self, positions: Tensor) -> Tensor:
-        """Return the network's outputs, and the gradient of the first by the position in the box (`distance_network`).
-
-        Args:
-            positions: (N, 3) scene coordinates.
-        """
-        found, grid = self.unit(positions), self.grid
-        first: Tensor = self.first
-        layout, opening = grid.layout, grid.opening
-        table: Tensor = grid.table
-        if opening is not None and not opening.complete:
-            layout = layout.first(opening.count)
-            open_features = layout.num_levels * table.shape[1]
-            factors = opening.completed(first.new_ones(1, open_features), grid.num_features)
-            table, first = table[: layout.num_entries], (first * factors)[:, :open_features]
-        if grid.deferred is not None:
-            grid.deferred.layout = layout
-        return distance_network(found, table, first, self.second, layout, grid.deferred)
 
     def shape(self, positions: Tensor) -> Shape:
         """Return distance, gradient and features at positions.
@@ -185,14 +129,14 @@ class SurfaceField(BoxField):
         Args:
             positions: (N, 3) scene coordinates.
         """
-        network = self.network(positions)
-        return Shape(*ball_distance(network, positions, self.ball), network[:, 1:-3])
+        shape: Shape = self.distance(positions)
+        return shape
 
     def reach(self, safety: float) -> Callable[[Tensor], Tensor]:
-        """Return the function from positions (N, 3) to how far rays may step from them (N,), negative inside.
+        """Return a function from positions (N, 3) to lengths (N,) that rays may step from there, negative inside.
 
         Args:
-            safety: factor by which the distance may be steeper on the way than at the position.
+            safety: maximum slope of the distance along a step, relative to its slope at the position.
         """
 
         def bound(positions: Tensor) -> Tensor:
@@ -206,7 +150,11 @@ class SurfaceField(BoxField):
         return self.shape(points.positions).distances
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        inputs = [unit_normals(features), spherical_harmonics(directions, DIRECTION_LEVELS)]
+        if self.direction_frequencies is None:
+            encoded = spherical_harmonics(directions, DIRECTION_LEVELS)
+        else:
+            encoded = frequency_encoding(directions, self.direction_frequencies)
+        inputs = [unit_normals(features), encoded]
         if self.appearance is not None:
             inputs.append(self.appearance(camera_indices, len(features)))
         return self.color_head(*inputs).float()
@@ -221,7 +169,7 @@ class SurfaceField(BoxField):
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         shape = self.shape(points.positions)
-        placed = (points.positions - self.centre) / self.size
+        placed = (points.positions - self.distance.centre) / self.size
         return self.density_at(shape.distances), torch.cat([shape.gradients, placed, shape.features], dim=-1)
 
     def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
@@ -249,8 +197,8 @@ class NeuSField(SurfaceField):
             directions: (N, 3) unit directions of their rays.
             deltas: (N,) lengths of the intervals, scene units.
         """
-        positions, intervals = points.positions, Intervals(directions, deltas, self.sharpness.share)
-        return surface_samples(self.network(positions), self.sharpness(), positions, self.ball, intervals)
+        intervals = Intervals(directions, deltas, self.sharpness.share)
+        return self.distance.samples(points.positions, self.sharpness(), intervals)
 
     def density_at(self, distances: Tensor) -> Tensor:
         """Return the density of a ray that meets the surface head-on: NeuS, equation 10."""
@@ -262,7 +210,7 @@ class VolSDFField(SurfaceField):
     """A field with the density of VolSDF, equation 2; the inverse width is 1 / beta."""
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return surface_samples(self.network(points.positions), self.sharpness(), points.positions, self.ball)
+        return self.distance.samples(points.positions, self.sharpness())
 
     def density_at(self, distances: Tensor) -> Tensor:
         return laplace_density(distances, 1 / self.sharpness())

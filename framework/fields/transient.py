@@ -16,14 +16,14 @@ from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.table_memory import require
 
 FREQUENCIES = 6
-"""Number of frequencies of positions, since a field's features need not tell where they are."""
+"""Number of frequencies of positions, which are an input because a field's features need not determine the position."""
 
 
 class TransientHead(nn.Module):
-    """Density, colour and uncertainty that one image has alone: NeRF-W, equation 10.
+    """Density, colour and uncertainty that exist in one image alone: NeRF-W, equation 10.
 
-    Each image has a map of vectors, interpolated between the vertices of a square grid over it. A map of one vertex is
-    the paper's transient vector.
+    Each image has vectors at the vertices of a square grid over it, with interpolation between them. With one vertex,
+    this is the paper's transient vector.
 
     Args:
         num_features: number F of features of the field.
@@ -66,7 +66,7 @@ class TransientHead(nn.Module):
         Args:
             features: (N, F) features of the field.
             positions: (N, 3) scene coordinates.
-            vectors: (N, S) vector of each sample's image where its ray crosses the image.
+            vectors: (N, S) vector of each sample's image at the ray's position in it.
         """
         placed = frequency_encoding(2 * contract_to_unit(positions, self.box) - 1, FREQUENCIES)
         density, found = self.network.density(features, vectors.to(features.dtype), placed.to(features.dtype))
@@ -82,7 +82,7 @@ class TransientHead(nn.Module):
             self._shown = previous
 
     def vectors_of(self, rays: Rays) -> Tensor | None:
-        """Return the vector (R, S) of each ray's image where the ray crosses it; None for rays of no training image."""
+        """Return the vector (R, S) of each ray's image at the ray's position; None if rays have no training image."""
         images = rays.camera_indices
         if images is None and self._shown is not None:
             images = torch.full((len(rays),), self._shown, device=rays.origins.device)

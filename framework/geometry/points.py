@@ -55,7 +55,7 @@ class Points:
     frustums: Frustums | None = None
     """The cones' intervals; None if not computed."""
     ambient: Tensor | None = None
-    """(N, K) further coordinates beside space, inputs of density and colour; None without."""
+    """(N, K) further coordinates in addition to space, inputs of density and colour; None if there are none."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.arguments import arguments_of
-from nerfloom.base.config import read_yaml
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.plain import read_yaml
 
 Vector: TypeAlias = tuple[float, float, float]
 """Three coordinates."""

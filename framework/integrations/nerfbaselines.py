@@ -19,10 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import TrainConfig, from_plain, to_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
 from nerfloom.integrations.nerfbaselines_data import (
@@ -37,6 +38,7 @@ from nerfloom.integrations.nerfbaselines_data import (
 )
 from nerfloom.integrations.nerfbaselines_settings import flattened, parse_overrides, with_matching_background
 from nerfloom.registry import load_method
+from nerfloom.renderable import refined_cameras
 from nerfloom.training.checkpoint import FOLDER, load_newest
 from nerfloom.training.run import write_json
 from nerfloom.training.trained import restored_model
@@ -168,7 +170,8 @@ class NerfloomMethod:
             color (H, W, 3) in [0, 1] over the data set's background, depth (H, W) along the ray in the data set's
             units, and accumulation (H, W), float32.
         """
-        cameras = self._frame.placed(cameras_of([camera.item()], ["the camera"])).to(self._model.device)
+        given = self._frame.placed(cameras_of([camera.item()], ["the camera"])).to(self._model.device)
+        cameras = refined_cameras(self._model, given, training=False)
         with shown_appearance(self._model, self._vector((options or {}).get("embedding"))):
             picture = self._model.render_view(View.of(cameras, 0), self._background)
         found = (picture.rgb.clamp(0, 1), picture.median_depth / self._frame.placement.scale, picture.accumulation)
@@ -195,6 +198,7 @@ class NerfloomMethod:
         if appearance_of(self._model) is None:
             raise NotImplementedError(f"{self.name} has learnt one appearance for all photographs")
         data = dataset_of(ArrayImages.of(dataset), self._frame, "ignored").to(self._model.device)
+        data = replace(data, cameras=refined_cameras(self._model, data.cameras, training=False))
         pixels = torch.arange(len(data.pixels), device=data.device) if data.kept is None else data.kept.pixels()
         found = fit_appearance(self._model, data, pixels, self._background, self._vector(embedding))
         assert found is not None

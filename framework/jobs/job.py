@@ -14,8 +14,8 @@ class Step:
 
     Args:
         command: program and arguments.
-        started: file that the command leaves early; if it exists, `resume` is run instead of `command`.
-        resume: command that goes on where an earlier one was stopped; required with `started`.
+        started: file that the command writes early; if it exists, `resume` is run instead of `command`.
+        resume: command that continues where an earlier one was stopped; required with `started`.
 
     Raises:
         ValueError: if a command is missing.
@@ -45,11 +45,11 @@ class Resources:
 
 @dataclass(frozen=True)
 class Job:
-    """Commands that run one after the other. Running a job again goes on where it was stopped.
+    """Commands that run one after the other. A job that was stopped resumes when it is run again.
 
     Args:
         title: name of the job in messages.
-        description: what it does, such as its budget; a message at its start has it.
+        description: what it does, such as its budget, for the message at its start.
         steps: the commands.
         log: file for the output of the commands.
         finished: returns whether the job's files are complete; called where the jobs are launched.

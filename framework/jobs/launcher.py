@@ -1,4 +1,4 @@
-"""The interface of launchers, and what all of them tell the user about their jobs."""
+"""The interface of launchers, and the messages about jobs that all of them print."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def nothing(job: Job) -> None:
 class Launcher(ABC):
     """A way to run jobs: on this machine, or on others that share its files.
 
-    Jobs leave the same files whichever launcher runs them. A job that is finished is not run again, and one that was
-    stopped goes on, so the same call continues after an interruption, also by another launcher.
+    Jobs write the same files with every launcher. Finished jobs are not run again, and stopped jobs are resumed. So the
+    same call, even with another launcher, continues after an interruption.
     """
 
     @property
     @abstractmethod
     def sharing(self) -> str | None:
-        """A sentence for reports on what a job's machine did besides; None if jobs ran one after the other."""
+        """A sentence for reports on what else a job's machine did; None if jobs ran one after the other."""
 
     @abstractmethod
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:

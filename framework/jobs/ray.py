@@ -1,9 +1,8 @@
-"""Jobs on a Ray cluster, whose machines share a file system with this one; without an address, on this machine.
+"""Jobs on a Ray cluster that shares a file system with this machine; without an address, on this machine alone.
 
 Ray decides where a job runs and notices lost workers. A job's output and results are files, which the worker writes
-where this process reads them, so they are the same as those of local processes. A job of a lost worker runs again
-elsewhere, and goes on where it was. Ray: Moritz et al. 2018, "Ray: A Distributed Framework for Emerging AI
-Applications".
+where this process reads them, so they are the same as those of local processes. A job of a lost worker is resumed
+elsewhere. Ray: Moritz et al. 2018, "Ray: A Distributed Framework for Emerging AI Applications".
 """
 
 from __future__ import annotations
@@ -177,7 +176,7 @@ def _goes_on(job: Job, lost: int, error: Exception, ledger: Ledger) -> bool:
     if lost > MAX_LOST:
         ledger.ended(job, f"it lost {lost} workers, the last by {_first_line(error)}")
         return False
-    say(f"  {job.title}: worker lost ({_first_line(error)}); the job goes on with another, {lost} of {MAX_LOST}")
+    say(f"  {job.title}: worker lost ({_first_line(error)}); the job continues on another, {lost} of {MAX_LOST}")
     return True
 
 

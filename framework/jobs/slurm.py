@@ -1,7 +1,7 @@
 """Jobs by Slurm: a script for `sbatch`, with an array that has a task for each unfinished job.
 
-The script is plain shell: a task runs a job's commands as they are, and goes on where an earlier one was stopped.
-Nothing of this package runs on the cluster but the jobs.
+The script is plain shell: a task runs a job's commands, and continues where an earlier one was stopped. Only the jobs
+run on the cluster.
 """
 
 from __future__ import annotations

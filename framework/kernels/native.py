@@ -104,8 +104,8 @@ def _opened(path: Path) -> ctypes.CDLL:
     """Return the library at `path`, after requesting the system's permission for the features it needs.
 
     Raises:
-        OSError: if it does not load, if it was built from other sources than those beside it (whose functions may take
-            other arguments), or if the system denies permission.
+        OSError: if it does not load, if it was built from sources other than those beside it, so that arguments may
+            differ, or if the system denies permission.
     """
     library = ctypes.CDLL(str(path))
     built_from = getattr(library, "built_from", None)

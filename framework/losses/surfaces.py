@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
 
 EVERY, ANYWHERE = 4, 8
-"""The length of the gradient is asked at one in this many samples, so that others may be without a gradient and are
-skipped; and for one in this many samples at a random place in the box."""
+"""`Eikonal` uses one in `EVERY` samples, so that others may be without a gradient and are skipped. For each `ANYWHERE`
+samples it adds a random position in the box."""
 
 BEHIND = 0.03
-"""Thickness of what is taken for solid behind points of a reconstruction, in halves of the box's shortest edge."""
+"""Thickness of space behind points of a reconstruction that counts as solid, in halves of the box's shortest edge."""
 ABSOLUTE = 0.1
-"""Factor of the absolute error of colours, which is some ten times the squared error, so that the weights of the other
+"""Factor of the absolute error of colours. That error is about ten times the squared error, so the weights of the other
 terms suit both."""
 
 
@@ -42,7 +42,7 @@ class SurfaceColorError(ColorError):
 class Eikonal(LossTerm):
     """Squared difference of the distance's gradient from length 1: Gropp et al. 2020, equation 2.
 
-    It is asked at some of the samples, and at random places in the box.
+    It is computed at some of the samples and at random positions in the box.
     """
 
     def __init__(self) -> None:
@@ -78,9 +78,9 @@ class Silhouette(LossTerm):
 class Curvature(LossTerm):
     """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
-    Each of some samples is compared with a place one sample's length away, in a random direction along its level set.
-    The term is the mean squared difference of their unit normals. It applies from the fraction `curvature_from` of the
-    training budget on.
+    Some samples are compared with a position one sample's length away, in a random direction along the level set. The
+    term is the mean squared difference of the two unit normals. It applies after the fraction `curvature_from` of the
+    training budget.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ def tangents(normals: Tensor) -> Tensor:
 
 
 def normal_change(normals: Tensor, others: Tensor) -> Tensor:
-    """Return the mean squared difference () of unit normals; with the angle a between them it is 2 - 2 cos a.
+    """Return the mean squared difference () of unit normals; for an angle a between them it is 2 - 2 cos a.
 
     Args:
         normals, others: (N, 3).
@@ -161,7 +161,7 @@ def known_points(batch: PixelBatch, box: Tensor) -> KnownPoints:
 class SurfacePoints(LossTerm):
     """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022).
 
-    It is the mean of how far |f| exceeds the point's standard deviation, in halves of the box's shortest edge.
+    It is the mean excess of |f| over the point's standard deviation, in halves of the box's shortest edge.
     """
 
     def __init__(self) -> None:
@@ -181,11 +181,12 @@ class SurfacePoints(LossTerm):
 
 
 class DistanceBounds(LossTerm):
-    """Bounds of the distance at random places before and behind points of a reconstruction, on the rays that see them.
+    """Bounds of the distance at random positions before and behind points of a reconstruction, on rays that see them.
 
-    An image that shows a point shows that space before it is empty: the distance there is positive, and at most that to
-    the point. Space just behind the point is taken for solid: the distance is negative there, and its magnitude is at
-    most that to the point. The term is the mean of what is beyond these bounds, in halves of the box's shortest edge.
+    If an image shows a point, space in front of the point is empty: the signed distance there is positive, and at most
+    the distance to the point. Space just behind the point counts as solid: the signed distance there is negative, and
+    its magnitude is at most the distance to the point. The term is the mean excess over these bounds, in halves of the
+    box's shortest edge.
     """
 
     def __init__(self) -> None:
@@ -208,12 +209,12 @@ class DistanceBounds(LossTerm):
 
 
 def beyond_bounds(distances: Tensor, left: Tensor, deviations: Tensor) -> Tensor:
-    """Return how far distances are outside the interval from 0 to the way that is left to a point.
+    """Return how far distances are outside the interval from 0 to the remaining length to a point.
 
     Args:
         distances: signed distances of any shape, scene units.
-        left: lengths of the way to a point on a surface, of the same shape; negative behind the point.
-        deviations: standard deviations of these lengths, broadcast to that shape; so much is allowed.
+        left: remaining lengths to a point on a surface, of the same shape; negative behind the point.
+        deviations: standard deviations of these lengths, broadcast to that shape; deviations up to this are allowed.
     """
     low, high = left.clamp(max=0) - deviations, left.clamp(min=0) + deviations
     return torch.relu(distances - high) + torch.relu(low - distances)

@@ -21,6 +21,7 @@ from nerfloom.losses.functions import (
     opacity_of_transparent,
 )
 from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.renderable import training_poses
 from nerfloom.samplers.proposal import half_edge
 
 if TYPE_CHECKING:
@@ -192,12 +193,15 @@ class UnseenRoughness(LossTerm):
     def factor(self, config: Any, step: int) -> float:
         return unseen_weight(config, step)
 
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.rays.camera_indices is not None
+
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         batch, model = shown.batch, shown.model
-        poses = model.scene.camera_to_worlds
+        poses = training_poses(model)
         if not len(batch) or poses is None:
             return None
-        rays = batch.rays[:: batch.rays_per_pixel][: model.config.unseen_patches]
+        rays = batch.rays[:: batch.rays_per_pixel][: model.config.unseen_patches].detached()
         stride = max(model.scene.image_size / PATCH_IMAGE, 1.0)
         unseen = model.render(unseen_patches(rays, poses, PATCH, stride), batch.background[0])
         if unseen.weights is None or unseen.samples is None:

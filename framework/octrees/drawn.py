@@ -1,4 +1,4 @@
-"""Renderables whose pictures are light through an octree, and fixed octrees, such as those of a file."""
+"""Renderables that show an octree, and fixed octrees, such as those of a file."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ RAYS_AT_ONCE = 2**18
 
 
 class DrawsOctree(RendersRays):
-    """A renderable whose pictures are light through an octree."""
+    """A renderable that shows the light through an octree."""
 
     early_stop: float = 1 / 255
-    """Maximum error of a colour channel in [0, 1] because rays end where little light is left."""
+    """Maximum error of a colour channel in [0, 1] from ending rays where little light is left."""
 
     @abstractmethod
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:

@@ -108,8 +108,8 @@ def read_octree(file: Path) -> Octree:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, LookupError, ArithmeticError, TypeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise DataError(f"{file} is no octree, or is damaged: {_short(error)}; copy or bake it again") from error
-    except (RuntimeError, NotImplementedError, MemoryError) as error:  # encrypted, compressed otherwise, too large
+        raise DataError(f"{file} is not an octree, or is damaged: {_short(error)}; copy or bake it again") from error
+    except (RuntimeError, NotImplementedError, MemoryError) as error:  # encrypted, compressed in another way, too large
         raise DataError(f"{file} cannot be read as an octree: {_short(error)}; copy or bake it again") from error
 
 
@@ -123,7 +123,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"it has no array '{missing[0]}'")
     version = _number(arrays, "version", 0, 1e6)
     if version != VERSION:
-        raise ValueError(f"it has version {version:g} of the format, and {VERSION} is known")
+        raise ValueError(f"it has version {version:g} of the format; only version {VERSION} is supported")
     return arrays
 
 
@@ -133,7 +133,7 @@ def _octree(arrays: dict[str, np.ndarray]) -> Octree:
     transform = _floats(arrays, "transform", (3, 4), np.float64)
     rotation = transform[:, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or not np.linalg.det(rotation) > 0:
-        raise ValueError("its transform is no rigid motion")
+        raise ValueError("its transform is not a rigid motion")
     near, far = _number(arrays, "near", 0, MAX_COORDINATE), _number(arrays, "far", 0, MAX_COORDINATE)
     if not near < far:
         raise ValueError("it ends before it starts")

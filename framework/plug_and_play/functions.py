@@ -48,7 +48,7 @@ class DensityOnly(Field):
 
 
 def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
-    """Wrap a user-defined function for samplers, with empty features beside the density.
+    """Wrap a user-defined function for samplers, with empty features in addition to the density.
 
     Args:
         sigma_fn: a `SigmaFunction`.

@@ -131,8 +131,8 @@ def sample(
         sigma_fn: density (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma (N,) for a moving scene.
             It is called without gradient, only to find the end of each ray. None for no early stop.
         grid: the occupied cells.
-        early_stop: transmittance below which the rest of a ray is dropped; 0 for never. In training, 1e-2 is as good as
-            1e-4 and faster.
+        early_stop: transmittance below which the rest of a ray is dropped; 0 for never. In training, 1e-2 gives the
+            same quality as 1e-4 and is faster.
         jitter: True to start each ray at a random fraction of a step (training), False to start at 0 (evaluation).
 
     Returns:

@@ -56,7 +56,7 @@ def extract(
     report: Report,
     database: Path,
     images: Path,
-    groups: list[tuple[list[str], int | None]],
+    groups: list[tuple[list[str], int | None, str]],
     masks: Path | None,
     flags: ColmapFlags,
 ) -> None:
@@ -66,7 +66,8 @@ def extract(
         report: called only at the beginning, because COLMAP does not report progress.
         database: COLMAP's database; it is created if missing.
         images: folder of the images.
-        groups: for each camera, the names of its images, and its number if it is in the database.
+        groups: for each camera, the names of its images, its number if it is in the database, and its parameters in
+            COLMAP's form if they are known, otherwise "".
         masks: folder of masks, or None.
         flags: the user's flags.
     """
@@ -81,9 +82,10 @@ def extract(
     names = "image_names" if "image_names:" in usage else "image_list"  # before 3.12
     options = "extraction_options" if "extraction_options:" in usage else "sift_options"  # before 3.13
     more = {"camera_model": flags.camera_model} if "camera_model:" in usage else {}  # before 4
-    for group, camera in groups:
+    for group, camera, parameters in groups:
         reader = pycolmap.ImageReaderOptions()
         _set(reader, "camera_model", flags.camera_model)
+        reader.camera_params = parameters
         if masks is not None:
             reader.mask_path = str(masks)
         if camera is not None:

@@ -8,7 +8,9 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.processing import colmap, database
 from nerfloom.processing.images import PreparedImage
+from nerfloom.processing.panoramas import camera_parameters
 from nerfloom.processing.reconstruction import Reconstruction
+from nerfloom.processing.settings import ColmapFlags
 
 
 def camera_groups(prepared: list[PreparedImage], sharing: str) -> list[list[str]]:
@@ -46,10 +48,12 @@ def extract(state: Reconstruction, prepared: list[PreparedImage], images: Path, 
     groups = camera_groups(prepared, state.flags.camera_sharing)
     known = database.features(state.database)
     cameras = [database.camera_of(state.database, group) for group in groups]
+    widths = {image.name: image.width for image in prepared}
     missing = [
-        ([name for name in group if name not in known], camera) for group, camera in zip(groups, cameras, strict=True)
+        ([name for name in group if name not in known], camera, _parameters(state.flags, widths[group[0]]))
+        for group, camera in zip(groups, cameras, strict=True)
     ]
-    count = sum(len(names) for names, _ in missing)
+    count = sum(len(names) for names, _, _ in missing)
     if count:
         with state.timed("features"):
             arguments = (state.database, images, [entry for entry in missing if entry[0]], masks, state.flags)
@@ -63,3 +67,8 @@ def extract(state: Reconstruction, prepared: list[PreparedImage], images: Path, 
         f"features: {mean:.0f} per image, {len(prepared)} images by {by}{kept}, "
         f"in {state.seconds.get('features', 0.0):.1f} s"
     )
+
+
+def _parameters(flags: ColmapFlags, width: int) -> str:
+    """Return COLMAP's parameters of a camera whose lens is known, as that of views is; "" otherwise."""
+    return "" if flags.camera_type == "perspective" else camera_parameters(width, flags.view_angle)

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.signals import Stopped, signal_of
 from nerfloom.processing.settings import (
+    BundlerFlags,
     ColmapFlags,
     ImagesFlags,
+    MetashapeFlags,
+    OdmFlags,
     OutputFlags,
     PolycamFlags,
+    ProgramFlags,
+    RealityCaptureFlags,
     Record3DFlags,
     VideoFlags,
 )
+
+if TYPE_CHECKING:
+    from nerfloom.processing.capture import Capture
+    from nerfloom.processing.reconstruction import Reconstruction
 
 
 class Kind(NamedTuple):
@@ -91,7 +101,8 @@ def _process_images(flags: ImagesFlags) -> None:
         return
     sources = find_images(flags.data, [flags.output_dir, *([] if flags.masks_dir is None else [flags.masks_dir])])
     begin(flags, sources)
-    reconstruct(Reconstruction(flags, ordered=is_sequence(sources)), flags.data, sources, flags.masks_dir)
+    state = Reconstruction(_with_lens(flags), ordered=is_sequence(sources))
+    reconstruct(state, *_as_views(state, flags.data, sources), flags.masks_dir)
 
 
 def _process_video(flags: VideoFlags) -> None:
@@ -105,29 +116,101 @@ def _process_video(flags: VideoFlags) -> None:
         return
     frame_count(flags.data)  # before anything is removed, check that the video can be read
     begin(flags, [Path(flags.data.name)])
-    state = Reconstruction(flags, ordered=True)
+    state = Reconstruction(_with_lens(flags), ordered=True)
     with state.timed("reading the video"):
         folder, sources = frames_of(flags.output_dir, flags.data, flags.num_frames_target)
-    reconstruct(state, folder, sources, None)
+    reconstruct(state, *_as_views(state, folder, sources), None)
+
+
+def _with_lens(flags: ColmapFlags) -> ColmapFlags:
+    """Return the flags with the camera model of the images: views of panoramas have no distortion."""
+    return flags if flags.camera_type == "perspective" else dataclasses.replace(flags, camera_model="PINHOLE")
+
+
+def _as_views(state: Reconstruction, folder: Path, sources: list[Path]) -> tuple[Path, list[Path]]:
+    """Return folder and paths of the images to reconstruct: the same ones, or the views of panoramas."""
+    if state.flags.camera_type == "perspective":
+        return folder, sources
+    from nerfloom.processing.panoramas import write_views
+    from nerfloom.processing.views import Views
+
+    flags = state.flags
+    with state.timed("cutting views"):
+        return write_views(
+            folder, sources, state.work, Views(flags.num_views, flags.view_angle, flags.views_up_and_down)
+        )
 
 
 def _convert_polycam(flags: PolycamFlags) -> None:
+    from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.output import claim
-    from nerfloom.processing.polycam import check, convert
+    from nerfloom.processing.polycam import check, convert, place
 
-    check(flags.data)
+    if flags.data.is_file():
+        check_archive(flags.data, place, "keyframes/images and keyframes/cameras; export Polycam's raw data")
+    else:
+        check(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
     crop = flags.crop_border_pixels
-    convert(flags.data, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
+    with unpacked(flags.data, flags.output_dir, place) as export:
+        convert(export, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
 
 
 def _convert_record3d(flags: Record3DFlags) -> None:
+    from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.output import claim
-    from nerfloom.processing.record3d import convert, find_root
+    from nerfloom.processing.record3d import convert, find_root, place
 
-    find_root(flags.data)
+    if flags.data.is_file():
+        check_archive(flags.data, place, "rgbd and metadata, which recordings of Record3D (.r3d) have")
+    else:
+        find_root(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
-    convert(flags.data, flags.output_dir, flags.num_downscales, flags.most)
+    with unpacked(flags.data, flags.output_dir, place) as export:
+        convert(export, flags.output_dir, flags.num_downscales, flags.most)
+
+
+def _convert_metashape(flags: MetashapeFlags) -> None:
+    from nerfloom.processing.metashape import read_capture
+    from nerfloom.processing.point_files import with_points
+
+    _convert(flags, flags.data, with_points(read_capture(flags.xml), flags.ply))
+
+
+def _convert_realitycapture(flags: RealityCaptureFlags) -> None:
+    from nerfloom.processing.point_files import with_points
+    from nerfloom.processing.realitycapture import read_capture
+
+    _convert(flags, flags.data, with_points(read_capture(flags.csv), flags.ply))
+
+
+def _convert_odm(flags: OdmFlags) -> None:
+    from nerfloom.processing.opensfm import find_reconstruction, read_capture
+
+    default = flags.data / "images" if (flags.data / "images").is_dir() else flags.data
+    _convert(flags, flags.images_dir or default, read_capture(find_reconstruction(flags.data)))
+
+
+def _convert_bundler(flags: BundlerFlags) -> None:
+    from nerfloom.processing.bundler import read_capture
+
+    listed = flags.bundle.with_name("list.txt") if flags.image_list is None else flags.image_list
+    _convert(flags, flags.data, read_capture(flags.bundle, listed))
+
+
+def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
+    from nerfloom.processing.named_images import placed_images
+    from nerfloom.processing.output import claim
+    from nerfloom.processing.posed_folder import write_capture
+    from nerfloom.processing.views import Views
+
+    if not images.is_dir():
+        raise DataError(f"{images} is not a folder; it must be that of the photographs")
+    placed = placed_images(images, capture)
+    claim(flags.output_dir, flags.data, flags.overwrite)
+    views = Views(flags.num_views, flags.view_angle, flags.views_up_and_down)
+    kept = None if flags.panoramas == "whole" else views
+    write_capture(images, capture, placed, flags.output_dir, flags.num_downscales, kept)
 
 
 KINDS: dict[str, Kind] = {
@@ -135,5 +218,9 @@ KINDS: dict[str, Kind] = {
     "video": Kind(VideoFlags, _process_video),
     "polycam": Kind(PolycamFlags, _convert_polycam),
     "record3d": Kind(Record3DFlags, _convert_record3d),
+    "metashape": Kind(MetashapeFlags, _convert_metashape),
+    "realitycapture": Kind(RealityCaptureFlags, _convert_realitycapture),
+    "odm": Kind(OdmFlags, _convert_odm),
+    "bundler": Kind(BundlerFlags, _convert_bundler),
 }
 """Kinds of input by name."""

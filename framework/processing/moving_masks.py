@@ -1,4 +1,4 @@
-"""Masks of what moves: a short training with `--robust` finds what other images contradict."""
+"""Masks of moving things: a short training with `--robust` finds what other images contradict."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 from PIL import Image
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.json_files import read_object
+from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.processing import transforms
@@ -22,7 +22,7 @@ from nerfloom.training.progress import ProgressBar
 from nerfloom.training.trainer import Trainer
 
 METHOD = "nerfacto"
-"""The method that looks for what moves."""
+"""The method that looks for moving things."""
 SETTINGS: dict[str, Any] = {
     "max_num_iterations": None,
     "robust": True,
@@ -30,17 +30,17 @@ SETTINGS: dict[str, Any] = {
     "mean_appearance_share": 0.0,
     "vis": "none",
 }
-"""Its settings. Without scaled gradients people become fog before their camera, which nothing contradicts. In a step
-with the mean appearance, all of an image that is lit otherwise would be wrong in one direction."""
+"""Its settings. Without scaled gradients, people become fog in front of their camera, which no image contradicts. In a
+step with the mean appearance, all of an image in other light would be wrong in one direction."""
 LONGER_SIDE = 400
-"""Longer side of the images that it learns from, pixels, at least; images are reduced by 2, 4 or 8."""
+"""Minimum longer side of the images that it learns from, pixels. Larger images are reduced by 2, 4 or 8."""
 
 
 def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
-    """Train on a finished data folder for a short time, and add masks that leave out what moves.
+    """Train on a finished data folder for a short time, and add masks that leave out moving things.
 
-    Masks are black where something moves; they are at full size, with reduced copies beside them, and transforms.json
-    names them, so that any tool that reads masks can use them.
+    Masks are black where something moves. They have full size, with reduced copies beside them. transforms.json names
+    them, so any tool that reads masks can use them.
 
     Args:
         output: folder with transforms.json and images.
@@ -58,7 +58,7 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     config = from_plain(method.config, {**SETTINGS, **settings}, "masks")
     dataset, _ = on_device(load_dataset(parsed, "train"), choose_device(config.machine))
     trainer = Trainer(method, config, dataset)
-    with ProgressBar(f"{METHOD}, to find what moves") as bar:
+    with ProgressBar(f"{METHOD}, to find moving things") as bar:
         for report in trainer.steps():
             bar.show(report)
     tiles, cameras, names, share = trainer.source.contradicted, trainer.train_set.cameras, [], 0.0

@@ -14,7 +14,7 @@ from nerfloom.training.data_folder import processed_folder
 
 FINISHED = "transforms.json"
 """File written last; a folder with it is complete."""
-_OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|(images|masks)(_\d+)?")
+_OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|unpacked|(images|masks)(_\d+)?")
 
 
 def check_apart(output: Path, data: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,25 +10,11 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.processing.finite_numbers import finite
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.transforms import Frame, Lens, content, write
-
-UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
-"""Errors raised if a number in a JSON file is missing or is something else."""
-
-
-def finite(value: Any) -> float:
-    """Convert the JSON value `value` to a number.
-
-    Raises:
-        TypeError, ValueError, OverflowError: if it is not a finite number (`UNUSABLE`).
-    """
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError(f"{number} is not finite")
-    return number
 
 
 def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:

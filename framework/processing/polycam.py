@@ -1,4 +1,7 @@
-"""Polycam's raw exports: keyframes/images (or corrected_images), with a JSON file of pose and lens per image."""
+"""Polycam's raw exports: keyframes/images (or corrected_images), with a JSON file of pose and lens per image.
+
+An export is a folder, or the zip file that Polycam makes of it.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,15 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import read_object
+from nerfloom.processing.finite_numbers import UNUSABLE, finite
 from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import UNUSABLE, evenly_spaced, finite, undistorted_lens, write_folder
+from nerfloom.processing.phone import evenly_spaced, undistorted_lens, write_folder
 from nerfloom.processing.transforms import Lens
 
 Z_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
 """(3, 4) transform from the phone's frame (y up) to one with z up, as in nerfstudio."""
+FOLDERS = ("images", "cameras", "corrected_images", "corrected_cameras")
+"""Folders in keyframes that are read."""
 
 
 def convert(export: Path, output: Path, num_downscales: int, max_images: int, min_blur_score: float, crop: int) -> None:
@@ -54,8 +60,18 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
     write_folder(images, chosen, output, num_downscales, Z_UP, crop)
 
 
+def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Return where a file of a zip file belongs in the folder of an export; None for files that are not needed.
+
+    Args:
+        parts: parts of its path in the zip file; the folder keyframes may be inside another one.
+    """
+    inside = parts[parts.index("keyframes") :] if "keyframes" in parts else ()
+    return inside if len(inside) == 3 and inside[1] in FOLDERS and parts[0] != "__MACOSX" else None
+
+
 def check(export: Path) -> None:
-    """Check that `export` is an unpacked raw export.
+    """Check that the folder `export` is a raw export.
 
     Raises:
         DataError: if it is not.
@@ -118,8 +134,6 @@ def lens_of(camera: dict[str, Any], path: Path) -> Lens:
 
 def _folders(export: Path) -> tuple[Path, Path]:
     """Return the folders of images and cameras; those corrected by Polycam if they exist."""
-    if export.is_file():
-        raise DataError(f"--data {export} is a file; unpack the raw export and pass the folder")
     for root in (export / "keyframes", export):
         for prefix in ("corrected_", ""):
             images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"

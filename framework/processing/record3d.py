@@ -1,4 +1,8 @@
-"""Record3D's "EXR + RGBD" exports: EXR_RGBD/rgb with numbered images, and metadata.json with the poses."""
+"""Record3D's exports: folders "EXR + RGBD" with EXR_RGBD/rgb/N.jpg and metadata.json, and recordings, RECORDING.r3d.
+
+A recording is a zip file with rgbd/N.jpg and metadata, which holds the same JSON. Its depth images are compressed by
+LZFSE, and are not read.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,11 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import read_object
+from nerfloom.processing.finite_numbers import UNUSABLE
 from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import UNUSABLE, evenly_spaced, undistorted_lens, write_folder
-from nerfloom.processing.transforms import Lens
+from nerfloom.processing.phone import evenly_spaced, undistorted_lens, write_folder
+from nerfloom.processing.polycam import Z_UP
+from nerfloom.processing.transforms import Lens, transformed
 
 
 def convert(export: Path, output: Path, num_downscales: int, max_images: int) -> None:
@@ -42,8 +48,22 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
     if len(usable) < len(poses):
         say(f"{len(poses) - len(usable)} of {len(poses)} poses have no image")
     lenses = lenses_of(metadata, len(poses), path)
+    poses = transformed(poses, Z_UP)  # both apps record in the frame of ARKit
     posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly_spaced(usable, max_images)}
-    write_folder(root / "rgb", posed, output, num_downscales, np.eye(4)[:3])
+    write_folder(root / "rgb", posed, output, num_downscales, Z_UP)
+
+
+def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Return where a file of a recording belongs in the folder of an export; None for files that are not needed.
+
+    Args:
+        parts: parts of its path in the zip file.
+    """
+    if parts == ("metadata",):
+        return ("metadata.json",)
+    if len(parts) == 2 and parts[0] == "rgbd" and parts[1].lower().endswith((".jpg", ".jpeg", ".png")):
+        return ("rgb", parts[1])
+    return None
 
 
 def find_root(export: Path) -> Path:

@@ -28,7 +28,7 @@ class OutputFlags:
     num_downscales: int = 3
     """Number of folders of reduced images: 3 writes images_2, images_4 and images_8."""
     can_resume: ClassVar[bool] = False
-    """Whether a stopped run can go on where it stopped."""
+    """Whether a stopped run can continue where it stopped."""
 
     def check(self) -> None:
         """Check the values.
@@ -41,9 +41,30 @@ class OutputFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColmapFlags(OutputFlags):
+class ViewFlags(OutputFlags):
+    """Flags of the perspective views that panoramas are cut into."""
+
+    num_views: int = 8
+    """Number of views cut out of a panorama around the horizon, at equal angles; the first looks at its centre."""
+    view_angle: float = 90.0
+    """Angle of view of each, horizontal and vertical, degrees."""
+    views_up_and_down: bool = False
+    """Cut two further views that look straight up and straight down."""
+
+    def check(self) -> None:
+        super().check()
+        if not 1 <= self.num_views <= 64:
+            raise FlagError(f"--num-views is {self.num_views}; it must be from 1 to 64")
+        if not 10 <= self.view_angle <= 150:
+            raise FlagError(f"--view-angle is {self.view_angle}; it must be from 10 to 150 degrees")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapFlags(ViewFlags):
     """Flags of the estimation of poses."""
 
+    camera_type: Literal["perspective", "equirectangular"] = "perspective"
+    """Kind of the images: equirectangular ones are 360-degree panoramas, which are cut into perspective views."""
     camera_model: CameraModel = "OPENCV"
     """Lens model: OPENCV has distortion k1, k2, p1, p2; OPENCV_FISHEYE is for angles of view over about 120 degrees."""
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
@@ -67,7 +88,7 @@ class ColmapFlags(OutputFlags):
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), for registered images only."""
     mask_moving: bool = False
-    """Train on the images for a short time with --robust, and write masks that leave out what moves."""
+    """Train on the images for a short time with --robust, and write masks that leave out moving things."""
     mask_seconds: float = 120.0
     """Seconds of this training."""
     device_type: Literal["cpu", "cuda"] = "cpu"
@@ -84,6 +105,8 @@ class ColmapFlags(OutputFlags):
         super().check()
         if self.resume and self.overwrite:
             raise FlagError("--overwrite removes what --resume continues; leave out one of them")
+        if self.camera_type == "equirectangular" and self.camera_model == "OPENCV_FISHEYE":
+            raise FlagError("--camera-type equirectangular cuts perspective views; leave out --camera-model")
         minimums = {
             "exhaustive_limit": 0, "num_neighbors": 1, "sequential_overlap": 1,
             "max_image_size": 64, "max_num_features": 64,
@@ -111,6 +134,8 @@ class ImagesFlags(ColmapFlags):
             raise ConfigError("--masks-dir with --undistort: masks are not undistorted; leave one of them out")
         if self.masks_dir is not None and self.mask_moving:
             raise ConfigError("--masks-dir with --mask-moving: an image has one mask; leave one of them out")
+        if self.masks_dir is not None and self.camera_type == "equirectangular":
+            raise ConfigError("--masks-dir with --camera-type equirectangular: masks are not cut; leave out one")
         if self.masks_dir is not None and not self.masks_dir.is_dir():
             raise ConfigError(f"--masks-dir {self.masks_dir}: there is no such folder")
 
@@ -164,3 +189,49 @@ class PolycamFlags(PhoneFlags):
 @dataclass(frozen=True, kw_only=True)
 class Record3DFlags(PhoneFlags):
     """Convert Record3D's export with EXR and RGBD."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgramFlags(ViewFlags):
+    """Flags of captures that another program placed."""
+
+    panoramas: Literal["views", "whole"] = "views"
+    """What becomes of panoramas: perspective views for any method, or whole, for methods that cast rays."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetashapeFlags(ProgramFlags):
+    """Convert photographs (--data, a folder) with the cameras of Agisoft Metashape."""
+
+    xml: Path
+    """File of the cameras: File > Export > Export Cameras, as Agisoft XML."""
+    ply: Path | None = None
+    """Points (PLY), exported in the coordinate system of the chunk."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealityCaptureFlags(ProgramFlags):
+    """Convert photographs (--data, a folder) with the cameras of RealityCapture or RealityScan."""
+
+    csv: Path
+    """File of the cameras: Registration, Internal/External camera parameters."""
+    ply: Path | None = None
+    """Points (PLY), exported in the same coordinate system."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdmFlags(ProgramFlags):
+    """Convert a project's folder (--data) of OpenDroneMap or OpenSfM."""
+
+    images_dir: Path | None = None
+    """Folder of the photographs. Default: the folder images of the project."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundlerFlags(ProgramFlags):
+    """Convert photographs (--data, a folder) with a reconstruction of Bundler, which many programs write."""
+
+    bundle: Path
+    """File of cameras and points, such as bundle.out."""
+    image_list: Path | None = None
+    """List of the images, in the order of the cameras. Default: list.txt beside the bundle."""

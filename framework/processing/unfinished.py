@@ -17,6 +17,8 @@ STARTED = "started.json"
 """File that records a run's input."""
 FRAMES = "frames"
 """Folder of a video's frames."""
+VIEWS = "views"
+"""Folder of the views of panoramas."""
 FREE = (
     "output_dir", "overwrite", "resume", "num_downscales", "matching_method", "exhaustive_limit", "num_neighbors",
     "sequential_overlap", "refine_intrinsics", "mask_moving", "mask_seconds", "device_type", "num_threads", "verbose",
@@ -73,7 +75,7 @@ def go_on(flags: ColmapFlags, sources: list[Path]) -> None:
             f"the first: {other[0]}; start again with --overwrite"
         )
     for path in work.iterdir():
-        if path.name not in (STARTED, FRAMES) and not path.name.startswith("database.db"):
+        if path.name not in (STARTED, FRAMES, VIEWS) and not path.name.startswith("database.db"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     say(f"resuming: using features and matches in {work}")
 

@@ -138,7 +138,7 @@ def background_renderer(
 
 
 def _ending_at(samples: Samples, ends: Tensor) -> Samples:
-    """Return samples, equally many on each ray, whose last intervals end at `ends` (R,)."""
+    """Return samples with the last intervals ending at `ends` (R,); each ray has the same number of samples."""
     changed = samples.padded(samples.t_ends).clone()
     changed[:, -1] = ends
     return replace(samples, t_ends=changed.view(-1), points=samples.t)

@@ -26,7 +26,7 @@ class Output:
     label: str = ""
     """Caption of its picture; the name if empty."""
     of_training: bool = False
-    """Whether it tells something of training images alone (`View.image`), as what is in one of them only."""
+    """Whether it shows something of training images alone (`View.image`), such as what only one of them contains."""
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Volume rendering of fields with reflections: what they are made of, as pictures and as penalties."""
+"""Volume rendering of fields with reflections: pictures of the parts of colours, and penalties of normals."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import VolumeRenderer, volume_render
 
 DIFFUSE, SPECULAR = Output("diffuse", "color"), Output("specular", "color")
-"""Light that leaves surfaces in all directions alike, and reflected light, each in display colours over black."""
+"""Light that leaves surfaces equally in all directions, and reflected light, each in display colours over black."""
 ROUGHNESS = Output("roughness", "scalar")
 """Inverse concentration of reflected directions; 0 is a mirror."""
 EVERY = 4
-"""The density's normals are asked at one in this many samples."""
+"""In training, the density's normals are computed at one in this many samples."""
 
 
 class ReflectionRenderer(VolumeRenderer):
@@ -43,7 +43,7 @@ class ReflectionRenderer(VolumeRenderer):
             predicted = field.predicted_normals(samples.features)
             normals = _of_some(rays, samples, field)
             penalties = normal_penalties(predicted, normals, directions, rendered.weights, samples)
-            penalties["normals_penalty"] = EVERY * penalties["normals_penalty"]  # that of all, in the mean
+            penalties["normals_penalty"] = EVERY * penalties["normals_penalty"]  # on average, that of all samples
             return replace(rendered, extras={**rendered.extras, **penalties})
         light = field.light(samples.features, directions)  # once, for colours and their parts
         rendered = volume_render(rays, samples, samples.sigma, light.rgb, background)

@@ -22,7 +22,7 @@ class Renderer(nn.Module, ABC):
     optimised: Optimised | None = None
     """Optimiser settings of its parameters; if None, the model's."""
     outputs: tuple[Output, ...] = ()
-    """Declarations of outputs beside colour, depths and opacity (`Rendered.extras`)."""
+    """Declarations of outputs in addition to colour, depths and opacity (`Rendered.extras`)."""
 
     @abstractmethod
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:

@@ -24,10 +24,10 @@ class TransientRenderer(VolumeRenderer):
     """Volume rendering of the static field alone, and together with the transient part of the rays' images.
 
     In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
-    constant densities. The paper's equation 8 adds the opacities of both instead, which is the same for thin intervals.
+    constant densities. The paper's equation 8 adds their opacities instead, which is the same for thin intervals.
 
     Depth, opacity and weights are those of the static part. The uncertainty is composited by the transient density
-    alone (equation 11), so that the static part does not change on its account.
+    alone (equation 11), so that it does not change the static part.
 
     Args:
         head: the transient part.

@@ -142,7 +142,7 @@ def volume_render(
     """Composite densities or alphas, and colours, of packed samples: NeRF, equation 3.
 
     Args:
-        rays: R rays, whose far ends are the depth of transparent rays.
+        rays: R rays; their far ends are the depth of transparent rays.
         samples: N samples along the rays.
         sigma: (N,) density in 1/length, or the opacity of each interval.
         rgb: (N, 3) colour in [0, 1].

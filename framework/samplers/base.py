@@ -26,6 +26,8 @@ class Sampler(nn.Module, ABC):
     """Target number of samples per training step; the number of rays adapts. None for a fixed number of rays."""
     has_coarse_level: bool = False
     """Whether its samples include a coarse level, which is rendered and supervised too (`Samples.coarse`)."""
+    carries_gradients: bool = True
+    """Whether rays may require a gradient, which their samples carry, so that poses can be refined."""
     learns_from_weights: bool = False
     """Whether the sampler learns by its own `loss`; the method's objective then includes `SamplerLoss`."""
 

@@ -1,8 +1,8 @@
-"""Samples whose opacity has a bounded error: VolSDF (Yariv et al. 2021), section 3.3 and algorithm 1.
+"""Samples with a bounded error of the opacity: VolSDF (Yariv et al. 2021), section 3.3 and algorithm 1.
 
-A signed distance says how near a surface may come between two samples, and so how much the density can change there.
-That bounds the error of the opacity, computed from samples by the rectangle rule. Samples are added where the bound is
-large. Where their number does not suffice, the density is blurred (a larger beta) until the bound holds.
+A signed distance limits how near a surface may come between two samples, and so how much the density can change there.
+This bounds the error of an opacity that is computed from samples by the rectangle rule. Samples are added where the
+bound is large. If they do not suffice, the density is blurred (a larger beta) until the bound holds.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from nerfloom.kernels.surfaces.opacity import laplace_density
 from nerfloom.samplers.base import Sampler
 
 EPSILON = 0.1
-"""Largest error of the opacity: that of the authors' code."""
+"""Maximum error of the opacity, as in the authors' code."""
 ROUNDS = 5
-"""Maximum number of times that samples are added: that of the authors' code."""
+"""Maximum number of times that samples are added, as in the authors' code."""
 BISECTIONS = 10
-"""Steps of the bisection that finds the smallest beta for which the bound holds, as in the authors' code."""
+"""Steps of the bisection for the smallest beta that satisfies the bound, as in the authors' code."""
 PADDING = 1e-4
 """Added to the weights that samples are drawn from, so that every interval can be drawn."""
 MAX_EXPONENT = 60.0
-"""Bound of the exponent of the error's bound; beyond, it is as good as infinite, and must not be."""
+"""Maximum exponent in the error's bound, so that the bound stays finite."""
 
 
 def nearest_in_intervals(distances: Tensor, lengths: Tensor) -> Tensor:
-    """Return the least distance to a surface within intervals: VolSDF, theorem 1.
+    """Return the minimum distance to a surface within intervals: VolSDF, theorem 1.
 
-    No surface is nearer than d to a place with the distance d. So the balls around the two ends are empty, and the
-    nearest place to the interval outside both of them is the bound.
+    No surface is nearer than d to a position with the distance d. So balls of these radii around the two ends are
+    empty. The bound is the distance from the interval to the nearest position outside both balls.
 
     Args:
-        distances: (R, S) signed distances at S places along rays.
+        distances: (R, S) signed distances at S positions along rays.
         lengths: (R, S - 1) lengths between them.
 
     Returns:
@@ -50,7 +50,7 @@ def nearest_in_intervals(distances: Tensor, lengths: Tensor) -> Tensor:
     """
     first, last = distances[:, :-1].abs(), distances[:, 1:].abs()
     half = (lengths + first + last) / 2
-    area = half * (half - lengths) * (half - first) * (half - last)  # Heron's formula: of a triangle's area, squared
+    area = half * (half - lengths) * (half - first) * (half - last)  # Heron's formula: squared area of a triangle
     height = 2 * area.clamp(min=0).sqrt() / lengths.clamp(min=torch.finfo(lengths.dtype).tiny)
     beside = (first.square() - last.square()).abs() >= lengths.square()
     nearest = torch.where(beside, torch.minimum(first, last), height)
@@ -58,10 +58,10 @@ def nearest_in_intervals(distances: Tensor, lengths: Tensor) -> Tensor:
 
 
 class Bounded(NamedTuple):
-    """The opacity along R rays at S places, by the rectangle rule, and its error."""
+    """The opacity along R rays at S positions, by the rectangle rule, and its error."""
 
     opacity: Tensor
-    """(R, S) opacity up to each place; 0 at the first."""
+    """(R, S) opacity up to each position; 0 at the first."""
     error: Tensor
     """(R, S - 1) bound of the error of the opacity within each interval."""
 
@@ -71,7 +71,8 @@ def bounded_opacity(t: Tensor, distances: Tensor, beta: Tensor) -> Bounded:
 
     Args:
         t: (R, S) sorted distances along the rays, scene units.
-        distances: (R, S) signed distances there. The bound holds if no place is nearer to a surface than they say.
+        distances: (R, S) signed distances there. The bound holds if none of them exceeds the true distance to a
+            surface.
         beta: (R, 1) or () mean distance over which the density falls, scene units.
     """
     lengths = t.diff(dim=-1)
@@ -85,13 +86,13 @@ def bounded_opacity(t: Tensor, distances: Tensor, beta: Tensor) -> Bounded:
 
 
 def bounding_beta(t: Tensor, distances: Tensor, beta: Tensor, first: Tensor, epsilon: float) -> Tensor:
-    """Return the smallest beta of each ray for which the opacity's error is bounded, by bisection.
+    """Return the smallest beta of each ray that bounds the opacity's error, found by bisection.
 
     Args:
         t: (R, S) sorted distances along the rays, scene units.
         distances: (R, S) signed distances there.
-        beta: () the density's own, which is the least.
-        first: (R, 1) values for which the bound is `epsilon` or less.
+        beta: () the density's own beta, the lower limit.
+        first: (R, 1) values that make the bound `epsilon` or less.
         epsilon: largest error of the opacity.
 
     Returns:
@@ -108,11 +109,11 @@ def bounding_beta(t: Tensor, distances: Tensor, beta: Tensor, first: Tensor, eps
 
 
 class ErrorBoundedSampler(Sampler):
-    """Samples drawn from an opacity whose error is bounded, of a field with the density of VolSDF.
+    """Samples of a field with the density of VolSDF, drawn from an opacity with a bounded error.
 
     Args:
         box: (2, 3) corners of the box that holds the surfaces, scene units.
-        num_steps: places along a ray where the distance is looked up first, and how many each round adds.
+        num_steps: number of distances evaluated along a ray at first, and added in each round.
         num_samples: samples per ray.
         epsilon: largest error of the opacity.
     """
@@ -137,16 +138,16 @@ class ErrorBoundedSampler(Sampler):
 
     @torch.no_grad()
     def bounded(self, rays: Rays, field: VolSDFField, jitter: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Look up distances along rays until the opacity's error is bounded: VolSDF, algorithm 1.
+        """Evaluate distances along rays until the opacity's error is bounded: VolSDF, algorithm 1.
 
         Args:
             rays: R rays.
             field: the field.
-            jitter: True for random places, False for fixed ones.
+            jitter: True for random positions, False for fixed ones.
 
         Returns:
             (R, S) sorted distances along the rays, (R, S) signed distances there, and (R, 1) values of beta, scene
-            units, for which the bound holds.
+            units, that satisfy the bound.
         """
         enter, leave = intersect_box(rays.origins, rays.directions, self.box)
         nears = torch.maximum(rays.nears, enter)
@@ -154,7 +155,7 @@ class ErrorBoundedSampler(Sampler):
         share = torch.linspace(0, 1, self.num_steps + 1, device=nears.device, dtype=nears.dtype)
         t = torch.lerp(nears[:, None], fars[:, None], share)
         distances, beta = self._distances(rays, field, t), 1 / field.sharpness()
-        # For this value the bound holds wherever the surface is, with n intervals of equal length or shorter ones.
+        # This value satisfies the bound for any surface, with n intervals of equal or smaller length.
         widest = (fars - nears)[:, None] / (2 * math.sqrt(self.num_steps * math.log1p(self.epsilon)))
         for _ in range(ROUNDS):
             smoothed = bounding_beta(t, distances, beta, widest, self.epsilon)

@@ -1,11 +1,12 @@
 """Sphere tracing of a signed distance (Hart 1996): samples where rays meet surfaces, up to one that covers the ray.
 
 A ray advances by the distance at its position, so it takes few steps far from a surface. It stays in occupied cells;
-the space between them counts as outside. A learnt distance is no exact one: steps are shortened by its slope at the
-position and by `SAFETY`, and a ray that has passed the surface is led back to it between its last two positions.
+the space between them counts as outside. A learnt distance is not exact. So steps are divided by `SAFETY` and by its
+slope at the position, if above 1. If a ray has passed the surface, the crossing is found between its last two
+positions.
 
-A pixel is a cone. With m the least distance of the ray on its way past a surface, and r the cone's radius there, the
-surface covers (r - m) / (2 r) of the cone if its edge is straight. So edges are smooth with one ray a pixel.
+A pixel is a cone. Let m be the minimum distance of a ray that passes a surface, and r the cone's radius there. If the
+surface's edge is straight, it covers (r - m) / (2 r) of the cone. So edges are smooth with one ray per pixel.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.wrapping import WrappingSampler
 
 SAFETY = 1.25
-"""Factor by which a learnt distance may be steeper on the way than at the position where it was evaluated."""
+"""Maximum slope of a learnt distance along a step, relative to its slope at the position where it was evaluated."""
 SHORTEST = 1 / 8
-"""Shortest advance, in steps of the sampler."""
+"""Minimum advance, in steps of the sampler."""
 REFINEMENTS, EXACT = 8, 1e-3
-"""Maximum number of evaluations to find the surface between two positions, and the distance from it that suffices, in
-shortest advances."""
+"""Maximum number of evaluations to find the surface between two positions, and the distance from it that is accepted,
+in minimum advances."""
 DistanceFunction = Callable[[Tensor], Tensor]
-"""Function from positions (N, 3) to signed distances (N,), none longer than that to the nearest surface."""
+"""Function from positions (N, 3) to signed distances (N,), at most the true distance to the nearest surface."""
 
 
 class Pieces(NamedTuple):
@@ -49,7 +50,7 @@ class Pieces(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """M places where rays meet a surface, sorted by ray and distance."""
+    """M positions where rays meet a surface, sorted by ray and distance."""
 
     owners: Tensor
     """(M,) int64 index of the ray."""
@@ -62,20 +63,20 @@ class Crossings(NamedTuple):
 
 
 class _Paths(NamedTuple):
-    """The state of rays that are still advancing, a column each."""
+    """The state of rays that are still advancing, one column per quantity."""
 
     rays: Tensor
     """Index."""
     t: Tensor
     """Distance along the ray."""
     before: Tensor
-    """Distance along the ray at the position before."""
+    """Distance along the ray at the previous position."""
     was: Tensor
     """Signed distance there; positive in space that is not searched, negative before the first position."""
     least: Tensor
-    """Least distance since the ray was last clear of a surface; -infinity if it has never been."""
+    """Minimum distance since the ray was last clear of a surface; -infinity if it has never been."""
     nearest: Tensor
-    """Distance along the ray at that place."""
+    """Distance along the ray at that position."""
     outside: Tensor
     """Distance along the ray of the last position before it entered; negative if it has not."""
     inside: Tensor
@@ -94,15 +95,14 @@ class _Paths(NamedTuple):
 def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: float) -> Crossings:
     """Return where rays meet surfaces, up to the first that covers them.
 
-    A ray that starts inside has to leave first. Parts of a surface are passed over only if they are thinner along the
-    ray than `shortest` and half of its cone's radius, and if the distances are no longer than those to the nearest
-    surface.
+    A ray that starts inside has to leave first. If the distances do not exceed those to the nearest surface, only parts
+    of a surface are missed that are thinner along the ray than the larger of `shortest` and half of the cone's radius.
 
     Args:
         distance: computes distances.
         rays: R rays; without `pixel_radii` a surface covers all of a ray or nothing.
         pieces: where to search; elsewhere all space is outside.
-        shortest: shortest advance, scene units.
+        shortest: minimum advance, scene units.
     """
     active = (pieces.offsets[1:] > pieces.offsets[:-1]).nonzero().squeeze(-1)
     radii = torch.zeros_like(rays.nears) if rays.pixel_radii is None else rays.pixel_radii

@@ -87,6 +87,7 @@ class OccupancySampler(Sampler):
         ConfigError: if the number of cells, boxes, slices or steps is out of range.
     """
 
+    carries_gradients = False
     box: Tensor
     density_grid: Tensor
     occupied: Tensor

@@ -10,7 +10,8 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.samplers.base import Sampler
 
 LAST_INTERVAL = 1e10
-"""Length of the last interval, scene units, as in the authors' code; the last sample stands for all behind."""
+"""Length of the last interval, scene units, as in the authors' code; the last sample represents everything behind
+it."""
 
 
 def stratified_points(rays: Rays, count: int, jitter: bool) -> Tensor:

@@ -21,6 +21,7 @@ class WrappingSampler(Sampler):
         super().__init__()
         self.sampler, self.samples_per_step = sampler, sampler.samples_per_step
         self.has_coarse_level, self.learns_from_weights = sampler.has_coarse_level, sampler.learns_from_weights
+        self.carries_gradients = sampler.carries_gradients
 
     def update(self, step: int, density: DensityFunction) -> None:
         self.sampler.update(step, density)

@@ -27,7 +27,7 @@ class SceneProfile:
     ignored: float | None
     """Fraction of pixels that are masked out or have no ray; None if there are none."""
     light: float | None
-    """Spread of the light between images, in stops (`light.light_spread`); None with alpha."""
+    """Spread of the light between images, in stops (`light_spread.light_spread`); None with alpha."""
     camera: str
     """Model of the cameras."""
     decisions: tuple[Decision, ...]

@@ -27,6 +27,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.data.ply import PlyElement, PlyHeader, read_columns
 from nerfloom.kernels.splats.project import DC, DEGREES
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.smallest_three import joined
 
 CHUNK = 256
 """Gaussians in a chunk."""
@@ -57,8 +58,8 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
     vertex, chunk = header.elements["vertex"], header.elements.get("chunk")
     if chunk is None or chunk.count * CHUNK < vertex.count or chunk.order == "ascii":
         raise DataError(
-            f"{file} is a compressed PLY file whose header states {0 if chunk is None else chunk.count} chunks of"
-            f" {CHUNK} for {vertex.count:,} Gaussians, or is no binary file; export it again"
+            f"{file} is a compressed PLY file with {0 if chunk is None else chunk.count} chunks of"
+            f" {CHUNK} for {vertex.count:,} Gaussians, or is not a binary file; export it again"
         )
     rows = np.arange(vertex.count) // CHUNK
     position, rotation, scale, color = (word.astype("<u4") for word in _columns(file, vertex, _WORDS))
@@ -95,16 +96,9 @@ def _between(low: np.ndarray, high: np.ndarray, share: np.ndarray) -> np.ndarray
 
 
 def _quaternions(words: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (N, 4) w, x, y, z: the largest component follows from unit length."""
+    """Return unit quaternions (N, 4) w, x, y, z."""
     others = np.stack([words >> shift & 1023 for shift in (20, 10, 0)], -1) / 1023 - 0.5
-    others *= math.sqrt(2)
-    largest = np.sqrt((1 - (others**2).sum(-1)).clip(0))
-    result = np.empty((len(words), 4))
-    for place in range(4):
-        rows = words >> 30 == place
-        result[np.ix_(rows, [component for component in range(4) if component != place])] = others[rows]
-        result[rows, place] = largest[rows]
-    return result
+    return joined(words >> 30, math.sqrt(2) * others)
 
 
 def _harmonics(file: Path, header: PlyHeader, count: int) -> Tensor:

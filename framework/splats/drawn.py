@@ -1,4 +1,4 @@
-"""Renderables whose pictures are drawings of Gaussians, and fixed Gaussians, such as those of a file."""
+"""Renderables that draw Gaussians, and fixed Gaussians, such as those of a file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.splats.project import SplatCamera
@@ -24,7 +23,7 @@ from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
 
 
 class DrawsGaussians(Renderable):
-    """A renderable whose pictures are drawings of Gaussians."""
+    """A renderable that draws Gaussians."""
 
     cameras: ClassVar[tuple[str, ...] | None] = DRAWN
     rasteriser: ClassVar[Rasteriser] = RASTERISER
@@ -53,14 +52,6 @@ class DrawsGaussians(Renderable):
         """
         return rgb
 
-    def camera(self, camera: Cameras) -> SplatCamera:
-        """Return the camera of a view outside of training; by default with its own pose.
-
-        Args:
-            camera: one camera.
-        """
-        return splat_camera(camera, smallest_depth(self.scene), self.look())
-
     @property
     def outputs(self) -> tuple[Output, ...]:
         """Return the normals, the shortest axes of Gaussians (`Picture.extras`)."""
@@ -76,14 +67,17 @@ class DrawsGaussians(Renderable):
             gaussians: Gaussians in the frame of the scene, at the time of the view.
             view, background: as in `render_view`.
         """
-        camera = self.camera(view.camera)
+        camera = self._camera(view)
         picture = draw_view(gaussians, camera, view.stride, background, self.scene.far, self.rasteriser)
         return replace(picture, rgb=self.lit(picture.rgb, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
         if self._prepared is None or self._prepared.time != view.time:
             self._prepared = PreparedGaussians(self.gaussians(view.time), self.rasteriser, view.time)
-        return self.lit(self._prepared.colors(self.camera(view.camera), view.stride, background), None)
+        return self.lit(self._prepared.colors(self._camera(view), view.stride, background), None)
+
+    def _camera(self, view: View) -> SplatCamera:
+        return splat_camera(view.camera, smallest_depth(self.scene), self.look())
 
 
 class DrawnGaussians(DrawsGaussians):

@@ -7,6 +7,7 @@ with the least error is used. Gaussians are dropped, the least visible first, on
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -17,6 +18,7 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.ply import ply_size
 from nerfloom.splats.spz import BITS, encoded, rounded_harmonics
+from nerfloom.splats.spz_container import SpzVersion
 
 COARSER_BITS = (4, 3)
 """Bits of harmonics in SPZ files if `BITS` are too many."""
@@ -24,6 +26,9 @@ MAX_SAMPLE = 1 << 16
 """Maximum number of Gaussians used to estimate sizes and errors."""
 DOUBT = 1.05
 """A choice is not tried if its estimated size exceeds the limit by more than this ratio."""
+
+Encode = Callable[[Gaussians], tuple[bytes, list[str]]]
+"""Returns the content of a file of Gaussians, and sentences about what is lost in it."""
 
 
 def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[Gaussians, str]:
@@ -48,13 +53,16 @@ def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
     return most_visible(with_degree(gaussians, 0), count), _changes(gaussians, 0, BITS, count)
 
 
-def fitted_spz(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[bytes, str]:
+def fitted_spz(
+    gaussians: Gaussians, most_bytes: float, look: Look = OURS, version: SpzVersion = 2
+) -> tuple[bytes, str]:
     """Return an SPZ file of limited size, and a description of what was removed.
 
     Args:
         gaussians: N Gaussians on the CPU.
         most_bytes: maximum size of the file.
         look: the settings of drawing.
+        version: version of the format.
 
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.
@@ -63,17 +71,44 @@ def fitted_spz(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
     choices = [(degree, bits) for degree in range(1, gaussians.degree + 1) for bits in (BITS, COARSER_BITS)]
     choices = [(0, BITS), *choices]
     for degree, bits in sorted(choices, key=lambda choice: colour_error(sample, *choice)):
-        size = len(encoded(with_degree(sample, degree), bits)) * len(gaussians) / max(len(sample), 1)
+        size = len(encoded(with_degree(sample, degree), bits, version=version)) * len(gaussians) / max(len(sample), 1)
         if size > DOUBT * most_bytes:
             continue
-        content = encoded(with_degree(gaussians, degree), bits, look)
+        content = encoded(with_degree(gaussians, degree), bits, look, version)
         if len(content) <= most_bytes:
             return content, _changes(gaussians, degree, bits, len(gaussians))
+    content, _, changes = _fewer(gaussians, most_bytes, lambda kept: (encoded(kept, BITS, look, version), []))
+    return content, changes
+
+
+def fitted(gaussians: Gaussians, most_bytes: float | None, encode: Encode) -> tuple[bytes, list[str], str]:
+    """Return a file of limited size in a format that has no choice but the degree and the number of Gaussians.
+
+    Args:
+        gaussians: N Gaussians on the CPU.
+        most_bytes: maximum size of the file; None for any.
+        encode: returns the content of a file of given Gaussians, and sentences about losses.
+
+    Returns:
+        The content, the sentences, and a description of what was removed.
+
+    Raises:
+        ConfigError: if not even one Gaussian fits, or the format cannot hold them.
+    """
+    for degree in range(gaussians.degree, -1, -1):
+        content, lost = encode(with_degree(gaussians, degree))
+        if most_bytes is None or len(content) <= most_bytes:
+            return content, lost, _changes(gaussians, degree, BITS, len(gaussians))
+    return _fewer(gaussians, most_bytes or 0.0, encode)
+
+
+def _fewer(gaussians: Gaussians, most_bytes: float, encode: Encode) -> tuple[bytes, list[str], str]:
+    """Return a file of as many Gaussians of degree 0 as fit, as `fitted` does."""
     fewer, count = with_degree(gaussians, 0), len(gaussians)
     while count > 0:
-        content = encoded(most_visible(fewer, count), look=look)
+        content, lost = encode(most_visible(fewer, count))
         if len(content) <= most_bytes:
-            return content, _changes(gaussians, 0, BITS, count)
+            return content, lost, _changes(gaussians, 0, BITS, count)
         count = math.floor(count * min(0.99, 0.995 * most_bytes / len(content)))
     raise _too_small(most_bytes)
 

@@ -80,7 +80,7 @@ class FoundDistances(nn.Module):
         if batch.distances is not None and measured_weight > 0:
             return batch.distances, measured_weight
         weight = found_weight * guidance(progress)
-        if weight == 0 or not len(self):
+        if weight == 0 or not len(self) or batch.index is None:
             return None, 0.0
         return self.of_image(batch.index, *batch.rgb.shape[:2]), weight
 

@@ -32,16 +32,26 @@ class Mcmc(Strategy):
     changes_per_doubling = 15.0
 
     def grow(self, gaussians: Gaussians, most: int, extent: float) -> Change | None:
-        here = len(gaussians)
-        return moved(gaussians, max(min(most, int(GROWTH * here)) - here, 0))
+        return moved(gaussians, growth(len(gaussians), most))
 
 
-def moved(gaussians: Gaussians, added: int) -> Change | None:
+def growth(count: int, most: int) -> int:
+    """Return the number of Gaussians that a change adds.
+
+    Args:
+        count: number of Gaussians before it.
+        most: maximum number of Gaussians afterwards.
+    """
+    return max(min(most, int(GROWTH * count)) - count, 0)
+
+
+def moved(gaussians: Gaussians, added: int, scores: Tensor | None = None) -> Change | None:
     """Move dead Gaussians to live ones, and add more.
 
     Args:
         gaussians: all N Gaussians.
         added: number of Gaussians to add.
+        scores: (N,) relative probability that a live Gaussian is chosen, positive; None for its opacity.
 
     Returns:
         The Gaussians that stay, and the new ones: all copies of each chosen Gaussian. None if nothing changes.
@@ -51,7 +61,7 @@ def moved(gaussians: Gaussians, added: int) -> Change | None:
     wanted = int((~alive).sum()) + added
     if wanted == 0 or not bool(alive.any()):
         return None
-    weight = torch.where(alive, opacity, 0).cumsum(0)
+    weight = torch.where(alive, opacity if scores is None else scores, 0).cumsum(0)
     draws = (torch.arange(wanted, device=weight.device) + torch.rand(wanted, device=weight.device)) / wanted
     sources = torch.searchsorted(weight, draws * weight[-1]).clamp(max=len(weight) - 1)
     copies = torch.bincount(sources, minlength=len(gaussians)).clamp(max=MAX_COPIES - 1)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, write_scale
 from nerfloom.data.offsets import write_offset
@@ -12,6 +14,7 @@ from nerfloom.geometry.local_origin import local_origin
 from nerfloom.splats.files import write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
+from nerfloom.splats.spz_container import SpzVersion
 from nerfloom.splats.transform import transformed_in_float64
 
 
@@ -26,18 +29,27 @@ def in_input(gaussians: Gaussians, placement: Placement) -> Gaussians:
 
 
 def write_placed(
-    file: Path, gaussians: Gaussians, look: Look, scale: Scale, max_megabytes: float | None = None
+    file: Path,
+    gaussians: Gaussians,
+    look: Look,
+    scale: Scale,
+    placement: Placement,
+    max_megabytes: float | None = None,
+    spz_version: SpzVersion = 2,
 ) -> list[str]:
     """Write Gaussians in the frame of the input, about a local origin where float32 is too coarse for it.
 
-    The origin is written to an offset file beside, and the unit to a file of the scale.
+    The origin is written to an offset file beside, and the unit to a file of the scale. In a .glb file everything is
+    turned so that up is +y, the origin too.
 
     Args:
         file: path of the file, with a suffix of `SUFFIXES`.
         gaussians: N Gaussians on the CPU, with centres in float64.
         look: the settings of drawing.
         scale: the unit of their coordinates.
+        placement: placement of their frame in a scene whose up is +z.
         max_megabytes: maximum size of the file in millions of bytes; None for any.
+        spz_version: version of SPZ files.
 
     Returns:
         Sentences for the user about what was lost, and about the local origin.
@@ -46,9 +58,11 @@ def write_placed(
         ConfigError: if the format cannot hold the Gaussians, or no file fits the size.
         OSError: if a file cannot be written.
     """
+    if file.suffix.lower() == ".glb":
+        gaussians = transformed_in_float64(gaussians, placement.to_y_up(), 1.0, torch.zeros(3, dtype=torch.float64))
     origin = local_origin(gaussians.means, gaussians.typical_size)
     means = gaussians.means if origin is None else gaussians.means - origin
-    said = write_gaussians(file, replace(gaussians, means=means.float()), max_megabytes, look)
+    said = write_gaussians(file, replace(gaussians, means=means.float()), max_megabytes, look, spz_version)
     if sentence := write_offset(file, origin):
         said.append(sentence)
     write_scale(file, scale)

@@ -88,10 +88,10 @@ class SplattingConfig(
     paced: Auto[bool] = AUTO
     """Adapt the share of reduced images and --steps-per-move to measured step times. Default: with --max-seconds in one
     process, unless --reduced-until or --steps-per-move is given."""
-    strategy: Literal["adc", "mcmc"] = "adc"
+    strategy: Literal["adc", "mcmc", "relocation"] = "adc"
     """How Gaussians are added and removed. adc: drop transparent Gaussians; clone or split those with large gradients
     of the image position (adaptive density control of 3DGS). mcmc: move transparent Gaussians to opaque ones
-    (3DGS-MCMC)."""
+    (3DGS-MCMC). relocation: move them to those that are opaque or have large gradients (FreeTimeGS)."""
     growth_end: float = 0.8
     """Share of the budget after which no Gaussian is added or moved."""
     steps_per_move: Auto[int] = AUTO

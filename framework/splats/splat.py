@@ -48,7 +48,7 @@ def read_splat(file: Path) -> Gaussians:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
     if not content or len(content) % ROW.itemsize:
         raise DataError(
-            f"{file} is no .splat file, or is truncated: it has {len(content):,} bytes, and each Gaussian has"
+            f"{file} is not a .splat file, or is truncated: it has {len(content):,} bytes, and each Gaussian has"
             f" {ROW.itemsize}; copy or export it again"
         )
     rows = np.frombuffer(content, ROW)

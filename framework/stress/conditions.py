@@ -68,7 +68,7 @@ class Condition:
     reason: str | None = None
     """Reason why more may be lost; None without."""
     may_refuse: bool = False
-    """Whether a clear error (NerfloomError) is as good as a result."""
+    """Whether a clear error (NerfloomError) is accepted instead of a result."""
     may_skip: bool = False
     """Whether any step may be dropped because it is not finite."""
     ball_only: bool = False
@@ -116,7 +116,7 @@ CONDITIONS = (
         "photographs of one pixel",
         _both(one_pixel),
         allowed=MAX_LOSS_OF_OTHER_PICTURES,
-        reason="there are only a dozen pixels, each the mean of an image whose centre its ray sees",
+        reason="there are only a dozen pixels: each is the mean of an image, and its ray sees the centre alone",
     ),
     Condition("duplicate-cameras", "every photograph and its camera twice", _train(twice)),
     Condition(

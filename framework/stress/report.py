@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerfloom.base.config import to_plain
+from nerfloom.base.plain import to_plain
 from nerfloom.data.scene import Scene
 from nerfloom.registry import load_method
 from nerfloom.stress.trial import Budget, shortened

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import TrainConfig, from_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import NerfloomError
+from nerfloom.base.plain import from_plain
 from nerfloom.base.signals import Stopped
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
@@ -27,6 +28,7 @@ from nerfloom.kernels.adam.adam import all_finite
 from nerfloom.method import Method
 from nerfloom.model import Model
 from nerfloom.registry import load_method
+from nerfloom.renderable import with_refined_poses
 from nerfloom.stress.conditions import Condition
 from nerfloom.stress.scenes import Views
 from nerfloom.training.run import Run
@@ -119,11 +121,12 @@ def _trained_and_evaluated(condition: Condition, run: Run, views: Views, budget:
     if (number := trainer.train().stopped_by) is not None:
         raise Stopped(number)
     state = trainer.state
-    test_psnr = float(evaluate(trainer.model, changed.test).results["psnr"])
-    trial = Trial(steps=state.step, skipped=state.skipped, seconds=state.seconds, error=unsound(trainer, changed.test))
+    test = with_refined_poses(trainer.model, changed.test)
+    test_psnr = float(evaluate(trainer.model, test).results["psnr"])
+    trial = Trial(steps=state.step, skipped=state.skipped, seconds=state.seconds, error=unsound(trainer, test))
     if not math.isfinite(test_psnr):
         return replace(trial, error=trial.error or "the PSNR of the test views is not finite")
-    return replace(trial, psnr=test_psnr, learnt=test_psnr - blank_psnr(trainer.model, changed.test))
+    return replace(trial, psnr=test_psnr, learnt=test_psnr - blank_psnr(trainer.model, test))
 
 
 def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene) -> TrainConfig:

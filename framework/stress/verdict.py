@@ -15,8 +15,8 @@ from nerfloom.stress.trial import Budget, Trial, attempt
 from nerfloom.training.run import Run
 
 Outcome = Literal["pass", "degraded", "refused", "fail", "not applicable"]
-"""Outcome of a run. refused: it ended with a clear error, which is as good as a result. not applicable: there was no
-run, because the condition changes nothing in what the method does."""
+"""Outcome of a run. refused: it ended with a clear error, which is accepted instead of a result. not applicable: there
+was no run, because the condition does not affect the method."""
 MIN_LEARNT = 3.0
 """Minimum PSNR of the plain run above that of empty images, dB; with a lower one, every run would pass."""
 

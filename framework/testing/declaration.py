@@ -11,7 +11,8 @@ from dataclasses import fields
 
 import yaml
 
-from nerfloom.base.config import TrainConfig, from_plain, to_plain
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.testing.finding import Fault
 from nerfloom.testing.method_under_test import MethodUnderTest
 

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 from nerfloom.base.device import runs_ahead
 from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.evaluator import Measured, measure_view, spread, views_to_judge
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, with_refined_poses
 from nerfloom.training.progress import StepReport
 from nerfloom.training.run import finite_or_null
 
@@ -189,7 +189,7 @@ class FewImages:
 
         Rendering uses the mean appearance regardless of --eval-appearance, since fitting one per image is slow.
         """
-        background = model.background
-        measured = [measure_view(model, self._dataset, view, background, stride) for view in self._views]
+        background, dataset = model.background, with_refined_poses(model, self._dataset)
+        measured = [measure_view(model, dataset, view, background, stride) for view in self._views]
         ssims = [image.ssim for image in measured if image.ssim is not None]
         return Measured(fmean(image.psnr for image in measured), fmean(ssims) if len(ssims) == len(measured) else None)

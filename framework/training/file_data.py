@@ -1,4 +1,4 @@
-"""Photographs of a file that is no run: of Gaussians, or of an octree."""
+"""Photographs for a file of Gaussians or an octree."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ REPLAYS_BEFORE_TESTS = 0, 64
 """Numbers of replays before each test of a graph. In 64 steps an occupancy grid has been updated at least four times,
 learning rates have changed, and other tensors may have moved."""
 MAX_KINDS = 4
-"""Maximum number of kinds of steps whose graphs are kept, most recent first; each graph holds memory."""
+"""Maximum number of kinds of steps with a graph in memory; the most recent are kept."""
 WAITED = "called a synchronizing CUDA operation"
 """Part of torch's warning where Python waits for the GPU."""
 FLAG = "--machine.cuda-graphs"
@@ -63,7 +63,7 @@ class Recorder(Protocol):
         """Capture `function` without running its operations.
 
         Returns:
-            Its result, whose tensors get their values in a replay, and the function that replays it.
+            Its result, with tensors that get their values in a replay, and the function that replays it.
         """
 
 

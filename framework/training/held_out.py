@@ -16,6 +16,7 @@ from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import evaluate, timed_view
 from nerfloom.evaluation.panels import composed, view_panels
 from nerfloom.model import Model
+from nerfloom.renderable import with_refined_poses
 from nerfloom.training.budget import evaluation_seconds
 from nerfloom.training.curve import FewImages, Point, in_order, rows
 from nerfloom.training.progress import StepReport, TensorBoard
@@ -77,7 +78,7 @@ class HeldOut:
             limit = evaluation_seconds(config, state) if every is None else None
             evaluation = evaluate(
                 self.model,
-                self.dataset,
+                with_refined_poses(self.model, self.dataset),
                 max_images=config.max_eval_images,
                 seconds=limit,
                 lpips_weights=config.lpips_weights,
@@ -100,7 +101,8 @@ class HeldOut:
     def _show(self, index: int, dataset: Dataset, step: int, board: TensorBoard) -> None:
         """Show image `index` beside its render."""
         background = self.model.background
-        picture, seconds = timed_view(self.model, dataset.view(index), background)
+        view = with_refined_poses(self.model, dataset).view(index)
+        picture, seconds = timed_view(self.model, view, background)
         target = composite(dataset.image(index).float() / 255, background)
         panels = view_panels(picture.rgb.clamp(0, 1), target, picture)
         self._picture_seconds += seconds

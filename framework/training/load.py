@@ -1,4 +1,4 @@
-"""Loading of a run, a folder of runs, a file of Gaussians, or an octree."""
+"""Loading of a run, a folder of runs, a scene in blocks, a file of Gaussians, or an octree."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.blocks.files import is_blocks_file
 from nerfloom.octrees.files import is_octree_file
 from nerfloom.splats.files import is_splat_file
 from nerfloom.splats.placement import Axis
+from nerfloom.training.block_files import load_blocks
 from nerfloom.training.file_data import DataFormat
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.octree_files import load_octree
@@ -25,11 +27,11 @@ def load(
     up: Axis | None = None,
     **settings: Any,
 ) -> Loaded:
-    """Load a trained run, a file of Gaussians, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
 
     Args:
-        path: the run's folder, its config.yml, a folder above it (for its newest run), a file of Gaussians (.ply,
-            .spz, .splat) in the frame of the input, or an octree (.octree).
+        path: the run's folder, its config.yml, a folder above it (for its newest run), a blocks.yml, a file of
+            Gaussians (.ply, .spz, .sog, .splat, .ksplat) in the frame of the input, or an octree (.octree).
         checkpoint: checkpoint of a run; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.
         data: folder of the data, if a run's has moved; optional data for a file.
@@ -48,13 +50,21 @@ def load(
             raise ConfigError(f"'{data_format[0]}': the run knows its data format; leave it out, with its flags")
         if up is not None:
             raise ConfigError("--up is for files of Gaussians: the run knows which way is up; leave it out")
+        if is_blocks_file(path):
+            refused = {"load_checkpoint": checkpoint, "eval_appearance": settings.pop("eval_appearance", None)}
+            _refuse("a scene in blocks", refused)
+            return load_blocks(path, device_type, data, **settings)
         return load_trained(path, checkpoint, device_type, data, **settings)
-    for name, value in {"load_checkpoint": checkpoint, **settings}.items():
-        if value is not None:
-            what = "an octree" if is_octree else "a file of Gaussians"
-            raise ConfigError(f"--{name.replace('_', '-')} has no effect with {what}: leave it out")
+    _refuse("an octree" if is_octree else "a file of Gaussians", {"load_checkpoint": checkpoint, **settings})
     if is_octree:
         if up is not None:
             raise ConfigError("--up is for files of Gaussians: an octree knows which way is up; leave it out")
         return load_octree(path, data, data_format, device_type)
     return load_splats(path, data, data_format, device_type, up)
+
+
+def _refuse(what: str, useless: dict[str, Any]) -> None:
+    """Raise ConfigError if a setting that has no effect with what is loaded is given."""
+    for name, value in useless.items():
+        if value is not None:
+            raise ConfigError(f"--{name.replace('_', '-')} has no effect with {what}: leave it out")

@@ -18,9 +18,10 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, write_scale
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
+from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.measuring import Length, measured, scale_of, surface_point
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, refined_cameras, with_refined_poses
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run
@@ -28,7 +29,10 @@ from nerfloom.training.run import Run
 
 @dataclass(frozen=True, repr=False)
 class Loaded:
-    """A renderable and its origin: the result of `nerfloom.load`."""
+    """A renderable and its origin: the result of `nerfloom.load`.
+
+    Cameras of its data stand where `Renderable.refined_poses` puts them, in the frame of the renderable's scene.
+    """
 
     model: Renderable
     """The renderable, on its device: a `nerfloom.Model` in evaluation mode, Gaussians, or an octree."""
@@ -54,7 +58,7 @@ class Loaded:
 
     @property
     def is_run(self) -> bool:
-        """True for a run, False for a file."""
+        """True for a run, False for a file: of Gaussians, an octree, or a scene in blocks."""
         return self.origin != self.checkpoint
 
     @property
@@ -74,7 +78,7 @@ class Loaded:
 
     @property
     def run(self) -> Run:
-        """The run. For a file with data it is a placeholder that holds the data.
+        """The run. For a file with data, and for a scene in blocks, it is a placeholder that holds the data.
 
         Raises:
             ConfigError: for a file without data.
@@ -95,7 +99,20 @@ class Loaded:
         """
         if split not in self._datasets:
             self._datasets[split] = load_split(self.run, split).to(self.model.device)
-        return self._datasets[split]
+        return with_refined_poses(self.model, self._datasets[split])  # which change while it trains
+
+    def parsed(self, split: Split) -> ParsedScene:
+        """Return the images of a split, not decoded, with their cameras.
+
+        Args:
+            split: train, val or test.
+
+        Raises:
+            ConfigError: for a file without data.
+            DataError: if the data cannot be read.
+        """
+        found = self.run.parse(split)
+        return replace(found, cameras=refined_cameras(self.model, found.cameras, split == "train"))
 
     def views(self, split: Split = "test") -> list[View]:
         """Return a view for each image of `split`: train, val or test."""
@@ -115,7 +132,7 @@ class Loaded:
         ending, known, found = Path(name).parts, set[str](), dict[Path, View]()
         for split in get_args(Split):
             try:
-                parsed = self.run.parse(split)
+                parsed = self.parsed(split)
             except DataError:
                 if split == "train":
                     raise
@@ -197,7 +214,7 @@ class Loaded:
         unit: str = "m",
         time: float | None = None,
     ) -> Loaded:
-        """Return this with the scale in which two points have a given distance; `keep_scale` keeps it.
+        """Return this in a scale that gives two points a known distance; `keep_scale` writes the scale to the run.
 
         Args:
             start, end: the points, as in `measure`.
@@ -223,12 +240,12 @@ class Loaded:
         """Write the scale to the run's folder, where whatever loads the run finds it.
 
         Raises:
-            ConfigError: for a file, whose coordinates are in a unit already.
+            ConfigError: for a file, because its coordinates are in a unit already.
             OSError: if it cannot be written.
         """
         if not self.is_run:
             raise ConfigError(
-                f"{self.origin} is not a run, and keeps its coordinates: set the scale of the run that it is from, and "
+                f"{self.origin} is not a run and keeps its coordinates: set the scale of the run that it is from, and "
                 "export or bake that again"
             )
         write_scale(self.folder, self.scale)
@@ -263,7 +280,8 @@ class Loaded:
                 say(f"the errors of lengths are not known: {error}")
                 parsed = None
             self._cameras["train"] = None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
-        return self._cameras["train"]
+        given = self._cameras["train"]
+        return None if given is None else refined_cameras(self.model, given, training=True)
 
     def _view(self, camera: View | Cameras) -> View:
         """Return a view as it is, or that of one camera on the model's device."""

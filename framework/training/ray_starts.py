@@ -48,7 +48,8 @@ def starts_checked(
         The settings and the decisions.
     """
     scene, chosen = dataset.scene, is_open(config.rays_shared_by) and settings.rays_shared_by
-    if not chosen or not scene.unbounded or scene.warped or settings.sampler == "occupancy":
+    nested = settings.sampler == "occupancy" and settings.background_model == "contraction"  # boxes skip by themselves
+    if not chosen or not scene.unbounded or scene.warped or nested:
         return settings, made
     reason = _why_not(dataset, chosen)
     if reason is None:

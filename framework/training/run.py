@@ -27,9 +27,10 @@ from typing import Any
 import yaml
 
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.config import TrainConfig, from_plain, read_yaml, to_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.plain import from_plain, read_yaml, to_plain
 from nerfloom.base.splits import Split
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.cameras.camera_path import read_transforms
@@ -139,7 +140,8 @@ def create_folder(run: Run) -> None:
             f"{run.folder} already holds a run; continue it with 'ns-train --resume {run.folder}', "
             "or choose another --timestamp"
         )
-    paths = {"data": run.config.data, "lpips_weights": run.config.lpips_weights}  # valid from any working folder
+    paths = {name: getattr(run.config, name) for name in ("data", "lpips_weights", "teacher")}
+    # Resolved, they are valid from any working folder.
     resolved: dict[str, Any] = {name: path.resolve() for name, path in paths.items() if path is not None}
     config = dataclasses.replace(run.config, **resolved)
     document = {

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import CheckpointError, ConfigError, DataError, nearest
+from nerfloom.blocks.files import NAME as BLOCKS
 
 CONFIG = "config.yml"
 """Name of the settings in a run's folder."""
@@ -19,9 +20,10 @@ LEVELS = ("*", "*/*", "*/*/*")
 
 
 def config_file(path: Path) -> Path:
-    """Return the path of a run's config.yml. For a folder of runs, choose the newest and print it.
+    """Return the path of a run's config.yml, or of the blocks.yml of a scene in blocks.
 
-    Runs with a checkpoint take precedence, since a later one may have ended before it learnt anything.
+    For a folder of runs, choose the newest and print it. Runs with a checkpoint take precedence, since a later one may
+    have ended before it learnt anything.
 
     Args:
         path: the file itself, the run's folder, or a folder above it, such as ``outputs``.
@@ -33,8 +35,9 @@ def config_file(path: Path) -> Path:
         raise ConfigError(f"cannot read {path}: {os.strerror(errno.ENOENT)}{_nearest_to(path)}")
     if not os.path.isdir(path):
         return path
-    if (path / CONFIG).is_file():
-        return path / CONFIG
+    for name in (CONFIG, BLOCKS):
+        if (path / name).is_file():
+            return path / name
     runs = sorted((file for level in LEVELS for file in path.glob(f"{level}/{CONFIG}")), key=os.path.getmtime)
     if not runs:
         raise ConfigError(f"{path} is not a run's folder: it has no {CONFIG}, and there is no run below it")
@@ -51,7 +54,7 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = None) -> Path:
-    """Return the config.yml of a trained run, or a file of Gaussians, after checking that all paths exist.
+    """Return the config.yml of a trained run, a file of Gaussians or an octree, after checking that all paths exist.
 
     Args:
         path: as for `config_file`, or a file of Gaussians.

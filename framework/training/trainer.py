@@ -14,15 +14,16 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.checked import checked
-from nerfloom.base.config import TrainConfig, to_plain
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import BEFORE_STEP, seed_step
 from nerfloom.base.errors import CheckpointError, DivergenceError
 from nerfloom.base.pace import Pace
+from nerfloom.base.plain import to_plain
 from nerfloom.base.processes import alone, from_first, processes
 from nerfloom.base.signals import stop_signals
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.sources import POINTS_UNTIL, BatchSource, Request, make_source
+from nerfloom.data.sources import POINTS_UNTIL, BatchSource, Request
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.method import Method
 from nerfloom.model import KeepsPace, StartsFromImages
@@ -40,6 +41,7 @@ from nerfloom.training.progress import ProgressBar, Rate, StepReport, TensorBoar
 from nerfloom.training.run import Run
 from nerfloom.training.state import State, agree
 from nerfloom.training.step import StepResult, learn, schedule, train_step
+from nerfloom.training.taught import batch_source
 from nerfloom.training.trained import restore_model
 
 STEPS_PER_LOG = 25
@@ -85,7 +87,7 @@ class Trainer:
         self.model = method.build(self.config, train_set.scene).to(self.device)
         show_images(self.model, train_set, eval_set)
         self.optimizer = make_optimizer(self.model, self.config)
-        self.source = make_source(self.model.batches, train_set, self.config) if source is None else source
+        self.source = batch_source(self.model, train_set, self.config) if source is None else source
         self.state = State()
         self.first_step = 0
         self.steps_per_read = 1 if self.device.type == "cpu" else STEPS_PER_LOG

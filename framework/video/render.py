@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerfloom.base.config import to_plain
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.plain import to_plain
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.error_bound import limited_error, parse_error
 from nerfloom.evaluation.frames import FACTS, Frames, hash_of_file, hash_of_tensors, open_frames, write_file

@@ -132,7 +132,7 @@ def learnt_cameras(parsed: ParsedScene) -> Cameras:
 
 
 def _interpolated(settings: InterpolateSettings, loaded: Loaded) -> Views:
-    cameras = learnt_cameras(loaded.run.parse("train"))
+    cameras = learnt_cameras(loaded.parsed("train"))
     cameras = cameras[shortest_order(cameras, settings.loop)]
     walk = walk_of(cameras, settings.loop)
     for sentence in about(walk, len(cameras)):
@@ -158,7 +158,7 @@ def about(walk: Walk, count: int) -> list[str]:
 
 
 def _one_camera(settings: TimeSettings, loaded: Loaded) -> Views:
-    parsed = loaded.run.parse(settings.split)
+    parsed = loaded.parsed(settings.split)
     if not loaded.model.scene.moving:
         raise ConfigError("ns-render time: the photographs of this run have no times")
     if not 0 <= settings.camera_index < len(parsed.cameras):
@@ -177,7 +177,7 @@ def _circle(settings: OrbitSettings, loaded: Loaded) -> Views:
     if settings.time is not None and not 0 <= settings.time <= 1:
         raise FlagError(f"--time is {settings.time:g}; it must be from 0 to 1")
     has_photographs = loaded.source is not None
-    cameras = learnt_cameras(loaded.run.parse("train")) if has_photographs else around(scene)
+    cameras = learnt_cameras(loaded.parsed("train")) if has_photographs else around(scene)
     # An object's centre is the box's; a capture's is the point that its cameras look at.
     target = looked_at(cameras.camera_to_worlds) if scene.unbounded and has_photographs else None
     middle = scene.box.mean(0).cpu() if target is None else target.float()
@@ -192,7 +192,7 @@ def _circle(settings: OrbitSettings, loaded: Loaded) -> Views:
 
 
 def _spiral(settings: SpiralSettings, loaded: Loaded) -> Views:
-    model, cameras = loaded.model, learnt_cameras(loaded.run.parse("train"))
+    model, cameras = loaded.model, learnt_cameras(loaded.parsed("train"))
     middle = replace_poses(cameras, middle_pose(cameras)[None])
     focus = focus_distance(model, middle.to(model.device), model.background)
     along, radius = fractions(settings.count, ease=settings.ease), in_scene(settings.radius, loaded)

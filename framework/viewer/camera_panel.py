@@ -56,7 +56,7 @@ class CameraPanel:
         size = SIZE * (float((places - places.mean(0)).norm(dim=-1).max()) or 1.0)
         handles = {}
         for index in chosen:
-            pose = self._photographs.pose(index)
+            pose = cameras.camera_to_worlds[index]
             handles[index] = self._client.scene.add_camera_frustum(
                 f"{ROOM}/{index}",
                 fov=self._photographs.fov(index),

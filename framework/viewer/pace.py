@@ -148,7 +148,7 @@ def _bands(speed: Speed, width: int, height: int, stride: int, rays: Rays, secon
 
 @dataclass(frozen=True)
 class Share:
-    """Share of time for pictures beside other work."""
+    """Share of time for pictures while other work runs."""
 
     share: float
     """Fraction of the total time for pictures, 0 to 1."""

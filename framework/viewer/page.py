@@ -11,6 +11,7 @@ import torch
 
 from nerfloom.base.console import say
 from nerfloom.cameras.poses import looked_at
+from nerfloom.renderable import training_poses
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.measure_panel import MeasurePanel
@@ -107,8 +108,8 @@ class Page:
 
     def _place_camera(self) -> None:
         """Place the initial camera at the first training camera, with the same view direction."""
-        scene = self._queue.loaded.model.scene
-        poses = scene.camera_to_worlds
+        model = self._queue.loaded.model
+        scene, poses = model.scene, training_poses(model)
         if poses is None or not len(poses) or scene.warped:
             center, size = scene.box.mean(0), float((scene.box[1] - scene.box[0]).norm())
             position = center + torch.tensor([0.0, -0.6, 0.3]).to(center) * size

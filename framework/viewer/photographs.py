@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from nerfloom.data.image_files import Content, read_image
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.evaluator import spread
+from nerfloom.renderable import Renderable, refined_cameras
 from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose
 
@@ -38,10 +40,11 @@ class Photographs:
 
     Args:
         run: the run, with the folder and the format of its data; None for none.
+        model: function that returns the model that is looked at now, in whose scene the cameras stand.
     """
 
-    def __init__(self, run: Run | None) -> None:
-        self._run = run
+    def __init__(self, run: Run | None, model: Callable[[], Renderable]) -> None:
+        self._run, self._model = run, model
         self._lock = threading.RLock()
         self._whole = lru_cache(maxsize=1)(self._read)
         self._small = lru_cache(maxsize=4 * MAX_SHOWN)(self._thumbnail)
@@ -61,19 +64,24 @@ class Photographs:
             return None
 
     @cached_property
-    def cameras(self) -> Cameras | None:
-        """Cameras for the sizes of the decoded images; None if there are none."""
+    def _given(self) -> Cameras | None:
+        """Cameras as the data say, for the sizes of the decoded images; None if there are none."""
         parsed = self.parsed
         return None if parsed is None else parsed.cameras.scaled(1 / parsed.downscale_factor)
 
     @property
+    def cameras(self) -> Cameras | None:
+        """Cameras in the scene, for the sizes of the decoded images; None if there are none."""
+        return None if self._given is None else refined_cameras(self._model(), self._given, training=True)
+
+    @property
     def ndc(self) -> Ndc | None:
         """Normalised device coordinates of the scene; None if it has none."""
-        return self.cameras.ndc if isinstance(self.cameras, NdcCameras) else None
+        return self._given.ndc if isinstance(self._given, NdcCameras) else None
 
     def chosen(self) -> list[int]:
         """Return the indices of the images whose cameras are shown, at most `MAX_SHOWN`, evenly spaced."""
-        return [] if self.cameras is None else spread(len(self.cameras), MAX_SHOWN)
+        return [] if self._given is None else spread(len(self._given), MAX_SHOWN)
 
     def name(self, index: int) -> str:
         """Return the file name of image `index`."""
@@ -81,15 +89,17 @@ class Photographs:
 
     def pose(self, index: int) -> Tensor:
         """Return the pose (3, 4) of image `index`, camera-to-scene."""
-        assert self.cameras is not None
-        return self.cameras.camera_to_worlds[index]
+        cameras = self.cameras
+        assert cameras is not None
+        return cameras.camera_to_worlds[index]
 
     def fov(self, index: int) -> float:
         """Return the vertical field of view of image `index`, radians; 60 degrees for lenses other than pinhole."""
-        assert self.cameras is not None
-        if self.cameras.model not in ("pinhole", "opencv"):
+        cameras = self._given
+        assert cameras is not None
+        if cameras.model not in ("pinhole", "opencv"):
             return math.radians(60)
-        return 2 * math.atan(0.5 * float(self.cameras.heights[index]) / float(self.cameras.fy[index]))
+        return 2 * math.atan(0.5 * float(cameras.heights[index]) / float(cameras.fy[index]))
 
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return a thumbnail (H, W, 3) uint8 of image `index`, over white; None if the file cannot be read."""
@@ -116,13 +126,13 @@ class Photographs:
         Args:
             pose: camera of a view.
         """
-        if self.cameras is None or self.ndc is not None:
+        cameras = self.cameras
+        if cameras is None or self.ndc is not None:
             return None
-        given = self.cameras.camera_to_worlds.double()
-        here = pose.tensor()
-        distances = (given[:, :, 3] - here[:, 3]).norm(dim=-1)
-        size = float((given[:, :, 3] - given[:, :, 3].mean(0)).norm(dim=-1).max()) or 1.0
-        ahead = (given[:, :, 2] * here[:, 2]).sum(-1)
+        known, here = cameras.camera_to_worlds.double(), pose.tensor()
+        distances = (known[:, :, 3] - here[:, 3]).norm(dim=-1)
+        size = float((known[:, :, 3] - known[:, :, 3].mean(0)).norm(dim=-1).max()) or 1.0
+        ahead = (known[:, :, 2] * here[:, 2]).sum(-1)
         close = (distances <= MAX_SHIFT * size) & (ahead >= math.cos(MAX_ANGLE))
         return int(torch.where(close, distances, torch.inf).argmin()) if bool(close.any()) else None
 
@@ -143,11 +153,11 @@ class Photographs:
         matrix = view.camera.camera_to_worlds[0].double().cpu().flatten().tolist()
         with self._lock:
             index = self.at(Pose(tuple(matrix), 1.0))
-            image = None if index is None else self._whole(index)
-        if index is None or image is None or self.cameras is None:
+            image, cameras = None if index is None else self._whole(index), self.cameras
+        if index is None or image is None or cameras is None:
             return None
         rays = view.camera.pixel_rays(view.pixels().reshape(-1), 0.0, 1.0)
-        columns, rows, seen = self.cameras.project(rays.origins.cpu() + rays.directions.cpu(), index)
+        columns, rows, seen = cameras.project(rays.origins.cpu() + rays.directions.cpu(), index)
         height, width = image.shape[:2]
         seen &= (columns > -0.5) & (rows > -0.5) & (columns < width - 0.5) & (rows < height - 0.5)
         flat = composite(image.float() / 255, background.cpu()).permute(2, 0, 1)[None]

@@ -27,7 +27,7 @@ near an image's border depend on the image's size, so strips of it would differ 
 dB."""
 
 PROBLEMS = NerfloomError, MemoryError, RuntimeError, ValueError
-"""Errors of a picture or a task that the viewer reports, and goes on."""
+"""Errors of a picture or a task that the viewer reports without stopping."""
 
 
 class RenderQueue:

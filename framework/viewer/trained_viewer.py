@@ -20,7 +20,7 @@ SECONDS_PER_LOOK = 2.0
 
 
 def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
-    """Serve a run or a file of Gaussians to browsers until Ctrl-C.
+    """Serve a run, a file of Gaussians or an octree to browsers until Ctrl-C.
 
     Args:
         loaded: the run or file.
@@ -32,7 +32,8 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
         ConfigError: if viser is missing, or the address cannot be used.
         KeyboardInterrupt: on Ctrl-C, after the server has stopped.
     """
-    photographs = Photographs(loaded.source)
+    queue: RenderQueue
+    photographs = Photographs(loaded.source, lambda: queue.loaded.model)
     queue = RenderQueue(loaded, ndc=_ndc(loaded.model.scene.warped, photographs), truth=photographs.truth)
     server = open_server(host, port, "nerfloom")
     page = Page(server, queue, photographs, may_render=follow)

@@ -142,7 +142,7 @@ def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
         ConfigError: if viser is missing, or the address cannot be used.
     """
     config, cameras = trainer.config, trainer.train_set.cameras
-    photographs = Photographs(run)
+    photographs = Photographs(run, lambda: trainer.model)
     ndc = cameras.ndc if isinstance(cameras, NdcCameras) else None
     queue = RenderQueue(in_training(run, trainer), PIECE_SECONDS, PIECE_SECONDS, ndc, photographs.truth)
     turns = Turns(trainer, queue, config.viewer_share)

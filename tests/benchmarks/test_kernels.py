@@ -32,7 +32,7 @@ def test_the_slowest_part_of_work_is_what_it_takes(work: Work, nanoseconds: floa
 
 
 def test_medians_of_stages_and_of_neighbours_ratios() -> None:
-    """The first run of each is a warm-up; a run in which the machine was ten times slower changes nothing."""
+    """The first run of each is a warm-up; a run on a machine that was ten times slower for a moment changes nothing."""
     ours = iter([[99, 99], [1, 2], [10, 20], [1, 3]])
     theirs = iter([[99, 99], [2, 4], [20, 40], [4, 4]])
     times = alternating(lambda: next(ours), lambda: next(theirs), repeats=3)

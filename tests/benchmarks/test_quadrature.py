@@ -91,7 +91,7 @@ def test_evaluations_are_counted(proposals: ProposalSampler) -> None:
 
 @torch.no_grad()
 def test_what_waves_drop_is_counted_too() -> None:
-    """The field is asked for whole waves, of which light may reach the first sample alone."""
+    """The field is evaluated for whole waves, although light may reach their first sample alone."""
     wall = Solids(Medium(Block((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 1e4))
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]]), torch.eye(3)[:1], torch.zeros(1), torch.full((1,), 9.0))
     assert marched(wall, full_grid(512), 1e-4, rays).evaluations == 8

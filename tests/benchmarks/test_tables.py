@@ -98,7 +98,7 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
         ("rows: [{data: {a: b}, methods: {c: kplanes}}]", "has no rows"),
         ("rows: [{data: {a: b}, methods: [kplanes], seconds: [1]}]", "must have names with a text each"),
         ("rows: [{data: {a: b}, methods: {c: kplanez}, seconds: [1]}]", "Did you mean 'kplanes'"),
-        ("rows: [{data: {../a: b}, methods: {c: kplanes}, seconds: [1]}]", "is no name of a row"),
+        ("rows: [{data: {../a: b}, methods: {c: kplanes}, seconds: [1]}]", "is not a name for a row"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1, 1]}]", "two rows are called a-c-1s"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}, second: [1]}]", "unknown key"),
     ],
@@ -212,7 +212,7 @@ def test_means_and_spreads_over_seeds(
 def test_what_is_no_file_of_results_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "table.json"
     file.write_text('{"rows": [')
-    with pytest.raises(ConfigError, match="is no file of results"):
+    with pytest.raises(ConfigError, match="is not a file of results"):
         add_row(file, "ball-ngp-10s", {"results": {"psnr": 30.0}})
     assert file.read_text() == '{"rows": ['
 
@@ -230,7 +230,7 @@ def test_a_row_is_expected_to_take_as_long_as_those_like_it(tmp_path: Path) -> N
 def test_bad_flags_are_refused_in_a_line(tmp_path: Path, refused: Refused) -> None:
     table = ("tables", "--tables", write(tmp_path), "--output-dir", tmp_path / "results")
     assert "no row has such a name" in refused(main, *table, "--only", "castle", status=2)
-    assert "is no regular expression" in refused(main, *table, "--only", "(", status=2)
+    assert "is not a regular expression" in refused(main, *table, "--only", "(", status=2)
     assert "it must be more than 0" in refused(main, *table, "--seconds-scale", 0, status=2)
     assert "cannot read" in refused(main, "tables", "--tables", tmp_path / "none.yml")
 

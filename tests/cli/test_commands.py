@@ -78,7 +78,7 @@ def test_damaged_data_is_one_line_and_debug_shows_more(tiny: Path, tmp_path: Pat
     assert done.returncode == 1
     assert "transforms_train.json is not JSON" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    with pytest.raises(DataError, match="is not JSON"):  # of which Python shows the traceback
+    with pytest.raises(DataError, match="is not JSON"):  # Python shows the traceback
         called("ns-train", *arguments, "--debug")
     assert not (tmp_path / "out").exists()
 

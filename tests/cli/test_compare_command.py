@@ -66,7 +66,7 @@ def test_what_cannot_be_compared(flags: tuple[object, ...], status: int, reason:
     "recipe", sorted((Path(__file__).parents[2] / "configs").glob("compare-*.yml")), ids=lambda path: path.name
 )
 def test_the_standard_comparisons_are_readable(recipe: Path) -> None:
-    from nerfloom.base.config import from_plain, read_yaml
+    from nerfloom.base.plain import from_plain, read_yaml
     from nerfloom.cli.compare import CompareFlags, plan_of
 
     plan = plan_of(from_plain(CompareFlags(), read_yaml(recipe), str(recipe)))

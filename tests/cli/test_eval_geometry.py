@@ -152,8 +152,8 @@ def test_a_reference_that_is_elsewhere_is_an_error(ball: Path, tmp_path: Path, r
     [
         (("--mesh", "a.ply"), 2, "--mesh is compared with a reference"),
         (("--reference-mesh", "a.ply", "--reference-points", "b.ply"), 2, "exclude each other"),
-        (("--reference-mesh", "gone.ply"), 1, "gone.ply is no file"),
-        (("--reference-mesh", "here.txt"), 1, "here.txt is no mesh: its name must end in"),
+        (("--reference-mesh", "gone.ply"), 1, "gone.ply is not a file"),
+        (("--reference-mesh", "here.txt"), 1, "here.txt is not a mesh: its name must end in"),
         (("--reference-mesh", "here.ply"), 1, "cannot read here.ply as a mesh"),
         (("--reference-points", "here.ply"), 1, "here.ply is not a PLY file"),
         (("--reference-points", "here.ply", "--min-views", -1), 2, "--min-views is -1; it must be at least 0"),

@@ -20,7 +20,7 @@ from nerfloom.samplers.choice import SamplingConfig
 from tests.cli.helpers import called
 
 METHODS = (
-    "dnerf", "instant-ngp", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
+    "dnerf", "instant-ngp", "kilo-nerf", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
     "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
 )  # fmt: skip
 FOR_FEW_IMAGES = ("instant-ngp", "kplanes", "nerf-plus-plus", "nerfacto", "tensorf", "vanilla-nerf")
@@ -80,7 +80,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
         *["background options"] * (method in WITH_BACKGROUND), "ray options",
         *["appearance options"] * (method in ("nerf-w", "nerfacto", "neus", "volsdf", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
-        "optimisation options", "evaluation and saving options",
+        "teacher options", "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",
     ]  # fmt: skip
     first = ["--data", "--max-seconds", "--max-num-iterations", "--output-dir", "--experiment-name", "--rays-per-pixel"]
@@ -122,6 +122,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
         "nerfacto": ["--num-levels", "--camera-learning-rate", "--appearance-embedding-dim"],
         "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
         "ray": ["--num-rays-per-batch", "--draw-by-error"],
+        "teacher": ["--teacher", "--teacher-share", "--teacher-until"],
         "optimisation": ["--learning-rate", "--lr-schedule", "--adam-eps"],
         "evaluation and saving": ["--steps-per-save", "--max-eval-images", "--target-psnr", "--load-checkpoint"],
         "machine": ["--machine.seed", "--machine.device-type", "--mixed-precision", "--cache-limit"],

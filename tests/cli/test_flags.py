@@ -14,6 +14,7 @@ from tests.cli.helpers import called
 COMMANDS = {
     "ns-bake": [],
     "ns-bench": ["kernels"],
+    "ns-blocks": [],
     "ns-compare": [],
     "ns-download-data": ["blender"],
     "ns-edit": [],

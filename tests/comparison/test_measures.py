@@ -96,4 +96,4 @@ def test_the_front_against_its_definition() -> None:
     points = [(1.0, 20.0), (2.0, 25.0), (2.0, 24.0), (3.0, 25.0), (4.0, 30.0), (1.0, 20.0), (math.inf, 31.0)]
     assert pareto(points) == [True, True, False, False, True, True, True]
     assert pareto([]) == []
-    assert pareto([(120.04, 33.0), (119.98, 29.0), (118.0, 28.0)]) == [True, False, True]  # a step more is no cost
+    assert pareto([(120.04, 33.0), (119.98, 29.0), (118.0, 28.0)]) == [True, False, True]  # one more step costs nothing

@@ -1,4 +1,4 @@
-"""What is compared, under which conditions, by which commands."""
+"""Plans: contenders, conditions and commands."""
 
 import json
 import math
@@ -160,5 +160,5 @@ def test_surfaces_are_judged_by_the_same_reference(tmp_path: Path) -> None:
     assert list(plan.conditions.geometry) == words
     assert plan.runs()[0].eval_command(plan.conditions)[-len(words) :] == words
     assert plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=60, crop=0.1)).conditions.geometry == ()
-    with pytest.raises(ConfigError, match=r"gone.ply is no file"):
+    with pytest.raises(ConfigError, match=r"gone.ply is not a file"):
         plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=60, reference_points=tmp_path / "gone.ply"))

@@ -16,7 +16,7 @@ from tests.dataparsers.sparse_models import SIZE, Capture, make_capture, misses,
 
 ALL = Nerfstudio(eval_mode="all")
 APPLIED = np.array([[1.0, 0.0, 0.0, 0.3], [0.0, 0.0, 1.0, -0.2], [0.0, -1.0, 0.0, 0.1]])
-"""From the model's axes, of which y points down, to the file's, of which z points up; and a shift."""
+"""From the model's axes, with y down, to the file's, with z up; and a shift."""
 SCALE = 1.7
 INTRINSICS = {"fl_x": 50.0, "fl_y": 48.0, "cx": 31.0, "cy": 19.0}
 

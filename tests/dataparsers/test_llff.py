@@ -1,4 +1,4 @@
-"""The LLFF format: poses_bounds.npy is read as its authors write it, and what is no such file is refused."""
+"""The LLFF format: poses_bounds.npy is read as its authors write it, and other files are refused."""
 
 import io
 from pathlib import Path

@@ -156,7 +156,7 @@ def seen_through(model: str, right: float, down: float, ahead: float) -> tuple[f
         angle = math.atan2(off, ahead)
         bent = angle * (1 + K1 * angle**2 + K2 * angle**4 + K3 * angle**6 + K4 * angle**8)
         return bent * right / off, bent * down / off
-    if model == "EQUIRECTANGULAR":  # of which half the width of a whole panorama is nerfstudio's focal length
+    if model == "EQUIRECTANGULAR":  # nerfstudio's focal length is half the width of a whole panorama
         longitude = math.atan2(right, ahead)
         return longitude / math.pi, math.asin(down / math.hypot(right, down, ahead)) / math.pi
     return right, down
@@ -340,6 +340,19 @@ def test_rounded_matrices_are_rotations(capture: Path, digits: int) -> None:
     rotations = ALL.parse(capture, "train").cameras.camera_to_worlds[:, :, :3].double()
     unit = torch.eye(3, dtype=torch.float64).expand(9, 3, 3)
     torch.testing.assert_close(rotations @ rotations.transpose(1, 2), unit, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("stated", ["none", "up", "pca", "vertical", 3])
+def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None:
+    """Entries of nerfstudio are followed where the flag leaves it to the data, and unknown ones are not."""
+    known = stated if stated in ("none", "up", "pca") else "auto"
+    expected = Nerfstudio(orientation_method=known).parse(capture, "train").transform
+    asked = Nerfstudio(orientation_method="pca").parse(capture, "train").transform
+    assert expected is not None
+    assert asked is not None
+    edit(capture, lambda content: content.update(orientation_override=stated))
+    assert torch.equal(Nerfstudio().parse(capture, "train").transform, expected)  # type: ignore[arg-type]
+    assert torch.equal(Nerfstudio(orientation_method="pca").parse(capture, "train").transform, asked)  # type: ignore[arg-type]
 
 
 def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ COUNT = 12
 
 
 def quaternion(rotation: np.ndarray) -> list[float]:
-    """x, y, z, w of a rotation that is no half turn, from its trace and its antisymmetric part."""
+    """x, y, z, w of a rotation other than a half turn, from its trace and its antisymmetric part."""
     w = math.sqrt(1 + np.trace(rotation)) / 2
     x, y, z = rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
     return [float(part) / (4 * w) for part in (x, y, z)] + [w]

@@ -117,7 +117,7 @@ def test_masks_and_depths_go_with_their_images(folder: Path) -> None:
     assert not data.scene.unbounded
     assert data.depths is not None
     ends = data.cameras.offsets.tolist()
-    for place, index in enumerate((0, 8)):  # stored in the file's unit, of which one is SCALE millimetres
+    for place, index in enumerate((0, 8)):  # stored in the file's unit; one is SCALE millimetres
         expected = (1.0 + index) * SCALE * scene.scale
         assert data.depths[ends[place]].item() == pytest.approx(expected, rel=1e-3)
 

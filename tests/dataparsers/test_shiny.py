@@ -71,7 +71,7 @@ def test_display_colours_are_those_of_the_standard() -> None:
 
 @pytest.mark.medium
 def test_scenes_are_written_and_read_as_shiny_blenders(tmp_path: Path) -> None:
-    """Normals beside images are no views; read back, they are the surface's within 8 bits."""
+    """Normals beside images are not views; read back, they are the surface's within 8 bits."""
     write_shiny(tmp_path / "shiny", size=24, num_train=3, num_test=2)
     assert {path.name for path in (tmp_path / "shiny").iterdir()} == set(SCENES)
     folder = tmp_path / "shiny" / "together"

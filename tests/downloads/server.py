@@ -17,7 +17,7 @@ class Served:
     etag: str | None = None
     """Sent with the file, and compared with If-Range; the content's sum if None."""
     breaks_after: list[int] = field(default_factory=list)
-    """Each answer but the last ones is cut off after so many bytes."""
+    """Numbers of bytes after which the first answers are cut off, one for each."""
     status: list[int] = field(default_factory=list)
     """Statuses of the first answers, in place of the file."""
     headers: dict[str, str] = field(default_factory=dict)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.refinement import PoseRefinement
@@ -70,16 +70,26 @@ class Surface(Ball):
         return 1.5 * (length**2 - RADIUS**2), 3 * points.positions
 
 
-class Refined(Ball):
-    """The same, with refined poses of its training cameras; other cameras are where they are."""
-
-    def __init__(self, count: int) -> None:
-        super().__init__()
-        self.poses = PoseRefinement(count)
-        torch.nn.init.constant_(self.poses.tangents, 0.05)
+class Coated(Ball):
+    """The same, with a coat of its own in each training image."""
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
-        return super().render(self.poses(rays), background)
+        rendered = super().render(rays, background)
+        if rays.camera_indices is None:
+            return rendered
+        return replace(rendered, median_depth=rendered.median_depth - 0.1 * (1 + rays.camera_indices))
+
+
+class Refined(Ball):
+    """The same, whose training cameras stand elsewhere than the data say: all are moved alike."""
+
+    def __init__(self, count: int, shift: Tensor) -> None:
+        super().__init__()
+        self.poses = PoseRefinement(count)
+        self.poses.tangents.data[:, :3] = shift
+
+    def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
+        return self.poses.refined(poses, training)
 
 
 def around(count: int = 40) -> Cameras:
@@ -126,11 +136,37 @@ def test_a_pixel_without_a_ray_has_no_point() -> None:
 
 
 def test_the_camera_of_a_picture_is_no_training_camera() -> None:
-    cameras = around()
-    model = Refined(len(cameras))
+    cameras, model = around(), Coated()
     point = surface_point(model, View.of(cameras, 3), 30.2, 61.7)
     assert float(point.norm()) == pytest.approx(RADIUS, abs=1e-6)
     assert torch.equal(seeing_cameras(model, cameras, point), seeing_cameras(Ball(), cameras, point))
+
+
+def test_lengths_are_measured_where_the_refined_cameras_stand() -> None:
+    """The data have all cameras moved by the same way; with refined poses, pixels, points and errors are the ball's."""
+    true, shift = around(), torch.tensor([0.3, -0.2, 0.4])
+    wrong = true.camera_to_worlds.clone()
+    wrong[:, :, 3] -= shift
+    given = replace(true, camera_to_worlds=wrong)
+    files = tuple(Path(f"{index}.png") for index in range(len(true)))
+
+    def parse(split: str) -> ParsedScene:
+        if split != "train":
+            raise DataError("no such images")
+        return ParsedScene(files, given, SCENE.box, SCENE.near, SCENE.far)
+
+    source: Any = SimpleNamespace(parse=parse)
+    model = Refined(len(true), shift)
+    moved = Loaded(model, Placement.of(None, 1.0), "ball", Path("run"), Path("run/step"), source=source)
+    ends = [moved.pick(moved.photograph(f"{index}.png"), 49.5, 49.5) for index in (3, 7)]
+    for index, end in zip((3, 7), ends, strict=True):
+        expected = RADIUS * torch.nn.functional.normalize(true.camera_to_worlds[index, :, 3], dim=0)
+        torch.testing.assert_close(end.float(), expected, atol=1e-3, rtol=0)
+    found = moved.measure(*ends)
+    exact = measured(Ball(), true, (ends[0], ends[1]), 1.0, Scale())
+    assert found.value == pytest.approx(exact.value)
+    assert found.error == pytest.approx(exact.error, rel=1e-4)
+    torch.testing.assert_close(moved.parsed("train").cameras.camera_to_worlds, true.camera_to_worlds)
 
 
 def test_the_cameras_that_see_a_point() -> None:

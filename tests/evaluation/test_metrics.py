@@ -153,7 +153,7 @@ def test_at_five_scales_windows_with_ignored_pixels_do_not_count() -> None:
     assert ms_ssim(image.float(), target.float(), kept) == pytest.approx(expected, abs=2e-6)
     image[~kept] = target[~kept]
     assert ms_ssim(image, target, kept) == pytest.approx(expected, abs=1e-12)
-    assert abs(five_scales(image.numpy(), target.numpy()) - expected) > 0.005  # what is ignored is no better
+    assert abs(five_scales(image.numpy(), target.numpy()) - expected) > 0.005  # ignored pixels are not better
 
 
 def test_without_a_window_of_kept_pixels_there_is_no_similarity() -> None:

@@ -87,7 +87,7 @@ def test_what_cannot_be_used_is_counted(tmp_path: Path, capsys: pytest.CaptureFi
     write_columns(tmp_path / "it.ply", list(zip("xyz", points.T, strict=True)), faces)
     assert len(read_mesh(tmp_path / "it.ply").corners) == 1
     said = capsys.readouterr().err
-    assert "left out are 1 points with coordinates that are not finite, 1 faces without a finite area" in said
+    assert "left out: 1 points with coordinates that are not finite, 1 faces without a finite area" in said
     assert len(read_points(tmp_path / "it.ply").points) == 3
 
 

@@ -137,7 +137,7 @@ def test_a_run_and_its_octree(shared_tiny: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert read_octree(file).leaves.colors.shape[1] == 12
     other = replace(run, model=replace_scene(run.model))
-    with pytest.raises(ConfigError, match="outside of its box"):
+    with pytest.raises(ConfigError, match="beyond its box"):
         bake(other, Baking())
 
 

@@ -2,8 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ from nerfloom.dataparsers.colmap import Colmap, read_images
 from nerfloom.dataparsers.colmap_model import read_model
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.dataparsers.reading import read_pose
-from nerfloom.export.cameras import PosedFiles, all_cameras, orthonormal, posed_files
+from nerfloom.export.cameras import PosedFiles, orthonormal, posed_files
 from nerfloom.export.colmap_text import images_folder, quaternion, write_model
 from nerfloom.export.transforms import transforms, write_transforms
 from tests.cli.helpers import train
@@ -31,9 +29,7 @@ SPLITS = ("train", "val", "test")
 def exported(parser: DataParser, data: Path) -> tuple[PosedFiles, dict[str, ParsedScene]]:
     """What a run on some data exports, as far as it depends on the data."""
     scenes = {split: parser.parse(data, split) for split in SPLITS}
-    first = scenes["train"]
-    cameras = all_cameras(scenes, first.cameras, first.cameras)
-    return posed_files(scenes, cameras, first.placement), scenes
+    return posed_files(scenes, scenes["train"].placement), scenes
 
 
 def given_poses(file: Path) -> dict[str, Tensor]:
@@ -181,23 +177,3 @@ def test_rounded_rotations_become_orthonormal_again() -> None:
     eye = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
     torch.testing.assert_close(found @ found.transpose(1, 2), eye, atol=1e-13, rtol=0)
     assert float((found - turn).abs().max()) < 1e-7
-
-
-def test_held_out_cameras_follow_the_refined_ones() -> None:
-    """All training cameras are moved by one similarity: then so are the others."""
-    turn = torch.from_numpy(Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix())
-    poses = torch.cat(
-        [torch.from_numpy(Rotation.random(9, random_state=2).as_matrix()), torch.randn(9, 3, 1).double()], -1
-    )
-
-    def moved(pose: Tensor) -> Tensor:
-        return torch.cat([turn @ pose[:, :, :3], (1.1 * turn @ pose[:, :, 3:]) + 0.2], -1)
-
-    def of(pose: Tensor) -> Cameras:
-        ones = torch.ones(len(pose))
-        return Cameras(pose.float(), ones, ones, ones, ones, ones.long(), ones.long())
-
-    scenes: Any = {"train": SimpleNamespace(cameras=of(poses[:6])), "val": SimpleNamespace(cameras=of(poses[6:]))}
-    found = all_cameras(scenes, of(poses[:6]), of(moved(poses[:6])))
-    torch.testing.assert_close(found["train"].camera_to_worlds.double(), moved(poses[:6]), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(found["val"].camera_to_worlds.double(), moved(poses[6:]), atol=1e-5, rtol=1e-5)

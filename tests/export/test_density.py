@@ -25,7 +25,7 @@ EYES = Cameras(torch.eye(4)[None, :3] + 5, *[numbers] * 4, *[numbers.long()] * 2
 
 
 class Matter(nn.Module):
-    """A model of which no more is known than its density."""
+    """A model that only has a density."""
 
     device = torch.device("cpu")
     rendering = staticmethod(nullcontext)
@@ -97,7 +97,7 @@ def test_blocks_are_those_that_overlap_an_occupied_cell() -> None:
 
 
 def test_cells_that_end_with_a_block_are_closed() -> None:
-    """Random cells of one density, whose surface is in blocks beside them too."""
+    """Random cells of one density; their surface is in neighbouring blocks too."""
     torch.manual_seed(0)
     grid = grid_of(lambda centers: (torch.rand(len(centers)) < 0.02) & (centers.abs() < 0.9).all(-1))
     for resolution in (64, 128):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from nerfloom.cameras.poses import Placement
 from nerfloom.export.colors import spread_colors
 from nerfloom.export.mesh import (
     Mesh,
@@ -17,6 +18,7 @@ from nerfloom.export.mesh import (
     vertex_normals,
 )
 from nerfloom.export.mesh_files import write_mesh
+from nerfloom.export.run_mesh import _write
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -122,6 +124,18 @@ def test_files_are_read_back(kind: str, tmp_path: Path) -> None:
         tmp_path / f"ball.{kind}"
     ).read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"ball.{kind}"]
+
+
+@pytest.mark.parametrize(("kind", "center"), [("ply", (2, 0, 0)), ("obj", (2, 0, 0)), ("glb", (0, 2, 0))])
+def test_ns_export_turns_up_to_y_in_glb_files(kind: str, center: tuple[int, int, int], tmp_path: Path) -> None:
+    """A ball above the middle of the scene, whose input has x up and twice the size."""
+    up_is_x = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    mesh = sphere(0.5, (0, 0, 1))
+    mesh = Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh))
+    _write(mesh, Placement(up_is_x, 0.5), tmp_path / f"ball.{kind}", 0.0)
+    read = trimesh.load(tmp_path / f"ball.{kind}", process=False, force="mesh")
+    np.testing.assert_allclose(np.mean(read.vertices, 0), center, atol=1e-5)
+    assert read.volume == pytest.approx(4 / 3 * math.pi, rel=0.02)  # not turned inside out
 
 
 def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

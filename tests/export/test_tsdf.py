@@ -22,7 +22,7 @@ RADIUS = 0.6
 
 
 class Ball:
-    """A model of which no more is known than pictures: a ball coloured by position, before nothing."""
+    """A model that only renders pictures: a ball coloured by position, in empty space."""
 
     scene = SimpleNamespace(far=100.0)
 

@@ -1,6 +1,6 @@
 """Many faults, one after the other: python -m tests.faults --count 100 --output faults.json
 
-Ends with how many of which kind there were, and what became of the runs; with status 1 where anything was lost, or a
+Ends with the number of faults of each kind, and what became of the runs; with status 1 where anything was lost, or a
 run did not end as one that nothing happened to.
 """
 

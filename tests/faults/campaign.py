@@ -169,7 +169,7 @@ FAULTS: dict[str, Fault] = {
     "dying reader": dying_reader,
 }
 TAKES_ONE = "damaged checkpoint"
-"""The only fault by which a checkpoint goes: the newest."""
+"""The only fault that removes a checkpoint: the newest."""
 DECK = (*FAULTS, "SIGKILL", "SIGKILL", "SIGTERM")
 """What happens to a run, in an order of its own."""
 
@@ -207,7 +207,7 @@ class Report:
 
 
 def run(base: Path, count: int, seed: int = 0, faults: Mapping[str, Fault] = FAULTS) -> Report:
-    """Inject so many faults, one after the other; fewer where runs give no occasion, or break.
+    """Inject a number of faults, one after the other; fewer where runs give no occasion, or break.
 
     Args:
         base: a folder for all that is written.

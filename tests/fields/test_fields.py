@@ -7,6 +7,7 @@ from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.base import Field
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField
+from nerfloom.fields.network_grid import NetworkGrid
 from nerfloom.geometry.points import Points
 
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
@@ -16,10 +17,12 @@ def make(kind: str) -> Field:
     torch.manual_seed(0)
     if kind == "nerf":
         return NeRFField()
+    if kind == "networks":
+        return NetworkGrid(BOX, 2)
     return EncodedField(BOX, HashGrid(num_levels=4, max_resolution=64, log2_table_size=12))
 
 
-@pytest.mark.parametrize("kind", ["nerf", "hash"])
+@pytest.mark.parametrize("kind", ["nerf", "hash", "networks"])
 @pytest.mark.parametrize("count", [0, 1, 50])
 @pytest.mark.parametrize("half", [True, False])
 def test_shapes_types_and_gradients(kind: str, count: int, half: bool) -> None:

@@ -77,7 +77,7 @@ ARRAY = (
 
 
 def entry(random: Random, content: bytes) -> bytes:
-    """An archive of arrays, one of which is damaged, or another's."""
+    """An archive of arrays; one is damaged, or is another's."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = {name: archive.read(name) for name in archive.namelist()}

@@ -29,7 +29,7 @@ def run(
     patience: float = 20.0,
     memory: int = 2**31,
 ) -> list[Outcome]:
-    """Read so many inputs for each reader, or for so many seconds in all.
+    """Read a number of inputs for each reader, or for a number of seconds in all.
 
     Args:
         readers: names in `READERS` of the module.

@@ -1,4 +1,4 @@
-"""Inputs that nobody should have to read, each of which its seed makes again.
+"""Inputs that no reader should have to accept; a seed reproduces each of them.
 
 What is done to a file depends on what it is: bytes are flipped under a checksum that fits again, counts and sizes are
 what types hold at most, values are of other kinds, names lead elsewhere.
@@ -25,6 +25,7 @@ KINDS: dict[str, Sequence[Mutation]] = {
     "ply": (*TEXT, *RAW),
     "npy": ARRAY,
     "npz": ARCHIVE,
+    "sog": ARCHIVE,
     "png": PICTURE,
     "jpg": PICTURE,
 }
@@ -39,7 +40,7 @@ LARGEST = 2**25
 
 
 def damaged(seed: str, files: Files, targets: Sequence[str], words: Sequence[str]) -> tuple[Files, list[str]]:
-    """A folder's files with something wrong, and what was done to which.
+    """A folder's files with something wrong, and what was done to each.
 
     Args:
         targets: patterns of the names of files that may be damaged.

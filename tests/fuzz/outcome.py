@@ -16,7 +16,7 @@ class Outcome:
     """The type of what was raised."""
     message: str = ""
     damage: tuple[str, ...] = ()
-    """What had been done to which file."""
+    """What had been done to each file."""
     trace: str = ""
     """Where an escape came from."""
 

@@ -16,7 +16,9 @@ import numpy as np
 import torch
 
 from nerfloom import DataParser, Dataset
-from nerfloom.base.config import from_plain, read_yaml
+from nerfloom.base.plain import from_plain, read_yaml
+from nerfloom.blocks.block import TrainedBlock
+from nerfloom.blocks.files import BlockList, read_blocks, write_blocks
 from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale, write_scale
@@ -51,10 +53,14 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.geometry.regions import read_region
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.octrees.files import read_octree, write_octree
-from nerfloom.processing import polycam, record3d
+from nerfloom.processing import bundler, metashape, opensfm, polycam, realitycapture, record3d
+from nerfloom.processing.capture import Capture
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
-from nerfloom.splats.files import SUFFIXES, read_gaussians, write_gaussians
+from nerfloom.processing.named_images import placed_images
+from nerfloom.processing.posed_folder import write_capture as write_placed
+from nerfloom.processing.views import Views
+from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import MAX_BLUR, MIN_BLUR, Look
 from nerfloom.training.checkpoint import FOLDER, load_checkpoint, load_newest
@@ -76,7 +82,8 @@ from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
 from tests.octrees.balls import ball
-from tests.splats.foreign_files import write_compressed, write_splat
+from tests.processing.programs import write_bundler, write_metashape, write_odm, write_realitycapture
+from tests.splats.foreign_files import write_compressed, write_ksplat, write_splat
 from tests.training.helpers import tiny_run
 
 MEMORY = 20e6
@@ -196,14 +203,19 @@ def write_splats(folder: Path) -> None:
     random = torch.Generator().manual_seed(0)
     shapes = ((6, 3), (6, 3), (6, 4), (6,), (6, 3), (6, 3, 8))
     gaussians = Gaussians(*(torch.randn(shape, generator=random) for shape in shapes))
-    for suffix in SUFFIXES:
-        write_gaussians(folder / f"splat{suffix}", gaussians, look=Look(True, 0.1))
+    (folder / "sog").mkdir()
+    for name in ("splat.ply", "splat.spz", "splat.sog", "sog/meta.json"):
+        write_gaussians(folder / name, gaussians, look=Look(True, 0.1))
+    write_gaussians(folder / "splat3.spz", gaussians, look=Look(True, 0.1), spz_version=3)
+    write_gaussians(folder / "splat4.spz", gaussians, look=Look(True, 0.1), spz_version=4)
     write_splat(folder / "splat.splat", gaussians)
     write_compressed(folder / "splat.compressed.ply", gaussians)
+    for level in range(3):
+        write_ksplat(folder / f"splat{level}.ksplat", gaussians, level)
 
 
 def read_splats(folder: Path, scratch: Path) -> None:
-    for file in sorted(folder.glob("splat*")):
+    for file in [*sorted(folder.glob("splat*")), folder / "sog" / "meta.json"]:
         gaussians, look = read_gaussians(file)
         require(MIN_BLUR <= look.blur <= MAX_BLUR, "Gaussians that are drawn as none can be")
         require(len(gaussians), "no Gaussians")
@@ -311,6 +323,40 @@ def convert_record3d(folder: Path, scratch: Path) -> None:
     parse(Nerfstudio(), scratch / "data", scratch)
 
 
+# -- other programs -----------------------------------------------------------------------------------------------
+
+
+def convert(read: Callable[[Path], Capture], images: str, folder: Path, scratch: Path) -> None:
+    """Write and parse the data folder of a capture that another program placed."""
+    capture = read(folder)
+    placed = placed_images(folder / images, capture)
+    require(capture.total >= len(placed.cameras), "more images than cameras")
+    (scratch / "data").mkdir()
+    write_placed(folder / images, capture, placed, scratch / "data", 0, Views(4, 90.0))
+    parse(Nerfstudio(), scratch / "data", scratch)
+
+
+def read_metashape(folder: Path) -> Capture:
+    return metashape.read_capture(folder / "cameras.xml")
+
+
+def read_realitycapture(folder: Path) -> Capture:
+    return realitycapture.read_capture(folder / "cameras.csv")
+
+
+def read_odm(folder: Path) -> Capture:
+    return opensfm.read_capture(opensfm.find_reconstruction(folder))
+
+
+def read_bundler(folder: Path) -> Capture:
+    return bundler.read_capture(folder / "bundle.out", folder / "list.txt")
+
+
+OPENSFM = (
+    "projection_type", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots", "coordinates",
+)  # fmt: skip
+
+
 # -- runs ---------------------------------------------------------------------------------------------------------
 
 
@@ -357,6 +403,23 @@ def read_recipe(folder: Path, scratch: Path) -> None:
     """Of a comparison."""
     plan = plan_of(from_plain(CompareFlags(), read_yaml(folder / "recipe.yml"), "recipe.yml"))
     require(plan.contenders and plan.conditions.budget(), "a comparison of nothing")
+
+
+def write_two_blocks(folder: Path) -> None:
+    runs = [folder / "runs" / str(number) for number in (0, 1)]
+    for run in runs:
+        run.mkdir(parents=True)
+        (run / "config.yml").write_text("method: instant-ngp\n")
+    blocks = [TrainedBlock((0.5, 1.0, 2.0), 3.0 + number, (0, 1, 2), run) for number, run in enumerate(runs)]
+    write_blocks(folder / "blocks.yml", BlockList(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 0.05, 1e3, tuple(blocks)))
+
+
+def read_scene_in_blocks(folder: Path, scratch: Path) -> None:
+    found = read_blocks(folder / "blocks.yml")
+    require(0 <= found.near < found.far and found.blocks, "a scene of nothing")
+    for block in found.blocks:
+        require(block.radius > 0 and all(map(math.isfinite, block.center)), "a block without a place")
+        require(all(len(row) == 4 and all(map(math.isfinite, row)) for row in block.color), "colours of nothing")
 
 
 def read_checkpoints(folder: Path, scratch: Path) -> None:
@@ -491,7 +554,12 @@ READERS: dict[str, Reader] = {
     "phototourism": Reader(write_phototourism, partial(parse, Phototourism()), ("gate.tsv",)),
     "ply": Reader(write_ply, read_ply, ("*.ply",)),
     "surfaces": Reader(write_surfaces, read_surfaces, ("mesh.*",)),
-    "splats": Reader(write_splats, read_splats, ("splat.*",)),
+    "splats": Reader(
+        write_splats,
+        read_splats,
+        ("splat*", "sog/*"),
+        ("version", "count", "mins", "codebook", "files", "bands", "model"),
+    ),
     "octree": Reader(write_octrees, read_octrees, ("*.octree",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),
     "scale": Reader(
@@ -508,9 +576,18 @@ READERS: dict[str, Reader] = {
     "record3d-raw": Reader(
         write_record3d_whole, convert_record3d, ("EXR_RGBD/metadata.json",), ("perFrameIntrinsicCoeffs", "K", "w")
     ),
+    "metashape": Reader(write_metashape, partial(convert, read_metashape, "photographs"), ("cameras.xml",)),
+    "realitycapture": Reader(
+        write_realitycapture, partial(convert, read_realitycapture, "photographs"), ("cameras.csv",)
+    ),
+    "odm": Reader(write_odm, partial(convert, read_odm, "images"), ("opensfm/reconstruction.json",), OPENSFM),
+    "bundler": Reader(write_bundler, partial(convert, read_bundler, "photographs"), ("bundle.out", "list.txt")),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
     "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius")),
+    "blocks": Reader(
+        write_two_blocks, read_scene_in_blocks, ("blocks.yml",), ("version", "box", "run", "center", "cameras", "color")
+    ),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),

@@ -70,7 +70,8 @@ class Watch:
 
 
 def limit_memory(more: int) -> None:
-    """Let this process take no more than so many further bytes of address space, where the system tells what it has."""
+    """Limit the further address space of this process to a number of bytes, where the system reports its present
+    size."""
     import resource
 
     try:
@@ -82,7 +83,7 @@ def limit_memory(more: int) -> None:
 
 
 def limit_files(size: int) -> None:
-    """Let no file grow beyond so many bytes, and none be left by a crash."""
+    """Limit the size of files to a number of bytes, and let a crash leave no file."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))

@@ -22,7 +22,8 @@ READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",
     "phototourism", "ply", "surfaces", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths",
     "photographs", "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
-    "lpips-weights", "depths-exr", "normals", "dtu", "sdfstudio", "octree", "scale",
+    "lpips-weights", "depths-exr", "normals", "dtu", "sdfstudio", "octree", "scale", "edits", "blocks", "metashape",
+    "realitycapture", "odm", "bundler",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""
 ASKED = [

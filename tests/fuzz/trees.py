@@ -43,7 +43,7 @@ def at(tree: Any, where: Where) -> Any:
 
 
 def changed(tree: Any, where: Where, change: Callable[[Any], Any]) -> Any:
-    """A copy of a tree in which one value is another."""
+    """A copy of a tree with one value replaced."""
     if not where:
         return change(copy.deepcopy(tree))
     copied = dict(tree) if isinstance(tree, dict) else list(tree)

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.errors import CheckpointError, ConfigError, DataError
+from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.integrations.nerfbaselines import (

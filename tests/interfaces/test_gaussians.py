@@ -56,7 +56,7 @@ def test_velocities_are_those_of_the_ball_and_make_pictures_sharper() -> None:
 
 def test_all_columns_go_through_growth_moves_and_checkpoints() -> None:
     """Each row keeps its values of all columns together, whatever becomes of the others."""
-    for strategy in ("adc", "mcmc"):
+    for strategy in ("adc", "mcmc", "relocation"):
         found = learner("drift", strategy=strategy, steps_per_reset=10**6)
         model: GaussianModel[Any] = found.model  # type: ignore[assignment]
         count = 400

@@ -75,7 +75,8 @@ def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> Non
 @needs_kernels
 @pytest.mark.parametrize("features", [1, 2, 4, 16, 48])
 def test_compiled_equals_reference_far_into_a_run(features: int) -> None:
-    """Counts beyond the table of corrections, a size that is no multiple of a vector, tiny gradients, signed zeros."""
+    """Counts beyond the table of corrections, a size that is not a multiple of a vector, tiny gradients, signed
+    zeros."""
     mine, theirs = tables(1003, features), tables(1003, features)
     for state in (mine, theirs):
         state[3][:500] = 5000

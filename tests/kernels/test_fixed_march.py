@@ -58,7 +58,7 @@ def truth(rays: Rays, grid: Occupancy, shift: Tensor | None) -> list[list[tuple[
 
 
 def moving(grid: Occupancy, rays: Rays) -> tuple[Rays, Occupancy]:
-    """Two slices of time, of which the second is the first's opposite."""
+    """Two slices of time; the second is the opposite of the first."""
     times = torch.linspace(0, 1, len(rays))
     return replace(rays, times=times), replace(grid, occupied=torch.cat([grid.occupied, ~grid.occupied]), slices=2)
 

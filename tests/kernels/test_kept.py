@@ -173,7 +173,7 @@ OURS: dict[str, Callable[[], nn.Module]] = {
     "deformed hash grid": lambda: moving(EncodedField(BOX, grid())),
     "layers between": LayersBetween,
 }
-"""Fields, of which nothing that is compiled may be evaluated twice."""
+"""Fields; none of their compiled operations may be evaluated twice."""
 UNUSUAL: dict[str, Callable[[], nn.Module]] = {
     "two heads": TwoHeads,
     "skipped on replay": SkippedOnReplay,

@@ -168,7 +168,7 @@ def test_cone_steps_are_even_and_then_geometric() -> None:
 
 @pytest.mark.parametrize("kind", [CompiledMarch, ReferenceMarch])
 def test_each_ray_marches_through_the_slice_of_its_time(kind) -> None:
-    """As rays do, slice by slice, through a grid that has this slice alone; 5^3 cells are no whole number of bytes."""
+    """As rays do, slice by slice, through a grid that has this slice alone; 5^3 cells do not fill whole bytes."""
     if kind is CompiledMarch and not native.available():
         pytest.skip("the compiled kernels are not installed")
     slices, resolution = 3, 5

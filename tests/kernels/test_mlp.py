@@ -154,7 +154,7 @@ def test_biases_and_activations(activation: Activation, bfloat16: bool) -> None:
 @pytest.mark.parametrize("asked", ["density", "outputs", "both"])
 @pytest.mark.parametrize(("parts", "layers"), [((32,), (64, 16)), ((5, 3), (1,)), ((40,), (30, 17))])
 def test_density_and_outputs_against_the_reference(parts, layers, asked: str) -> None:
-    """Of log-densities from -30 to 40, which are clipped at 15, in batches that are no whole blocks."""
+    """Of log-densities from -30 to 40, which are clipped at 15, in batches that are not whole blocks."""
     inputs, weights = network(parts, layers, 333)
     weights[-1][0] *= 8
     of_density, of_outputs = torch.randn(333) * 1e-3, torch.randn(333, layers[-1])

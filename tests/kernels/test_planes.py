@@ -16,7 +16,7 @@ LAYOUTS = {"k-planes": STILL, "k-planes with time": MOVING, "vm": VM, "cp": CP}
 
 
 def inputs(layout: PlanesLayout, features: int, count: int = 301) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions, of which some lie on edges and outside, and a table away from zero."""
+    """Positions, some on edges and some outside, and a table away from zero."""
     generator = torch.Generator().manual_seed(0)
     positions = torch.rand(count, layout.dims, generator=generator) * 1.2 - 0.1
     positions[: min(count, 4)] = torch.tensor([0.0, 1.0, 0.5, 1.0])[: min(count, 4), None]

@@ -25,7 +25,7 @@ def logit(opacity: float) -> float:
 
 
 def straight(width: int, height: int, **settings: float | bool) -> SplatCamera:
-    """Return a camera at the origin, for which a pixel at depth 1 is 1 / FOCAL wide, its axis at the image's corner."""
+    """Return a camera at the origin with its axis at the image's corner; a pixel at depth 1 is 1 / FOCAL wide."""
     return SplatCamera(torch.eye(3, 4), (FOCAL, FOCAL, 0.0, 0.0), width, height, **settings)
 
 

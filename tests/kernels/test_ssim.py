@@ -24,7 +24,7 @@ from tests.kernels.compiled import needs_kernels, relative_error
 
 SIZES = [(11, 11, 1), (11, 11, 3), (11, 64, 3), (90, 11, 4), (12, 27, 1), (23, 16, 3), (70, 53, 3), (41, 37, 4)]
 TALL = (131, 45, 3)
-"""Several bands on two threads, the last of which is short."""
+"""Several bands on two threads; the last band is short."""
 
 
 def smooth(height: int, width: int, channels: int) -> Tensor:
@@ -90,7 +90,7 @@ def test_value_and_gradient_of_random_sizes(threads: Callable[[int], None]) -> N
 @pytest.mark.parametrize("amount", [0.3, 0.03, 3e-3, 3e-4])
 @pytest.mark.parametrize("flat", [None, 0.0, 0.5, 1.0])
 def test_little_is_lost_near_flat_parts_and_near_the_target(amount: float, flat: float | None) -> None:
-    """Variances are differences, of which little would be left there."""
+    """Variances are differences, and little of them would be left there."""
     torch.manual_seed(0)
     target = smooth(80, 75, 3) if flat is None else torch.full((80, 75, 3), flat)
     error, of_gradient = compared(noisy(target, amount), target)

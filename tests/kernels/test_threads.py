@@ -118,7 +118,7 @@ def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -
 def test_memory_that_is_not_there_is_an_error_and_not_the_end_of_the_process() -> None:
     refresh = native.Function("refresh_occupancy", "pqffffpi")
     with pytest.raises(MemoryError, match="refresh_occupancy: there is not enough memory"):
-        refresh(None, 2**62, 1.0, 0.1, 0.01, 0.0, None, 2)  # sums of so many cells are more than can be addressed
+        refresh(None, 2**62, 1.0, 0.1, 0.01, 0.0, None, 2)  # sums of this many cells cannot be addressed
 
 
 def test_what_no_kernel_can_do_is_refused_by_name() -> None:

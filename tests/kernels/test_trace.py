@@ -62,7 +62,7 @@ def rounding(field: EncodedField, lines: Rays, samples: Samples) -> Tensor:
     Traces and waves round positions differently, in the last bit of float32: one multiplies and adds in C++, which
     rounds once or twice as the compiler likes, the other in torch. So an input or an activation that stands near the
     middle between two numbers of bfloat16 can become either, and these are up to 2^-7 of it apart. The bound is that
-    all of them do, and all add up. Most values are no such case and agree far better.
+    all of them do, and all add up. Most values are not such a case and agree far better.
     """
     with torch.no_grad():
         first, second = field.density_head.parameters()

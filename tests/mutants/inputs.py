@@ -394,6 +394,27 @@ MUTANTS = {
             "Record3D's cameras are turned the other way",
             "processing/test_process_command.py::test_record3d_keeps_the_phones_poses"),
     ],
+    "nerfloom.processing.metashape": [
+        Mutant("metashape-scale-of-positions", "_pose", "A + world.scale * B", "A + B",
+            "positions of a scaled chunk stay in its own unit",
+            "processing/test_programs.py::test_lenses_of_metashape"),
+    ],
+    "nerfloom.processing.metashape_lens": [
+        Mutant("metashape-tangential-exchanged", "lens_of", "{'p1': given['p2'], 'p2': given['p1']}",
+            "{'p1': given['p1'], 'p2': given['p2']}",
+            "tangential coefficients of Metashape are taken for OpenCV's",
+            "processing/test_programs.py::test_lenses_of_metashape"),
+    ],
+    "nerfloom.processing.realitycapture": [
+        Mutant("realitycapture-heading-turned", "rotation_of", "(-heading, pitch, roll)", "(heading, pitch, roll)",
+            "cameras of RealityCapture look west where they should look east",
+            "processing/test_programs.py::test_heading_pitch_and_roll_have_their_meaning"),
+    ],
+    "nerfloom.processing.views": [
+        Mutant("views-turned-to-the-left", "turned", "math.radians(right)", "math.radians(-right)",
+            "views of a panorama have the poses of those on the other side",
+            "processing/test_views.py::test_views_look_where_they_should"),
+    ],
     "nerfloom.processing.transforms": [
         Mutant("written-lens-exchanged", "", "('fl_x', 'fl_y', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')",
             "('fl_x', 'fl_y', 'cx', 'cy', 'k1', 'p1', 'k2', 'p2')",

@@ -9,11 +9,6 @@ MUTANTS = {
             "normals are in another frame than their points",
             "truth/test_export.py::test_exported_points_normals_and_colours_are_in_the_captures_frame"),
     ],
-    "nerfloom.export.run_cameras": [
-        Mutant("exported-poses-unrefined", "export_cameras", "refined_cameras(loaded.model, A)", "A",
-            "ns-export cameras writes the poses that came in",
-            "truth/test_export.py::test_refined_cameras_are_exported_where_they_are_believed_to_be"),
-    ],
     "nerfloom.video.render": [
         Mutant("frames-of-other-cameras", "_facts", "hash_of_tensors(*A, B)", '""',
             "a render of another camera path goes on with frames of the one that was stopped",
@@ -34,6 +29,21 @@ MUTANTS = {
         Mutant("fov-across", "perspective", "height / 2 / A", "width / 2 / A",
             "wide videos show less above and below than --fov says",
             "test_framing.py::test_a_perspective_shows_its_field_of_view_in_the_height_and_more_in_a_wide_image"),
+    ],
+    "nerfloom.blocks.blend": [
+        Mutant("blocks-end-suddenly", "near_shares", "1 / A - 1 / B", "1 / A",
+            "a block appears and leaves suddenly where a flight passes its radius",
+            "blocks/test_blend.py::test_shares_in_closed_form"),
+    ],
+    "nerfloom.blocks.composed": [
+        Mutant("depth-in-units-of-a-block", "Blocks.picture_of", "A / scale, B / scale", "A, B",
+            "depths of composed pictures are in the units of whichever block they are from",
+            "blocks/test_composed.py::test_two_blocks_of_one_colour_each_are_blended_exactly"),
+    ],
+    "nerfloom.blocks.merge": [
+        Mutant("doubled-borders", "merged", "part[in_cell(A, B, C)]", "part",
+            "what two blocks have learned is drawn twice",
+            "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
@@ -108,7 +118,7 @@ MUTANTS = {
     ],
     "nerfloom.evaluation.measuring": [
         Mutant("picked-by-a-training-camera", "_first_surfaces", "replace(A, camera_indices=None)", "A",
-            "with refined poses, points at pixels are moved as the first training camera was",
+            "points at pixels are those of the first training image's own appearance",
             "evaluation/test_measuring.py::test_the_camera_of_a_picture_is_no_training_camera"),
     ],
     "nerfloom.evaluation.metrics": [
@@ -275,6 +285,12 @@ MUTANTS = {
         Mutant("error-of-stored-photographs", "Loaded._photographs", "A.scaled(B)", "A",
             "after training on reduced images, errors of lengths are too small by that factor",
             "evaluation/test_measuring.py::test_half_a_pixel_is_one_of_the_images_that_were_learnt_from"),
+        Mutant("exported-poses-unrefined", "Loaded.dataset", "with_refined_poses(self.model, A)", "A",
+            "ns-export cameras writes the poses that came in, and points are off the surfaces",
+            "truth/test_refined_poses.py::test_exported_cameras_stand_there_too"),
+        Mutant("lengths-by-given-cameras", "Loaded._photographs", "refined_cameras(A, B, training=True)", "B",
+            "errors of lengths are those of cameras that stand elsewhere",
+            "evaluation/test_measuring.py::test_lengths_are_measured_where_the_refined_cameras_stand"),
     ],
     "nerfloom.model": [
         Mutant("background-of-photographs", "Model.background",

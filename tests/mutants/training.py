@@ -4,7 +4,7 @@ from tests.mutants.mutant import Mutant
 
 # fmt: off
 MUTANTS = {
-    "nerfloom.base.config": [
+    "nerfloom.base.plain": [
         Mutant("yaml-lists", "to_plain", "[A for item in B]", "[A for item in B][:1]",
             "a setting of several numbers is written to config.yml with the first alone",
             "test_config.py::test_every_methods_config_survives_yaml"),
@@ -29,6 +29,8 @@ MUTANTS = {
     "nerfloom.methods._captures": [
         Mutant("poses-refined-where-exact", "refinement_choice", "A == 'device'", "A != 'device'",
             "exact poses are refined, and a device's are not", "truth/test_run.py::test_cameras_are_the_captures"),
+        Mutant("rays-of-given-poses", "RefinedModel.loss", "replace(batch, rays=A)", "batch",
+            "poses are never refined", "truth/test_refined_poses.py::test_training_moves_rays_and_rendering_does_not"),
     ],
     "nerfloom.methods.instant_ngp": [
         Mutant("ngp-plan-of-longest", "plan", "A / FITTED_SECONDS", "FITTED_SECONDS / A",
@@ -142,6 +144,19 @@ MUTANTS = {
         Mutant("bad-step-taken", "backward", "optimizer.finite(A)", "optimizer.finite(A) or True",
             "a gradient that is not finite ruins the parameters",
             "training/test_operations.py::test_a_loss_is_found_bad_together_with_its_gradients"),
+    ],
+    "nerfloom.training.taught": [
+        Mutant("teacher-to-the-end", "MixedSource.of", "max(1 - A, 0.0)", "1.0",
+            "photographs never finish, and the pupil keeps the teacher's errors",
+            "training/test_taught.py::test_photographs_finish"),
+        Mutant("taught-views-of-training-cameras", "TaughtPixels.draw", "replace(A, camera_indices=None)", "A",
+            "views of a teacher get the appearance and the poses of the first photographs",
+            "training/test_taught.py::test_pixels_show_what_the_teacher_sees_along_their_rays"),
+    ],
+    "nerfloom.training.teacher": [
+        Mutant("density-in-the-teachers-unit", "Teacher.at_points", "self.scale * A.float()", "A.float()",
+            "a pupil in another unit learns matter that is too thin or too thick",
+            "training/test_taught.py::test_density_and_colours_at_points"),
     ],
     "nerfloom.training.trained": [
         Mutant("eval-flags-lost", "load_trained", "_changed(A, B, settings)", "A",

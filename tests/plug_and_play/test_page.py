@@ -1,4 +1,4 @@
-"""docs/plug-and-play.md says what is so: its code runs, in the order in which it stands, and does what it is for."""
+"""docs/plug-and-play.md is true: its code runs, in the order of the page, and does what the page says."""
 
 import re
 

@@ -41,9 +41,10 @@ def test_record3d_keeps_the_phones_poses(tmp_path: Path) -> None:
     convert(tmp_path, output, 1, 100)
     found = json.loads((output / "transforms.json").read_text())
     assert (found["fl_x"], found["fl_y"], found["cx"], found["cy"]) == (10, 11, 4, 3)
-    assert [frame["transform_matrix"][0][3] for frame in found["frames"]] == [0, 2, 3]
+    # The phone's z, x and y become x, y and z.
+    assert [frame["transform_matrix"][1][3] for frame in found["frames"]] == [0, 2, 3]
     quarter_turn = np.array(found["frames"][0]["transform_matrix"])[:3, :3]
-    np.testing.assert_allclose(quarter_turn, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-9)
+    np.testing.assert_allclose(quarter_turn, [[0, 0, 1], [0, -1, 0], [1, 0, 0]], atol=1e-9)
     with Image.open(output / "images_2" / "0.jpg") as small:
         assert small.size == (4, 3)
 

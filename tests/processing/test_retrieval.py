@@ -14,7 +14,7 @@ def test_all_and_neighbouring_pairs() -> None:
 
 
 def test_photographs_of_the_same_place_are_found() -> None:
-    """Three places with features of their own, four photographs each, of which each shows a random half."""
+    """Three places with their own features, and four photographs of each; a photograph shows a random half."""
     draws = np.random.default_rng(0)
     places = [draws.integers(0, 255, (300, 128)).astype(np.uint8) for _ in range(3)]
     photographs = [places[i % 3][draws.permutation(300)[:150]] for i in range(12)]

@@ -19,7 +19,7 @@ MAX_WHEEL = 6_000_000
 MAX_SDIST = 3_000_000
 """Bytes."""
 DATA = (".png", ".jpg", ".jpeg", ".gif", ".exr", ".mp4", ".npy", ".npz", ".ply", ".spz", ".ckpt", ".pt", ".zip")
-"""Suffixes of pictures, data and checkpoints, none of which belongs into a distribution."""
+"""Suffixes of pictures, data and checkpoints; none belongs in a distribution."""
 LIBRARIES = (".so", ".dylib", ".dll")
 
 

@@ -1,4 +1,4 @@
-"""`make release-check` notices what it is for; the whole of it takes minutes, and is no test."""
+"""`make release-check` finds the mistakes that it is for; a whole run takes minutes and is not a test."""
 
 import ast
 import re

@@ -24,7 +24,7 @@ def walls(depths: Tensor, opacity: float = 1.0) -> tuple[Tensor, Samples]:
 
 @pytest.mark.parametrize(("distance", "expected"), [(0.1, 0.0), (0.5, 0.0), (1.25, 3 * 0.75), (2.0, 4.5), (9.0, 7.5)])
 def test_density_before_a_distance_is_its_integral(distance: float, expected: float) -> None:
-    """Density 3 from 0.5 to 3, in intervals of different lengths, of which the distance may cut one."""
+    """Density 3 from 0.5 to 3, in intervals of different lengths; the distance may cut one of them."""
     samples = regular(torch.tensor([0.5, 0.6, 1.0, 1.7, 2.4, 3.0], dtype=torch.float64), 7)
     sigma = torch.full((35,), 3.0, dtype=torch.float64, requires_grad=True)
     loss = density_before(samples.evaluated(sigma, sigma[:, None]), distance)

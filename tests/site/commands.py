@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-import nerfloom.training.load  # noqa: F401  modules that name find_data must have the true one, if a check comes first
+import nerfloom.training.load  # modules that name find_data or config_file must have the true ones, if a check is first
+import nerfloom.training.teacher  # noqa: F401
 from nerfloom.registry import load_dataparser, registered
 from nerfloom.training.run import Run
 from tests.site.pages import ROOT
@@ -61,13 +62,17 @@ class Checker:
             "nerfloom.training.run_path.config_file": lambda path: path if path.suffix else path / "config.yml",
             "benchmarks.__main__.trained_run": lambda path, *_: path,
             **{f"nerfloom.cli.{name}.trained_run": lambda path, *_: path for name in TAKE_RUNS},
-            **{f"nerfloom.cli.{name}.check_data": lambda path: None for name in ("bench_results", "compare", "stress")},
+            **{
+                f"nerfloom.cli.{name}.check_data": lambda path: None
+                for name in ("bench_results", "blocks", "compare", "stress")
+            },
             "nerfloom.cli.session.start": begin,
             "nerfloom.cli.session.resume": begin,
             "nerfloom.training.load.load": begin,
             "nerfloom.cli.evaluate_geometry.read_reference": lambda flags: None,
             "nerfloom.processing.kinds._check_input": begin,
             "nerfloom.cli.compare.compare": begin,
+            "nerfloom.cli.blocks.build": begin,
             "nerfloom.cli.stress.stress": stress,
             "nerfloom.downloads.install.announce": begin,
         }
@@ -101,7 +106,7 @@ class Checker:
         elif name in ("python", "python3"):
             check_python(rest)
         else:
-            assert name in UNCHECKED, f"{name} is no command that is known here"
+            assert name in UNCHECKED, f"{name} is not a command that is known here"
 
     def _ours(self, name: str, rest: list[str]) -> None:
         scripts = dict(re.findall(r'^(ns-[\w-]+) = "(.+):main"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))

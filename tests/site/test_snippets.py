@@ -1,4 +1,4 @@
-"""Python in the documents runs: in the order in which it stands on its page, on a run of a few steps."""
+"""Python in the documents runs: in the order of its page, on a run of a few steps."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from tests.training.helpers import TINY
 
 EXECUTED = ("start/first-picture", "guides/video", "python/index")
 """Pages whose Python needs a run at most. Of other pages: plug-and-play in tests/plug_and_play, those below, and
-signatures, which are no programs."""
+signatures, which are not programs."""
 RUN = "outputs/lego/instant-ngp/TIME"
 
 
@@ -27,7 +27,7 @@ def run_block(block: Block, names: dict[str, Any]) -> None:
 
 @pytest.fixture
 def trained(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working folder in which the documents' run exists, and in which training takes a few steps."""
+    """A working folder with the documents' run, where training takes a few steps."""
     import nerfloom
 
     monkeypatch.chdir(tmp_path)
@@ -100,6 +100,7 @@ def test_pages_with_programs_are_executed() -> None:
         "plug-and-play",
         "guides/add-a-format",
         "guides/add-a-method",
+        "guides/edit",
         "guides/judge-geometry",
         "guides/measure",
         "interfaces",

@@ -84,3 +84,75 @@ def write_compressed(file: Path, gaussians: Gaussians, colors: bool = True, comm
 
 def _axes(name: str) -> list[str]:
     return list("xyz") if name == "xyz" else [f"scale_{axis}" for axis in "xyz"]
+
+
+def write_ksplat(file: Path, gaussians: Gaussians, level: int, block: float = 5.0, bucket_size: int = 8) -> list[int]:
+    """A .ksplat file of two sections, each with half of the Gaussians, of degree 2 at most; returns their order."""
+    rest = gaussians.harmonics.flatten().tolist() or [0.0]
+    low, high = min(rest), max(rest)
+    half = len(gaussians) // 2
+    sections, headers, order = [], [], []
+    for members in (range(half), range(half, len(gaussians))):
+        full, partial = ksplat_buckets(gaussians.means[members.start : members.stop].tolist(), block, bucket_size)
+        buckets = [*full, *partial]
+        numbers = b"".join(struct.pack("<I", len(bucket)) for _, bucket in partial)
+        centers = b"".join(struct.pack("<3f", *center) for center, _ in buckets)
+        rows = []
+        for center, bucket in buckets:
+            for index in bucket:
+                order.append(members.start + index)
+                rows.append(ksplat_row(gaussians[order[-1] : order[-1] + 1], level, center, block, low, high))
+        content = (numbers + centers if level else b"") + b"".join(rows)
+        header = bytearray(1024)
+        struct.pack_into("<2I", header, 0, len(rows), len(rows))
+        struct.pack_into("<H", header, 40, gaussians.degree)
+        struct.pack_into("<I", header, 28, len(content))
+        if level:
+            struct.pack_into("<2IfH", header, 8, bucket_size, len(buckets), block, 12)
+            struct.pack_into("<I", header, 24, 32767)
+            struct.pack_into("<2I", header, 32, len(full), len(partial))
+        headers.append(bytes(header))
+        sections.append(content)
+    start = bytearray(4096)
+    struct.pack_into("<4B4IH", start, 0, 0, 1, 0, 0, 2, 2, len(order), len(order), level)
+    struct.pack_into("<2f", start, 36, low, high)
+    file.write_bytes(b"".join([bytes(start), *headers, *sections]))
+    return order
+
+
+Bucket = tuple[list[float], list[int]]
+"""Centre, and the Gaussians in it."""
+
+
+def ksplat_buckets(points: list[list[float]], block: float, most: int) -> tuple[list[Bucket], list[Bucket]]:
+    """The full buckets and the others, of cubes with a side of `block`."""
+    low = [min(point[axis] for point in points) for axis in range(3)]
+    full: list[Bucket] = []
+    partial: dict[tuple[int, ...], Bucket] = {}
+    for index, point in enumerate(points):
+        cell = tuple(math.floor((point[axis] - low[axis]) / block) for axis in range(3))
+        center = [cell[axis] * block + low[axis] + block / 2 for axis in range(3)]
+        bucket = partial.setdefault(cell, (center, []))
+        bucket[1].append(index)
+        if len(bucket[1]) >= most:
+            full.append(partial.pop(cell))
+    return full, list(partial.values())
+
+
+def ksplat_row(one: Gaussians, level: int, center: list[float], block: float, low: float, high: float) -> bytes:
+    """A Gaussian in a bucket."""
+    g = one.map(lambda values: values[0])
+    colors = [255 * (0.5 + DC * value) for value in g.colors.tolist()] + [255 * sigmoid(float(g.logits))]
+    color = struct.pack("<4B", *(min(max(math.floor(value), 0), 255) for value in colors))
+    turn, sizes = (g.rotations / g.rotations.norm()).tolist(), g.log_scales.exp().tolist()
+    # All of a degree's red before its green before its blue.
+    rest = [*g.harmonics[:, :3].flatten().tolist(), *g.harmonics[:, 3:].flatten().tolist()]
+    if level == 0:
+        return struct.pack("<10f", *g.means.tolist(), *sizes, *turn) + color + struct.pack(f"<{len(rest)}f", *rest)
+    factor = 32767 / (block / 2)
+    offsets = [a - b for a, b in zip(g.means.tolist(), center, strict=True)]
+    steps = [min(max(math.floor(factor * offset + 0.5) + 32767, 0), 65535) for offset in offsets]
+    start = struct.pack("<3H7e", *steps, *sizes, *turn) + color
+    if level == 1:
+        return start + struct.pack(f"<{len(rest)}e", *rest)
+    return start + bytes(min(max(math.floor(255 * (v - low) / (high - low)), 0), 255) for v in rest)

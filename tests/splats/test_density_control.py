@@ -26,7 +26,7 @@ EXTENT = 2.0
 
 
 def row(count: int) -> Gaussians:
-    """Opaque Gaussians, small enough to be cloned, of which each can be told by its centre."""
+    """Opaque Gaussians, small enough to be cloned; their centres tell them apart."""
     torch.manual_seed(0)
     one = torch.ones(count)
     sizes = torch.full((count, 3), 0.5 * MAX_CLONED_SIZE * EXTENT).log()

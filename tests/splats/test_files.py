@@ -23,7 +23,8 @@ from nerfloom.splats.gaussian_limit import colour_error, fitted_ply, fitted_spz,
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.ply import MAX_LOGIT, ply_size, property_names, write_ply
-from nerfloom.splats.spz import COMMENT_START, SIGNS, encoded, fractional_bits
+from nerfloom.splats.spz import SIGNS, encoded, fractional_bits
+from nerfloom.splats.spz_container import COMMENT_START
 from nerfloom.splats.transform import quaternion, quaternion_product, rotated_harmonics, transformed
 from tests.conftest import Refused
 
@@ -211,14 +212,14 @@ def test_damaged_ply_is_refused(tmp_path: Path) -> None:
     assert "45 properties f_rest" in refused_in_a_line(file, whole.replace(b" f_rest_7\n", b" f_rest_x\n"))
     assert "it holds no Gaussians" in refused_in_a_line(file, whole.replace(b"vertex 40", b"vertex 0"))
     assert "truncated" in refused_in_a_line(file, whole.replace(b"vertex 40", b"vertex 40000000000000"))
-    assert "neither a PLY nor an SPZ file" in refused_in_a_line(file, b"\x89PNG")
+    assert "no file of Gaussians" in refused_in_a_line(file, b"\x89PNG")
     with pytest.raises(DataError, match="cannot read"):
         gaussians_in(tmp_path / "none.ply")
     with pytest.raises(DataError, match="cannot read"):
         gaussians_in(tmp_path)
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".glb"])
 def test_a_full_disk_leaves_the_file_that_was_there(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,7 +254,7 @@ def body(rotation: bytes, harmonics: bytes = b"") -> bytes:
 
 
 def test_version_2_by_hand(tmp_path: Path) -> None:
-    """The order of arrays, the axes, and the coefficients' order, of which red, green and blue are neighbours."""
+    """The order of arrays, the axes, and the order of coefficients: red, green and blue are neighbours."""
     harmonics = bytes([128 + 8 * index for index in range(9)])
     (tmp_path / "a.spz").write_bytes(packed(2, 1, 1, body(bytes([255, 127, 128]), harmonics)))
     g = gaussians_in(tmp_path / "a.spz")
@@ -367,6 +368,14 @@ def test_extensions_behind_the_arrays_are_passed_over(tmp_path: Path) -> None:
     content = body(bytes([255, 127, 128])) + struct.pack("<II", 0xADBE0002, 12) + 12 * b"\0"
     (tmp_path / "a.spz").write_bytes(packed(2, 1, 0, content, flags=2))
     assert len(gaussians_in(tmp_path / "a.spz")) == 1
+    for axes in (4, 6):  # right, up and back, which are usual; and right, down and front
+        extended = content + struct.pack("<III", 0xADBE0003, 4, axes)
+        (tmp_path / "a.spz").write_bytes(packed(2, 1, 0, extended, flags=2))
+        if axes == 4:
+            assert len(gaussians_in(tmp_path / "a.spz")) == 1
+        else:
+            with pytest.raises(DataError, match=r"a\.spz has axes that are not read, number 6"):
+                gaussians_in(tmp_path / "a.spz")
 
 
 def test_degree_4_of_spz_is_cut_to_3(tmp_path: Path) -> None:
@@ -376,9 +385,9 @@ def test_degree_4_of_spz_is_cut_to_3(tmp_path: Path) -> None:
 
 def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     file, one = tmp_path / "a.spz", body(bytes(3))
-    for version in (0, 1, 4, 2**31):
+    for version in (0, 4, 5, 2**31):
         assert f"SPZ of version {version};" in refused_in_a_line(file, packed(version, 1, 0, one))
-    assert "version 4 or later" in refused_in_a_line(file, b"NGSP" + bytes(100))
+    assert "SPZ of version 0;" in refused_in_a_line(file, b"NGSP" + bytes(100))
     assert "does not begin with NGSP" in refused_in_a_line(file, gzip.compress(bytes(100)))
     assert "of degree 5" in refused_in_a_line(file, packed(2, 1, 5, one))
     assert "31 fractional" in refused_in_a_line(file, packed(2, 1, 0, one, fraction=31))
@@ -513,7 +522,7 @@ def test_limits_that_hold_nothing_are_refused(tmp_path: Path) -> None:
     for suffix in ("ply", "spz"):
         with pytest.raises(ConfigError, match="no Gaussian fits into 20 bytes"):
             write_gaussians(tmp_path / f"a.{suffix}", some(5), 20e-6)
-    with pytest.raises(ConfigError, match=r"written to \.ply or \.spz"):
+    with pytest.raises(ConfigError, match=r"written to \.ply, \.spz, \.sog or \.glb files"):
         write_gaussians(tmp_path / "a.obj", some(5))
 
 
@@ -547,7 +556,7 @@ def test_spz_of_other_programs_is_sorted_by_depth(tmp_path: Path, flags: int) ->
 
 
 class Splats:
-    """A model of which no more is known than that it has Gaussians."""
+    """A model that only has Gaussians."""
 
     scene = SimpleNamespace(warped=False, moving=False)
 

@@ -37,7 +37,7 @@ FEW: dict[str, Any] = {"num_gaussians": 600, "start_gaussians": 400, "steps_per_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "relocation"])
 def test_a_start_and_a_loss_are_a_method(strategy: str) -> None:
     torch.manual_seed(0)
     findings = check_method(METHOD, "plain", dataclasses.replace(METHOD.config, strategy=strategy, **FEW))

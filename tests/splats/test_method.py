@@ -41,7 +41,7 @@ def ball(logit: float = 20.0, **changes: Any) -> Gaussians:
 
 
 def test_cameras_that_cannot_be_drawn_are_refused_before_the_run_has_a_folder(tmp_path: Path) -> None:
-    """Panoramas, of which a method that casts rays learns."""
+    """Panoramas; a method that casts rays learns from them."""
     data = write_capture(tmp_path / "panoramas", 8, camera_model="EQUIRECTANGULAR")
     words = ("--data", data, "--output-dir", tmp_path / "out", "--vis", "none", "--max-num-iterations", 1)
     done = called("ns-train", "gaussian-splatting", *words)
@@ -222,7 +222,7 @@ def test_the_method_is_declared() -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "relocation"])
 def test_a_run_goes_on_with_the_same_bits_between_two_changes(strategy: str, shared_tiny: Path, tmp_path: Path) -> None:
     """Gradients that are being counted are a part of a checkpoint, and so are all numbers of Gaussians."""
     settings = {"strategy": strategy, "steps_per_move": 10, "steps_per_reset": 20, "max_num_iterations": 60}

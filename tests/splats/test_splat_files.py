@@ -47,7 +47,7 @@ def psnr(file: Path) -> float:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("kind", ["ply", "spz"])
+@pytest.mark.parametrize("kind", ["ply", "spz", "sog"])
 def test_a_file_has_the_psnr_of_its_run(kind: str, capture: Path, capture_run: Path, tmp_path: Path) -> None:
     placement = load(capture_run).placement
     assert placement.scale < 0.5
@@ -127,9 +127,9 @@ def test_files_of_other_programs_stand_for_a_run(capture: Path, capture_run: Pat
     assert isinstance(model, HasGaussians)
     assert len(model.gaussians()) == len(given)
     assert model.look() == Look(sort="depth")
-    (tmp_path / "a.ksplat").write_bytes(bytes(10))
-    with pytest.raises(DataError, match=r"a\.ksplat is of GaussianSplats3D's format"):
-        load(tmp_path / "a.ksplat", data=capture)
+    (tmp_path / "a.rad").write_bytes(bytes(10))
+    with pytest.raises(DataError, match=r"a\.rad is of Spark's format"):
+        load(tmp_path / "a.rad", data=capture)
 
 
 def test_the_format_and_its_flags_may_be_named(shared_tiny: Path, tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_pictures_and_gradients_are_those_of_products(backend: str, alphas: list
 @pytest.mark.entry(11)
 @backends()
 def test_a_thousand_thin_opacities_are_not_lost(backend: str) -> None:
-    """1 - 1e-9 is 1 in float32, of which no product would ever become less."""
+    """1 - 1e-9 is 1 in float32, and no product of ones would ever become less."""
     found = composited([[1e-9] * 1000])
     assert found.accumulation.item() == pytest.approx(1e-6, rel=1e-4)
     assert found.weights is not None

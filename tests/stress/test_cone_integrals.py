@@ -106,7 +106,7 @@ def test_gaussians_are_contracted_by_the_derivative_of_the_contraction() -> None
 @pytest.mark.entry(10)
 @pytest.mark.parametrize("distance", [0.5, 1.5, 4.0, 60.0])
 def test_contracted_gaussians_have_the_moments_of_contracted_draws(distance: float) -> None:
-    """Of Gaussians that are small beside their distance, to which the derivative is exact; elongated and oblique."""
+    """Gaussians that are small compared with their distance, so that the derivative is exact; elongated and oblique."""
     means = directions(10) * distance
     roots = 1e-4 * distance * frames(directions(10).flip(0)) * torch.tensor([1.0, 0.2, 0.2], dtype=F64)
     found, contracted = contract_gaussians(means, roots)
@@ -191,7 +191,8 @@ def test_wide_gaussians_have_no_waves_and_finite_gradients(dtype: torch.dtype) -
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("along", [None, icosahedron_directions().double()])
 def test_the_encoding_of_cones_is_the_mean_over_points_in_them(contracted: bool, along: Tensor | None) -> None:
-    """Over the frustums' own points, of which Gaussians are an approximation, for waves longer than they are."""
+    """Compared with means over the frustums' points, which Gaussians approximate, for waves longer than the
+    frustums."""
     radii, generator = torch.tensor([0.02, 0.01], dtype=F64), torch.Generator().manual_seed(1)
     rays, samples = two_rays(radii)
     encoding = IntegratedEncoding(BOX, 2, 1e-3, contracted, along).double()

@@ -35,7 +35,7 @@ SOURCES = [file for name in ("framework", "methods") for file in (Path(__file__)
 
 
 def mentioned(pattern: str) -> list[str]:
-    """Files of the framework and its methods in which a pattern occurs."""
+    """Files of the framework and its methods that contain a pattern."""
     return [file.name for file in SOURCES if re.search(pattern, file.read_text(encoding="utf-8"), re.IGNORECASE)]
 
 
@@ -139,9 +139,12 @@ def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.entry(15)
-def test_the_only_srgb_curve_has_no_gradient_and_a_value_at_black() -> None:
-    """Colours are as stored; numpy's curve looks at photographs alone. Another one needs a test of its slope at 0."""
-    assert mentioned(r"\*\* *2\.4\b") == ["light_spread.py"]
+def test_srgb_curves_have_no_gradient_and_a_value_at_black() -> None:
+    """Colours are as stored; numpy has curves for the light of photographs and for glTF files, without a gradient.
+
+    A curve that is learnt through needs a test of its slope at 0.
+    """
+    assert mentioned(r"\*\* *2\.4\b") == ["gltf.py", "light_spread.py"]
     black = light_of(np.zeros((16, 16, 3), np.uint8))
     assert black.tolist() == [[-9.0] * len(QUANTILES), [0.0] * len(QUANTILES), [0.0] * len(QUANTILES)]
 

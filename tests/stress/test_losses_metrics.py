@@ -253,7 +253,7 @@ def test_a_nan_in_a_picture_is_seen_in_the_metrics() -> None:
 def test_lpips_is_shown_images_from_minus_one_to_one(
     dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Images in [0, 1] go to the network, of which there is a double here, as float32 in [-1, 1]."""
+    """Images in [0, 1] go to the network, here a double of it, as float32 in [-1, 1]."""
     shown: list[Tensor] = []
 
     class Network:

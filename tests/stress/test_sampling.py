@@ -115,7 +115,7 @@ def test_a_ray_whose_bins_all_stand_in_one_place(backend: str, padding: float) -
 
 
 def new_edges_with_nan_at(place: int) -> Tensor:
-    """New intervals of a histogram of three bins, one of which weighs NaN."""
+    """New intervals of a histogram of three bins; one has a weight of NaN."""
     weights = torch.tensor([[0.2, 0.5, 0.3]])
     weights[0, place] = math.nan
     return resample(torch.tensor([[0.0, 1.0, 2.0, 3.0]]), weights, torch.tensor([0.5]), 4, 1.0, 0.01)

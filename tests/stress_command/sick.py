@@ -15,7 +15,7 @@ class SickConfig(InstantNGPConfig):
     """Settings of instant-ngp, and when it is sick."""
 
     sick_rays: int = 1
-    """In training, colours of batches of at most so many rays are NaN."""
+    """Maximum number of rays of a batch that gets colours of NaN in training."""
 
 
 class Sick(RayModel[SickConfig]):

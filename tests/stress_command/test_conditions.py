@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfloom.base.config import from_plain
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.plain import from_plain
 from nerfloom.cli.stress import USAGE
 from nerfloom.data.sources import make_source
 from nerfloom.registry import load_method

@@ -22,7 +22,7 @@ from tests.training.helpers import TINY, tiny_run, tiny_trainer
 BALL = ball_views()
 BUDGET = Budget(steps=75, seconds=None)
 SICK = " ".join(["sick", *TINY_NGP])
-WITHOUT_ALPHA = {"gaussian-splatting": {"start": "auto"}}
+WITHOUT_ALPHA = {"gaussian-splatting": {"start": "auto"}, "moving-gaussians": {"start": "auto"}}
 """Settings of tiny runs that suit images without alpha too, as those of some conditions."""
 
 
@@ -134,7 +134,7 @@ def test_a_plugin_that_is_always_sick_fails_everywhere(tmp_path: Path, refused: 
 @pytest.mark.medium
 @pytest.mark.usefixtures("sick")
 def test_several_methods_make_one_table(tmp_path: Path, refused: Refused) -> None:
-    """A row for each condition, a column for each method, and why what is no pass is none."""
+    """A row for each condition, a column for each method, and the reason for each outcome other than a pass."""
     path = tmp_path / "both.json"
     flags = ("--only", "1-ray", "--max-num-iterations", 15, "--output-path", path)
     healthy = " ".join(["instant-ngp", *TINY_NGP])

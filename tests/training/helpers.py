@@ -90,6 +90,15 @@ TINY: dict[str, dict[str, Any]] = {
         "learning_rate": 5e-3,
         "lr_warmup_steps": 0,
     },
+    "kilo-nerf": {
+        "network_resolution": 3,
+        "hidden_width": 16,
+        "position_frequencies": 4,
+        "grid_resolution": 16,
+        "num_steps": 64,
+        "samples_per_batch": 4096,
+        "learning_rate": 1e-2,
+    },
     "kplanes": {
         "base_resolution": 16,
         "num_scales": 2,
@@ -100,6 +109,13 @@ TINY: dict[str, dict[str, Any]] = {
         "samples_per_batch": 4096,
     },
     "gaussian-splatting": {
+        "num_gaussians": 600,
+        "start_gaussians": 400,
+        "start": "silhouettes",
+        "steps_per_move": 10,
+        "rate_factor": 3.0,
+    },
+    "moving-gaussians": {
         "num_gaussians": 600,
         "start_gaussians": 400,
         "start": "silhouettes",
@@ -163,6 +179,16 @@ TINY: dict[str, dict[str, Any]] = {
         "hidden_width": 32,
         "samples_per_batch": 4096,
     },
+    "neus+frequency": {
+        "encoding": "frequency",
+        "hidden_width": 32,
+        "position_frequencies": 2,
+        "grid_resolution": 16,
+        "num_steps": 48,
+        "samples_per_batch": 2048,
+        "learning_rate": 5e-3,
+        "start_radius": 0.6,
+    },
     "ref-nerf": {
         "num_levels": 4,
         "max_resolution": 64,
@@ -190,6 +216,16 @@ TINY: dict[str, dict[str, Any]] = {
         "num_steps": 64,
         "hidden_width": 32,
         "samples_per_batch": 4096,
+    },
+    "volsdf+frequency": {
+        "encoding": "frequency",
+        "hidden_width": 32,
+        "position_frequencies": 2,
+        "grid_resolution": 16,
+        "num_steps": 48,
+        "samples_per_batch": 2048,
+        "learning_rate": 5e-3,
+        "start_radius": 0.6,
     },
     "pixel-nerf": {
         "num_source_views": 3,

@@ -105,7 +105,7 @@ class FakeRecorder:
 
 
 def ahead(monkeypatch: Any) -> None:
-    """Let the CPU be a device that runs ahead of Python, and for which there are no kernels of ours."""
+    """Let the CPU be a device that runs ahead of Python and has no kernels of ours."""
     from nerfloom.kernels import native
 
     monkeypatch.setattr(native, "available", lambda: False)

@@ -38,7 +38,7 @@ Found = dict[str, Any]
 
 
 class PartSource(PixelSource):
-    """Batches of which each process takes its part."""
+    """Batches; each process takes its part."""
 
     def draw(self, request: Request) -> PixelBatch:
         seed_step(self.seed, request.step)

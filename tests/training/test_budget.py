@@ -1,4 +1,4 @@
-"""How much of a budget is spent, and the reasons for which a run ends."""
+"""The spent share of a budget, and the reasons why a run ends."""
 
 import signal
 from pathlib import Path

@@ -54,7 +54,7 @@ def test_the_one_that_stays_can_be_read(tmp_path: Path) -> None:
     state = load_newest(tmp_path)
     assert state is not None
     assert state["model"]["w"][0] == 4
-    save(tmp_path, 10, before=7)  # of which there is none
+    save(tmp_path, 10, before=7)  # there is none
     assert [int(path.stem[5:]) for path in list_checkpoints(tmp_path)] == [9, 10]
 
 

@@ -88,7 +88,7 @@ def test_looks_change_no_bit(shared_tiny: Path, tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_look_is_what_its_pixels_say(shared_tiny: Path, tmp_path: Path) -> None:
-    """Without a stride it is the evaluation of the same images; with one, of every so many-th pixel of them."""
+    """Without a stride it is the evaluation of the same images; with a stride, of every n-th pixel of them."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
     for _ in range(10):
         trainer.train_step()

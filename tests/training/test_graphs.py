@@ -104,7 +104,7 @@ def test_repeated_steps_learn_what_steps_learn(
     assert_same_bits(tensors(usual), tensors(repeating))
     assert usual.state.train_mse == repeating.state.train_mse
     hierarchical = any(name in variant for name in ("mip", "vanilla", "dnerf", "plus"))
-    kinds = 1 if hierarchical else 2  # steps in which proposals learn, and others
+    kinds = 1 if hierarchical else 2  # steps where proposals learn, and others
     assert len(recorder.tapes) == kinds
     assert recorder.repeated == STEPS - kinds * WARM_UP
     assert said == ["training steps are captured as CUDA graphs and replayed"]

@@ -14,7 +14,7 @@ from tests.other_device import OTHER, There, other_device
 from tests.training.test_graphs import VARIANTS, small
 
 STRIDE = 16
-"""Every so many-th row and column of a picture is compared."""
+"""Interval of the compared rows and columns of a picture."""
 
 
 def bent(dataset: Dataset) -> Dataset:

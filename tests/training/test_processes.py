@@ -49,7 +49,7 @@ def free_port() -> int:
 def numbered() -> list[dict[str, str]]:
     """Variables of two processes, as torchrun numbers them, which itself takes seconds to begin.
 
-    They have no GPU, of which there may be one, and none of whose runs has the same bits twice.
+    They have no GPU: there may be only one, and its runs do not have the same bits twice.
     """
     port = free_port()
     return [

@@ -31,7 +31,7 @@ from tests.conftest import TICK
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 
 KINDS = list(TINY)
-RAY_KINDS = [kind for kind in TINY if kind != "gaussian-splatting"]
+RAY_KINDS = [kind for kind in TINY if kind not in ("gaussian-splatting", "moving-gaussians")]
 """Those that render rays, in chunks."""
 
 
@@ -40,7 +40,7 @@ QUICK = ("instant-ngp", "vanilla-nerf", "nerfacto", "gaussian-splatting")
 
 
 def quick(kinds: list[str]) -> list[Any]:
-    """The kinds, of which the others are slow."""
+    """The kinds that are not slow."""
     return [pytest.param(kind, marks=() if kind in QUICK else pytest.mark.slow) for kind in kinds]
 
 
@@ -251,7 +251,7 @@ def test_an_empty_grid_is_harmless(shared_tiny: Path, tmp_path: Path) -> None:
 
 
 def in_chunks_of(trainer: Trainer, rays: int) -> None:
-    """Let its model render so many rays at once."""
+    """Let its model render a number of rays at once."""
     trainer.model.config = dataclasses.replace(trainer.model.config, eval_num_rays_per_chunk=rays)
 
 
@@ -337,7 +337,7 @@ def test_a_second_ctrl_c_ends_at_once() -> None:
 
 
 def test_a_good_checkpoint_outlives_a_divergence(shared_tiny: Path, tmp_path: Path) -> None:
-    """Ten bad steps, each of which would be saved: the state from before must still be there."""
+    """Ten bad steps that would all be saved: the state from before must still be there."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", steps_per_save=2)
     for _ in range(3):
         trainer.train_step()

@@ -1,4 +1,4 @@
-"""A capture of which everything is known: a patterned ball, photographed from all around through a known lens.
+"""A capture with a known truth: a patterned ball, photographed from all around through a known lens.
 
 Made without any of the framework's mathematics. A photograph's pixel has the colour that the ray through its centre
 meets, so whoever reads a capture rightly finds, along the ray of every pixel, the very colour that the pixel has; half
@@ -148,7 +148,7 @@ def write_photographs(folder: Path, names: list[str], lens: Lens = PINHOLE) -> N
 
 
 def write_depths(folder: Path, names: list[str], lens: Lens = PINHOLE, steps: float = 1000.0) -> None:
-    """16-bit pictures of depth, so many steps a metre."""
+    """16-bit pictures of depth, with a number of steps per metre."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(names):
         Image.fromarray((depth(index, lens) * steps).round().astype(np.uint16)).save(folder / name)

@@ -26,7 +26,7 @@ WORSE = {
 
 NEITHER = ("steps", "training, rays/s", "faces")
 """Columns without a best: a method may learn more in fewer steps, rays of one that draws images are pixels, and more
-faces are no merit."""
+faces are not a merit."""
 
 
 def finished(planned: PlannedRun, figures: dict[str, float]) -> Measured:

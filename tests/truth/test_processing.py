@@ -17,7 +17,20 @@ from nerfloom.processing import reconstruction as module
 from nerfloom.processing.reconstruction import Reconstruction
 from tests.cli.helpers import called
 from tests.dataparsers.sparse_models import write_colmap
-from tests.truth.ball import CENTRE, COUNT, HEIGHT, NAMES, PINHOLE, RADIUS, WIDTH, Lens, photograph, write_photographs
+from tests.processing.programs import document, numbers, sensor
+from tests.truth.ball import (
+    CENTRE,
+    COUNT,
+    HEIGHT,
+    NAMES,
+    PINHOLE,
+    RADIUS,
+    WIDTH,
+    Lens,
+    photograph,
+    pose_of,
+    write_photographs,
+)
 from tests.truth.formats import COLMAP_CAMERAS, camera_line, model_of, write_polycam, write_record3d
 from tests.truth.test_captures import assert_pixels_show_the_ball, in_own_frame
 
@@ -179,3 +192,28 @@ def test_a_lens_of_each_photograph(tmp_path: Path) -> None:
         frames.append(transforms.Frame(name, pose, written))
     transforms.write(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
     assert_pixels_show_the_ball(EVERY.parse(tmp_path, "train"), None)
+
+
+@pytest.mark.parametrize("kind", ["frame", "fisheye"])
+def test_metashape(kind: str, tmp_path: Path) -> None:
+    """Its lens by its own names: the principal point from the centre, and tangential coefficients exchanged."""
+    named = {"k1": 0.06, "k2": -0.09, "k3": 0.2, "k4": -0.4}
+    if kind == "frame":
+        named = {"k1": -0.11, "k2": 0.02, "k3": 0.01, "k7": 0.03, "p1": 0.008, "p2": -0.012}
+    lens = Lens("opencv" if kind == "frame" else "fisheye", named)
+    write_photographs(tmp_path / "photographs", NAMES, lens)
+    fx, fy, cx, cy = lens.intrinsics
+    calibration = {"f": fy, "b1": fx - fy, "cx": cx - WIDTH / 2, "cy": cy - HEIGHT / 2}
+    calibration |= {"p1": named.get("p2", 0.0), "p2": named.get("p1", 0.0), "k4": named.get("k7", named.get("k4", 0.0))}
+    calibration |= {name: named[name] for name in ("k1", "k2", "k3")}
+    cameras = ""
+    for index, name in enumerate(NAMES):
+        matrix = pose_of(index) @ np.diag([1.0, -1, -1, 1])
+        moved = f"<transform>{numbers(matrix)}</transform>"
+        cameras += f'<camera id="{index}" sensor_id="0" label="{name}">{moved}</camera>'
+    text = document(sensor(0, kind, calibration, (WIDTH, HEIGHT)), cameras)
+    (tmp_path / "cameras.xml").write_text(text)
+    flags = ("--xml", tmp_path / "cameras.xml", "--num-downscales", 0)
+    content = process("metashape", tmp_path / "photographs", tmp_path / "out", *flags)
+    assert len(content["frames"]) == COUNT
+    assert_pixels_show_the_ball(EVERY.parse(tmp_path / "out", "train"), None)

@@ -89,7 +89,7 @@ def test_cameras_are_the_captures(trained: Path, tmp_path: Path) -> None:
 
 
 def test_other_programs_find_the_scene_by_the_transform_beside_it(trained: Path) -> None:
-    """nerfstudio's file: `scale * (transform @ x)` of the capture's own frame, in which all cameras fit [-1, 1]."""
+    """nerfstudio's file: `scale * (transform @ x)` of the capture's own frame; all cameras fit [-1, 1] there."""
     content = json.loads((trained / "dataparser_transforms.json").read_text())
     transform = np.array(content["transform"])
     positions = np.stack([pose_of(index)[:3, 3] for index in range(COUNT)])

@@ -291,7 +291,7 @@ def test_each_group_has_the_rate_and_the_schedule_that_it_names(shared_tiny: Pat
 def test_longer_runs_of_instant_ngp_get_larger_tables(
     seconds: float | None, size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)  # those for which the times were found
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)  # the times were found for these
     method = load_method("instant-ngp")
     config, _ = method.decided(dataclasses.replace(method.config, max_seconds=seconds), SCENE)
     assert config.log2_table_size == size
@@ -316,7 +316,8 @@ def test_a_pixel_is_several_rays_from_the_share_of_the_budget_on_that_is_asked_f
 
 
 def test_the_coarse_network_learns_by_its_own_colours(shared_tiny: Path, tmp_path: Path) -> None:
-    """NeRF, equation 6: the squared errors of both levels are added; what is drawn by the coarse one is no way back."""
+    """NeRF, equation 6: the squared errors of both levels are added; the samples drawn by the coarse level pass no
+    gradient back."""
     trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path / "run")
     model, batch = trainer.model.train(), draw_batch(trainer.train_set, 32, "black")
     parameters = list(model.sampler.parameters())
@@ -377,7 +378,7 @@ def test_light_is_gathered_in_normalised_distance(shared_tiny: Path, tmp_path: P
 def test_a_ray_of_a_capture_ends_in_matter_unless_photographs_tell_what_is_empty(
     has_alpha: bool, opacity: float
 ) -> None:
-    """However thin what there is: the sky of a photograph without alpha is no hole."""
+    """The sky of a photograph without alpha is not a hole, however thin the matter there."""
     settings = {"sampler": "proposal", "num_proposal_samples": (8,), "num_nerf_samples": 8}
     config: Any = dataclasses.replace(load_method("nerfacto").config, **settings)
     scene = dataclasses.replace(SCENE, unbounded=True, has_alpha=has_alpha, near=0.05, far=1000.0)

@@ -117,7 +117,27 @@ def test_gaussians_are_drawn_as_a_whole_however_slow_that_is() -> None:
 
 @pytest.fixture
 def photographs(shared_tiny: Path, tmp_path: Path) -> Photographs:
-    return Photographs(tiny_run("instant-ngp", shared_tiny, tmp_path))
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path)
+    return Photographs(tiny_run("instant-ngp", shared_tiny, tmp_path), lambda: trainer.model)
+
+
+def test_photographs_stand_where_their_refined_cameras_do(shared_tiny: Path, tmp_path: Path) -> None:
+    """Each is moved by what the model has learnt by now."""
+    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run", sampler="proposal", camera_optimizer="SO3xR3")
+    photographs = Photographs(tiny_run("nerfacto", shared_tiny, tmp_path / "run"), lambda: trainer.model)
+    before = at(photographs, 3)
+    assert photographs.at(before) == 3
+    shift = torch.tensor([0.3, -0.2, 0.4])
+    trainer.model.poses.tangents.data[:, :3] = shift
+    assert photographs.at(before) is None
+    after = at(photographs, 3)
+    torch.testing.assert_close((after.tensor() - before.tensor())[:, 3].float(), shift, atol=1e-5, rtol=0)
+    assert photographs.at(after) == 3
+    view = View(Request(after, 20, 20).camera())
+    found = photographs.truth(view, torch.zeros(20, 20, 3), torch.ones(3))
+    rgba = torch.from_numpy(iio.imread(shared_tiny / "train" / "r_3.png").copy()).float() / 255
+    assert found is not None
+    torch.testing.assert_close(found, rgba[..., :3] * rgba[..., 3:] + (1 - rgba[..., 3:]), atol=1e-4, rtol=0)
 
 
 def at(photographs: Photographs, index: int) -> Pose:
@@ -178,7 +198,7 @@ def test_cells_are_those_on_the_surface() -> None:
 
 
 def at_step_7(folder: Path) -> Loaded:
-    """A run without a model, of which no more is asked than what its panel says."""
+    """A run without a model; the tests only need the text of its panel."""
     placement = Placement(torch.eye(4)[:3].double(), 1.0)
     return Loaded(cast(Renderable, None), placement, "instant-ngp", folder, folder / "step-7.ckpt", 7)
 

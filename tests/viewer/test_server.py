@@ -39,7 +39,7 @@ class Served:
         trainer = Trainer.of(run, load_split(run, "train"))
         for _ in range(60):
             trainer.train_step()
-        self.photographs = Photographs(run)
+        self.photographs = Photographs(run, lambda: trainer.model)
         self.queue = RenderQueue(in_training(run, trainer), truth=self.photographs.truth)
         self.folder, self.model = folder, trainer.model
         self._server = open_server("127.0.0.1", 17007, "test")

@@ -44,7 +44,7 @@ class DenseGridConfig(
     hidden_width: int = 64
     """Features of a layer of the two networks."""
     num_features: int = 15
-    """Features that the first network hands to the second, beside density."""
+    """Features that the first network passes to the second, in addition to density."""
 
 
 class DenseGridField(Field):

@@ -87,10 +87,10 @@ def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
 
 @dataclass(frozen=True)
 class ViewBatch:
-    """One whole training image."""
+    """One whole training image, or one that a teacher has rendered."""
 
-    index: int
-    """Index of the training image."""
+    index: int | None
+    """Index of the training image; None for a view of a teacher."""
     view: View
     """Its camera."""
     rgb: Tensor

@@ -1,14 +1,14 @@
 """Tiles of training images that the other images contradict: people who walk through, shadows, leaves that move.
 
-Where an image shows somebody whom the others do not, the model shows what is behind. Its colours there are wrong in the
-same direction throughout a region. Where texture or an edge is not sharp yet, errors are as large, but their signs
-differ from pixel to pixel. So each tile keeps a running mean of the signed errors of its drawn pixels. A tile is
-contradicted if the square of that mean, averaged over 3 x 3 tiles, is several times the median of all tiles, and not
-small in itself. So there is no share of pixels that is always left out: where nothing moves, the means of all tiles
-become small.
+Where one image shows somebody who is absent from the others, the model shows what is behind that person. Its colours
+are then wrong in the same direction throughout a region. Where texture or an edge is not sharp yet, errors are as
+large, but their signs differ from pixel to pixel. So each tile keeps a running mean of the signed errors of its drawn
+pixels. A tile is contradicted if the square of that mean, averaged over 3 x 3 tiles, is several times the median of all
+tiles and exceeds a threshold. No fixed share of pixels is left out: where nothing moves, the means of all tiles become
+small.
 
-That errors tell what moves, and that neighbours decide together, is from RobustNeRF (Sabour et al. 2023); that all
-pixels count at first, from SpotLessSplats (Sabour et al. 2024).
+Finding what moves from errors, and deciding together with neighbours, are ideas of RobustNeRF (Sabour et al. 2023);
+counting all pixels at first is one of SpotLessSplats (Sabour et al. 2024).
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.tiles import Tiles
 
 TILES_ALONG = 12
-"""Number of tiles along an image's longer side, unless they had less than 4 pixels."""
+"""Number of tiles along an image's longer side; fewer if their sides would be shorter than `MIN_SIDE`."""
 MIN_SIDE = 4
-"""Least side of a tile, pixels."""
+"""Minimum side of a tile, pixels."""
 MEMORY = 32
-"""Number of draws in a tile after which an error counts 1 / e in its mean."""
+"""Number of draws in a tile that reduce an error's weight in its mean to 1 / e."""
 MIN_DRAWS = 4
 """Number of draws in a tile and its neighbours before it can be contradicted."""
 ALL_UNTIL = 0.25
-"""Fraction of the budget during which all pixels count: before there is a scene, large errors are the scene."""
+"""Fraction of the budget during which all pixels count, because errors are large everywhere until the scene is
+learnt."""
 LEAST = 0.07
-"""Mean error of colours in [0, 1] that a contradicted tile has at least."""
+"""Minimum mean error of a contradicted tile; colours are in [0, 1]."""
 STEPS_PER_LOOK = 25
 """Steps between decisions on which tiles are contradicted."""
 
 
 class ContradictedTiles:
-    """Running means of the signed errors in each tile, and the tiles that do not count.
+    """Running means of the signed errors in each tile, and the tiles that are contradicted.
 
     Args:
         dataset: M images.
@@ -47,7 +48,8 @@ class ContradictedTiles:
         self.tiles = Tiles(dataset.cameras, max(round(dataset.scene.image_size / TILES_ALONG), MIN_SIDE))
         self.around, self.factor = self.tiles.neighbours(), factor
         self.state = torch.zeros(self.tiles.total, 5, device=dataset.device)
-        """(T, 5) weighted sums of signed errors, of the three channels; sum of the weights; 1 if contradicted, or 0."""
+        """(T, 5) weighted sums of the signed errors of the three channels; sum of the weights; 1 if contradicted,
+        otherwise 0."""
 
     def learn(self, pixels: Tensor, errors: Tensor) -> None:
         """Update the means of tiles.

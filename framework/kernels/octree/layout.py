@@ -30,7 +30,7 @@ BRICKS_AT_ONCE = 2**12
 
 @dataclass(frozen=True)
 class OctreeLayout:
-    """The leaves of an octree: L cells of a grid, in B bricks. `build` makes it, and everything relies on that."""
+    """The leaves of an octree: L cells of a grid, in B bricks. `build` makes one and checks it."""
 
     origin: Tensor
     """(3,) corner of the first cell, scene units."""

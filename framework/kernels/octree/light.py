@@ -48,7 +48,7 @@ class OctreeLight(NamedTuple):
 
 
 def depths_of(raw: Tensor) -> Tensor:
-    """Return optical depths of cells' edges: exp(raw - 1), and from 1 on raw itself, so that none has to be negative.
+    """Return optical depths of cells' edges: exp(raw - 1) up to raw = 1, and raw beyond, so that they are positive.
 
     It is the activation of SVRaster (Sun et al. 2025) without its sharper slope.
 
@@ -72,7 +72,7 @@ def light_of(
         layout: where the L leaves are.
         depths: (L,) optical depth of a cell's edge in each leaf.
         coefficients: (L, 3 K) coefficients of the leaves.
-        rays: R rays, whose type the others have.
+        rays: R rays; the other tensors have their type.
         background: (R, 3) colour of the background.
         stop: transmittance below which a ray ends.
     """

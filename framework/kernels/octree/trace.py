@@ -38,7 +38,7 @@ def trace_octree(
     stop: float = 0.0,
     deferred: tuple[LeafGradient, LeafGradient] | None = None,
 ) -> OctreeLight:
-    """Return the light of R rays through an octree, with a gradient of its leaves. Other gradients take the reference.
+    """Return the light of R rays through an octree, with a gradient of its leaves; the reference has all gradients.
 
     Args:
         layout: where the L leaves are.

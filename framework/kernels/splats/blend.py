@@ -11,9 +11,9 @@ to this Gaussian, so T is not divided by 1 - alpha at each step. Each entry of a
 added by Gaussian in a fixed order: no two threads write to the same place, and the result has the same bits with any
 number of threads.
 
-Growth asks how much the pixels pull at a Gaussian, even where they pull it apart and their gradients cancel (AbsGS, Ye
-et al. 2024). So every form leaves, in two columns of the records' gradient that the image does not depend on, the sums
-over pixels of the absolute gradients of the centre:
+Growth needs the magnitude of the pixels' gradients for a Gaussian, even where gradients of opposite sign cancel (AbsGS,
+Ye et al. 2024). So every implementation stores the sums over pixels of the absolute gradients of the centre. They are
+in two columns of the records' gradient that are unused, because the image does not depend on these columns:
 
     gradient[ABSOLUTE_X] = sum_p |d loss / d x through pixel p|        gradient[ABSOLUTE_Y] likewise of y
 """
@@ -133,7 +133,7 @@ def _offsets(listed: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _exponent(listed: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
-    """Return u^2 + v^2 (..., P, M) at offsets from Gaussians (..., M, RECORD), whose alpha falls by exp(-u^2 - v^2)."""
+    """Return u^2 + v^2 (..., P, M) at offsets from Gaussians (..., M, RECORD); alpha falls by exp(-u^2 - v^2)."""
     along_x, along_y = listed[..., Record.U_X] * dx, listed[..., Record.U_Y] * dy
     return (along_x + along_y) ** 2 + (listed[..., Record.V_Y] * dy) ** 2
 
@@ -154,7 +154,7 @@ class _OfEachPixel(torch.autograd.Function):
 def _blend_together(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Compute `blend` for many tiles at once, those with lists of like lengths together.
+    """Compute `blend` for many tiles at once, those with lists of similar lengths together.
 
     Synchronises once, for the lengths. If not all tiles fit into memory, the backward pass computes them again.
     """

@@ -75,7 +75,7 @@ class SplatCamera:
     blur: float = BLUR
     """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
-    """Whether opacity makes up for the blur."""
+    """Whether opacity is reduced to compensate for the blur."""
     lens: Distortion | None = None
     """Distortion of the projection "opencv" or "fisheye"; None for a pinhole camera."""
     fisheye: bool = False

@@ -174,7 +174,7 @@ def shape_back(grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED: tl.
 
 @triton.jit
 def column_back(pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy):
-    """Return, of an axis, the gradients of itself, its scale, itself times that in the camera's frame, and J's rows.
+    """Return the gradients of an axis, of its scale, of their product in the camera's frame, and of J's rows.
 
     Its arguments are `pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy`.
     """
@@ -230,7 +230,7 @@ def _pose_row(
     sums, shown, pose, i: tl.constexpr, of_p, x, y, z, of_x, of_y, of_z, g0, g1, g2, r00, r01, r02, r10, r11, r12, r20,
     r21, r22,
 ):  # fmt: skip
-    """Write a program's sums for row i of the pose, whose entries count as independent.
+    """Write a program's sums for row i of the pose; its entries count as independent.
 
     They are of the centre, of the axes (g: gradients of their rows times the scales), and of the camera's centre.
     """

@@ -32,21 +32,21 @@ class TileLists(NamedTuple):
     firsts: Tensor
     """(N + 1,) int32; Gaussian g has the slots from firsts[g] to firsts[g + 1] - 1."""
     needed: Tensor | None = None
-    """() int64 number of entries that there would be with capacity for all; None if there was."""
+    """() int64 number of entries with unlimited capacity; None if the capacity was sufficient."""
 
 
 def tile_lists(
     records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
-    """Return lists of the Gaussians that each tile of an image may show, nearest first, those as near by their index.
+    """Return lists of the Gaussians that each tile of an image may show, nearest first, and by index at equal distance.
 
     Args:
         records: (N, RECORD) Gaussians on the image, from `project_gaussians`.
         width, height: size of the image, pixels.
         for_gradients: whether a backward pass follows; otherwise the lists may have no slots.
-        capacity: number of entries, which avoids a synchronisation; Gaussians beyond it are dropped whole. None for no
-            limit.
+        capacity: number of entries, which avoids a synchronisation; Gaussians beyond it are dropped entirely. None for
+            no limit.
         keys: (N,) positive numbers that sort the visible Gaussians instead, smallest first.
 
     Raises:

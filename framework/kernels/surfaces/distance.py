@@ -1,16 +1,19 @@
-"""A network on a hash grid with the gradient of its first output, which can be learnt from.
+"""A network on a hash grid, with a differentiable gradient of its first output.
 
-The network has one hidden layer with ReLU, as in NeuS2 (Wang et al. 2023), whose second derivative is 0 almost
+The network has one hidden layer with ReLU, as in NeuS2 (Wang et al. 2023). The second derivative of ReLU is 0 almost
 everywhere. With features e(x) of the grid, h = W1 e, active units m = [h > 0] and outputs y = W2 (m h):
 
     dy_0 / de = W1^T (m w),      w the first row of W2
     n = dy_0 / dx = (de / dx)^T W1^T (m w)
 
-A loss with gradients dy by y and v by n has the gradients of dy . y + (dy_0 / dx) . v. With t = (de / dx) v:
+A loss with the gradients dy for y and v for n has the gradients of dy . y + (dy_0 / dx) . v. With t = (de / dx) v:
 
     by W2:  dy (m h)^T, and m W1 t added to the first row
     by W1:  (m W2^T dy) e^T + (m w) t^T
     by e:   W1^T (m W2^T dy)            by t:  W1^T (m w)
+
+By the position x, the outputs have the gradient of e (`following_positions`). That of n needs the grid's second
+derivative, which is 0 along the axes and jumps at the faces of cells.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from torch import Tensor
 
 from nerfloom.kernels import native, result_cache
 from nerfloom.kernels.dispatch import CPP, TRITON, Operation
-from nerfloom.kernels.grids.hash_grid import LOOK_UP, hash_grid_reference
+from nerfloom.kernels.grids.hash_grid import LOOK_UP, hash_grid, hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP as TANGENT
@@ -34,7 +37,7 @@ def distance_network_reference(
 ) -> Tensor:
     """Compute `distance_network` in PyTorch, for any device and float type, with derivatives of any order.
 
-    `positions`, `table`, `first`, `second`, `layout` and the result are as there.
+    `positions`, `table`, `first`, `second`, `layout` and the result are as in `distance_network`.
     """
     learns = torch.is_grad_enabled()
     with torch.enable_grad():
@@ -77,6 +80,23 @@ def distance_network(
         sizes = " and ".join(str(tuple(each.shape)) for each in (first, second))
         raise ValueError(f"distance_network: weights of {sizes} do not fit {layout.num_levels} levels")
     return DISTANCE_NETWORK((positions, table, first, second), positions, table, first, second, layout, deferred)
+
+
+def following_positions(
+    positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout
+) -> Tensor:
+    """Return zeros (N, D + 3) that have the gradient of a network's outputs by the position.
+
+    Added to `distance_network` of positions without a gradient, they give it that gradient, in the compiled form too.
+    The gradient of the first output by the position counts as constant.
+
+    Args:
+        positions: (N, 3); coordinates are clamped to [0, 1], where the gradient is 0.
+        table, first, second, layout: as in `distance_network`.
+    """
+    hidden = torch.relu(hash_grid(positions, table.detach(), layout) @ first.detach().t())
+    outputs = hidden @ second.detach().t()
+    return torch.nn.functional.pad(outputs - outputs.detach(), (0, 3))
 
 
 def _reference(

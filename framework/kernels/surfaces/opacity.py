@@ -22,7 +22,7 @@ def surface_opacity(
         distances: (N,) signed distance f in the middle of each interval, negative inside.
         cosines: (N,) derivative of f along the ray.
         lengths: (N,) lengths of the intervals, in the unit of the distance.
-        sharpness: () inverse of the width in which a surface turns opaque.
+        sharpness: () inverse of the width over which a surface turns opaque.
         annealing: 1 for the paper's formula. Below 1, intervals along which the distance does not fall are partly
             opaque too, so that wrong surfaces that face away also have a gradient; 0 at the start of training.
 
@@ -33,7 +33,7 @@ def surface_opacity(
     if annealing < 1:
         falling = falling * annealing + torch.relu(0.5 - 0.5 * cosines) * (1 - annealing)
     half = falling * lengths / 2
-    # 1 - S(a) / S(b) = S(-a) (1 - exp(a - b)), in which nothing cancels.
+    # 1 - S(a) / S(b) = S(-a) (1 - exp(a - b)) has no cancellation.
     return torch.sigmoid(sharpness * (half - distances)) * -torch.expm1(-2 * sharpness * half)
 
 

@@ -1,4 +1,4 @@
-"""Samples of a signed distance that is a ball plus a network's output: what stops light there, and its colour's inputs.
+"""Samples of a signed distance, a ball plus a network's output: their opacity or density, and inputs of their colour.
 
 With the outputs y and the gradient dy_0 / du of a network in the unit box (`distance.py`), u = (x - low) scale:
 
@@ -39,7 +39,8 @@ class Ball(NamedTuple):
     radius: float
     """Radius, scene units."""
     rounding: float
-    """Radius within which the ball is rounded off at its centre, scene units; a distance has no gradient there."""
+    """Radius around the centre within which the distance is smoothed, scene units, because it has no gradient at the
+    centre."""
 
 
 class Intervals(NamedTuple):
@@ -50,7 +51,7 @@ class Intervals(NamedTuple):
     lengths: Tensor
     """(N,) lengths, scene units."""
     annealing: float = 1.0
-    """Share of the slope's annealing that is done (`surface_opacity`)."""
+    """Fraction of the slope's annealing that is done (`surface_opacity`)."""
 
 
 def ball_distance(network: Tensor, positions: Tensor, ball: Ball) -> tuple[Tensor, Tensor]:
@@ -96,12 +97,33 @@ def surface_samples_reference(
 
     `network`, `sharpness`, `positions`, `ball`, `intervals` and the result are as there.
     """
-    distances, gradients = ball_distance(network, positions, ball)
-    features = torch.cat([gradients, (positions - ball.centre) / ball.size, network[:, 1:-3]], dim=-1)
+    placed = (positions - ball.centre) / ball.size
+    return stopped_samples(*ball_distance(network, positions, ball), network[:, 1:-3], placed, sharpness, intervals)
+
+
+def stopped_samples(
+    distances: Tensor,
+    gradients: Tensor,
+    features: Tensor,
+    placed: Tensor,
+    sharpness: Tensor,
+    intervals: Intervals | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Return what stops light at samples of any distance, and the inputs of their colour, as `surface_samples` does.
+
+    Args:
+        distances: (N,) signed distances at the samples, scene units.
+        gradients: (N, 3) their gradients.
+        features: (N, F) further inputs of the colour.
+        placed: (N, 3) positions relative to the box.
+        sharpness: () inverse width of the surface, 1/length.
+        intervals: the intervals around the samples; None for points.
+    """
+    inputs = torch.cat([gradients, placed, features], dim=-1)
     if intervals is None:
-        return laplace_density(distances, 1 / sharpness), features
+        return laplace_density(distances, 1 / sharpness), inputs
     cosines = (gradients * intervals.directions).sum(-1)
-    return surface_opacity(distances, cosines, intervals.lengths, sharpness, intervals.annealing), features
+    return surface_opacity(distances, cosines, intervals.lengths, sharpness, intervals.annealing), inputs
 
 
 def unit_normals(features: Tensor) -> Tensor:

@@ -171,7 +171,7 @@ class _Samples(torch.autograd.Function):
 
 
 def _inputs(rows: Any, sharpness: Tensor, annealing: Tensor, ball: Ball) -> tuple[Any, ...]:
-    """Return the arguments that both kernels have after the network; points stand for what they lack."""
+    """Return the arguments of both kernels after the network; positions replace missing arguments."""
     positions, directions, lengths = rows if len(rows) == 3 else (rows[0],) * 3
     return positions, directions, lengths, sharpness, annealing, *ball
 

@@ -14,7 +14,7 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.strategy import Change, Strategy
 
 DROPPED, COPIED = 20, 5
-"""One in so many Gaussians goes at a change, and one in so many comes."""
+"""One Gaussian in this many is removed at a change, and one in this many is added."""
 
 
 class Fittest(Strategy):

@@ -1,4 +1,4 @@
-"""Surface: a signed distance, opaque as in NeuS (Wang et al. 2021, equation 13), whose gradient is to have length 1."""
+"""Surface: a signed distance with a gradient of length 1, opaque as in NeuS (Wang et al. 2021, equation 13)."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ class SurfaceConfig(SamplingConfig, max_num_iterations=2_000, samples_per_batch=
     """Settings of surface."""
 
     sharpness: float = 20.0
-    """Inverse of the width in which a surface turns opaque at first, 1/length."""
+    """First inverse of the width over which a surface turns opaque, 1/length."""
 
 
 class SurfaceField(Field):
@@ -44,7 +44,7 @@ class SurfaceField(Field):
         reach = directions * (deltas / 2)[:, None]
         inverse_width = self.log_sharpness.exp()
         ends = [self.shape(points.positions + side * reach)[0] * inverse_width for side in (-1, 1)]
-        # 1 - sigmoid(b) / sigmoid(a) in logarithms, in which neither underflows.
+        # 1 - sigmoid(b) / sigmoid(a) in logarithms, so that neither underflows.
         closed = -torch.expm1((nn.functional.logsigmoid(ends[1]) - nn.functional.logsigmoid(ends[0])).clamp(max=0))
         return closed, self.shape(points.positions)[1]
 

@@ -60,7 +60,7 @@ def test_each_ray_marches_through_the_slice_of_its_time() -> None:
 
 @pytest.mark.parametrize(("share", "cone"), [(0.02, 1 / 16), (0.3, 1 / 16), (0.3, 0.0)])
 def test_samples_in_nested_boxes(share: float, cone: float) -> None:
-    """Three boxes, of which the rays start in and outside the largest."""
+    """Three boxes; rays start inside and outside the largest."""
     rays, single = random_rays(33), occupancy(8, share)
     larger = [occupancy(8, share, seed).occupied for seed in (1, 2)]
     grid = replace(single, occupied=torch.cat([single.occupied, *larger]) & own_cells(3, 8), levels=3)

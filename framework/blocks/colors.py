@@ -1,0 +1,103 @@
+"""Colours of blocks that learned in different light, exposure or white balance, matched by affine functions.
+
+Block-NeRF (Tancik et al. 2022), section 4.3, matches a block to its neighbour by a search for its appearance vector.
+Here each block has a matrix of 3 x 4, fitted in closed form to pictures of the images that two blocks share. So it
+works with every method, and with exposure and white balance exactly; it cannot move the sun.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from nerfloom.blocks.block import IDENTITY, Affine
+from nerfloom.kernels.splats.project import DC
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.gaussians import Gaussians
+
+RIDGE = 1e-3
+"""Weight of the squared distance from the identity, beside the mean squared error of colours in [0, 1]."""
+
+
+def fitted_color(seen: Tensor, wanted: Tensor, ridge: float = RIDGE) -> Tensor:
+    """Return the affine function (3, 4) float64 of colours that makes pixels of one picture those of another.
+
+    It minimises the mean of |M x - y|^2, plus `ridge` times |M - I|^2.
+
+    Args:
+        seen: (N, 4) colour of the surface times opacity, and opacity, of N pixels.
+        wanted: (N, 3) colour of the surface times opacity, as they should be.
+        ridge: weight of the distance from the identity.
+    """
+    x, y = seen.double(), wanted.double()
+    identity = torch.tensor(IDENTITY, dtype=torch.float64, device=x.device)
+    moments = x.T @ x / max(len(x), 1) + ridge * torch.eye(4).to(x)
+    products = y.T @ x / max(len(x), 1) + ridge * identity
+    return torch.linalg.solve(moments, products.T).T
+
+
+def without_background(picture: Picture, background: Tensor) -> Tensor:
+    """Return colour times opacity, and opacity, of a picture's pixels, (H, W, 4).
+
+    Args:
+        picture: the picture.
+        background: (3,) the colour that it was rendered over.
+    """
+    behind = (1 - picture.accumulation)[..., None] * background
+    return torch.cat([picture.rgb - behind, picture.accumulation[..., None]], dim=-1)
+
+
+def recolored(picture: Picture, color: Affine, background: Tensor) -> Picture:
+    """Return a picture in other colours. The background keeps its own.
+
+    Args:
+        picture: the picture.
+        color: the affine function of colours.
+        background: (3,) the colour that it was rendered over.
+    """
+    matrix = torch.tensor(color, dtype=picture.rgb.dtype, device=picture.rgb.device)
+    behind = (1 - picture.accumulation)[..., None] * background
+    return replace(picture, rgb=without_background(picture, background) @ matrix.T + behind)
+
+
+def recolored_gaussians(gaussians: Gaussians, color: Affine) -> Gaussians:
+    """Return Gaussians in other colours. Their harmonics are linear in colour, so this is exact before clamping.
+
+    Args:
+        gaussians: N Gaussians.
+        color: the affine function of colours.
+    """
+    matrix = torch.tensor(color, dtype=torch.float64, device=gaussians.means.device)
+    turned, shift = matrix[:, :3], matrix[:, 3]
+    plain = (0.5 + DC * gaussians.colors.double()) @ turned.T + shift
+    return replace(
+        gaussians,
+        colors=((plain - 0.5) / DC).to(gaussians.colors),
+        harmonics=torch.einsum("ij,njk->nik", turned, gaussians.harmonics.double()).to(gaussians.harmonics),
+    )
+
+
+def matching_order(cameras: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+    """Return the order in which blocks are matched: pairs of a block and an earlier one, whose colours it takes over.
+
+    The first block is the one that shares most images with others; each next pair shares as many as any can (Prim's
+    algorithm for a largest spanning tree). A block that shares none with those before starts anew, and is in no pair.
+
+    Args:
+        cameras: indices of the images of each block.
+    """
+    sets = [set(each) for each in cameras]
+    shared = [[len(one & other) if one is not other else 0 for other in sets] for one in sets]
+    pairs, done = list[tuple[int, int]](), list[int]()
+    left = sorted(range(len(sets)), key=lambda number: (-sum(shared[number]), number))
+    while left:
+        block = left[0]
+        if found := max(((shared[b][r], -b, -r) for b in left for r in done if shared[b][r]), default=None):
+            block = -found[1]
+            pairs.append((block, -found[2]))
+        left.remove(block)
+        done.append(block)
+    return pairs

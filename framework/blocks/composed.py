@@ -1,0 +1,155 @@
+"""Blocks of a large scene in one picture: those near the camera, of which only a few are in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nerfloom.blocks.blend import blended, near_shares, visible_shares
+from nerfloom.blocks.block import TrainedBlock
+from nerfloom.blocks.colors import recolored, recolored_gaussians
+from nerfloom.blocks.merge import merged
+from nerfloom.cameras.moved import moved_cameras
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.view import View
+from nerfloom.data.scene import Scene
+from nerfloom.renderable import Renderable
+from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.gaussians import Gaussians, HasGaussians
+from nerfloom.splats.look import Look
+from nerfloom.splats.transform import transformed
+
+KEPT = 4
+"""Number of blocks in memory; where a grid of blocks overlaps, a place is in four of them."""
+MIN_SHARE = 1e-3
+"""Blocks with a smaller share are not drawn. It changes a colour by about a quarter of a step of 8 bits."""
+LOOK_SIDE = 16
+"""Shorter side of the pictures that tell how much of a view a block shows, pixels."""
+
+
+class Opened(NamedTuple):
+    """A block that is in memory."""
+
+    model: Renderable
+    """Its model, on its device."""
+    placement: Placement
+    """Placement of the input in the model's scene."""
+
+
+class Blocks(Renderable):
+    """Several blocks of a scene in one picture: Block-NeRF (Tancik et al. 2022, arXiv:2202.05263), section 4.3.
+
+    Blocks within reach of the camera are rendered, and blended by their inverse distance. Frames are converted in
+    float64 by the blocks' placements, so blocks need not share one. What a view shows of a block is estimated by the
+    mean opacity of a small picture of it.
+    """
+
+    def __init__(
+        self, blocks: Sequence[TrainedBlock], opened: Callable[[int], Opened], placement: Placement, scene: Scene
+    ) -> None:
+        """Open the first block, whose device and rays per pixel are those of all.
+
+        Args:
+            blocks: the blocks.
+            opened: returns a block by its number, from memory or loaded (`few_in_memory`).
+            placement: placement of the input in the composed scene.
+            scene: the composed scene.
+        """
+        self.blocks, self.opened, self.placement, self.scene = tuple(blocks), opened, placement, scene
+        first = opened(0).model
+        self._device, self._rays_per_pixel = first.device, first.rays_per_pixel
+        self._centers = torch.tensor([block.center for block in self.blocks], dtype=torch.float64)
+        self._radii = torch.tensor([block.radius for block in self.blocks], dtype=torch.float64)
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    @property
+    def rays_per_pixel(self) -> int:
+        return self._rays_per_pixel
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        shares = self.shares(view, background)
+        pictures = [
+            recolored(self.picture_of(number, view, background), self.blocks[number].color, background)
+            for number in shares
+        ]
+        return blended(pictures, list(shares.values()))
+
+    def shares(self, view: View, background: Tensor) -> dict[int, float]:
+        """Return the share in a picture of each block that it shows, by its number; they sum to 1.
+
+        Args:
+            view: the camera, in the composed scene.
+            background: (3,) colour of the background.
+        """
+        position = self.placement.original_points(view.camera.camera_to_worlds[:, :, 3].cpu())
+        shares = near_shares((self._centers - position).norm(dim=-1), self._radii)
+        near = _worth_drawing(shares)
+        if len(near) > 1:
+            coarse = replace(view, stride=view.stride * max(min(view.height, view.width) // LOOK_SIDE, 1))
+            visibilities = torch.zeros_like(shares)
+            for number in near:
+                visibilities[number] = float(self.picture_of(number, coarse, background).accumulation.mean())
+            shares = visible_shares(torch.where(shares >= MIN_SHARE, shares, 0.0), visibilities)
+            near = _worth_drawing(shares)
+        total = float(shares[near].sum())
+        return {number: float(shares[number]) / total for number in near}
+
+    def picture_of(self, number: int, view: View, background: Tensor) -> Picture:
+        """Return the picture of one block in its own colours, with lengths in units of the composed scene.
+
+        Args:
+            number: index of the block.
+            view: the camera, in the composed scene.
+            background: (3,) colour of the background.
+        """
+        model, placement = self.opened(number)
+        rotation, scale, shift = self.placement.similarity_to(placement)
+        camera = moved_cameras(view.camera, rotation, scale, shift)
+        picture = model.render_view(replace(view, camera=camera, image=None), background)
+        depths = picture.depth / scale, picture.median_depth / scale
+        return Picture(picture.rgb, *depths, picture.accumulation, num_rays=picture.num_rays)
+
+
+class GaussianBlocks(Blocks):
+    """Blocks that consist of Gaussians, which can be merged into those of one scene."""
+
+    def gaussians(self, time: float | None = None) -> Gaussians:
+        """Return the Gaussians of all blocks at a `time`, in the composed scene, on the CPU (`merge.merged`)."""
+        parts = []
+        for number, block in enumerate(self.blocks):
+            model, placement = self.opened(number)
+            assert isinstance(model, HasGaussians)
+            own = model.gaussians(time).map(lambda values: values.detach().cpu())
+            own = transformed(own, *placement.similarity_to(self.placement))
+            parts.append(recolored_gaussians(own, block.color))
+        return merged(parts, self.placement.points(self._centers))
+
+    def look(self) -> Look:
+        """Return the settings of drawing, which are those of the first block."""
+        first = self.opened(0).model
+        assert isinstance(first, HasGaussians)
+        return first.look()
+
+
+def few_in_memory(opened: Callable[[int], Opened], kept: int = KEPT) -> Callable[[int], Opened]:
+    """Return a function that loads blocks as `opened` does, and keeps some of them in memory.
+
+    Args:
+        opened: loads a block, given its number.
+        kept: number of blocks that are kept. The one that was not used for longest leaves.
+    """
+    return lru_cache(maxsize=kept)(opened)
+
+
+def _worth_drawing(shares: Tensor) -> list[int]:
+    """Return the blocks with a share of at least MIN_SHARE, the largest first."""
+    order = shares.argsort(descending=True, stable=True)
+    return order[shares[order] >= MIN_SHARE].tolist()

@@ -1,0 +1,45 @@
+"""Points that another program exported beside its cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from nerfloom.base.console import say
+from nerfloom.data.ply import read_columns, read_header, vertices
+from nerfloom.processing.capture import Capture, check_points
+
+COLORS = ("red", "green", "blue")
+"""Properties of coloured vertices."""
+GREY = 128
+"""Colour of points without colour."""
+
+
+def with_points(capture: Capture, file: Path | None) -> Capture:
+    """Return a capture with the points of a PLY file in place of its own.
+
+    Args:
+        capture: the capture.
+        file: the PLY file, in the frame of the program; None leaves the capture as it is.
+
+    Raises:
+        DataError: if the file cannot be read, has no vertices, or most of them are far from the cameras.
+    """
+    if file is None:
+        return capture
+    element = vertices(file, read_header(file))
+    colored = set(COLORS) <= set(element.names)
+    columns = read_columns(file, element, [*"xyz", *(COLORS if colored else ())])
+    points = np.stack(columns[:3], axis=1).astype(np.float64)
+    colors = np.stack(columns[3:], axis=1) if colored else np.full(points.shape, GREY)
+    if dict(element.columns).get("red", "u1").startswith("f"):
+        colors = colors * 255.0  # colours that are not whole numbers are from 0 to 1
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        say(f"{file}: {int((~finite).sum()):,} of {len(points):,} points are not finite and left out")
+    kept = np.nan_to_num(colors[finite].astype(np.float64)).clip(0, 255).round().astype(np.uint8)
+    made = replace(capture, points=points[finite], colors=kept)
+    check_points(made, file)
+    return made

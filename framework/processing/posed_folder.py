@@ -1,0 +1,169 @@
+"""The data folder of a capture that another program placed: images, views of panoramas, points and transforms.json."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.processing.capture import Capture, PosedCamera
+from nerfloom.processing.images import PreparedImage, in_parallel, output_names, prepare_all, save
+from nerfloom.processing.named_images import PlacedImages, reasons
+from nerfloom.processing.output import FINISHED, ready
+from nerfloom.processing.pyramid import write_pyramid
+from nerfloom.processing.transforms import Frame, Lens, content, transformed, write, write_points
+from nerfloom.processing.views import View, Views, cut, view_lens
+
+POINTS = "sparse_pc.ply"
+"""File of the points."""
+PANORAMA, PERSPECTIVE = "EQUIRECTANGULAR", "OPENCV"
+"""Models of lenses."""
+
+
+@dataclass(frozen=True)
+class _Posed:
+    """A prepared image with its pose and its lens."""
+
+    image: PreparedImage
+    pose: np.ndarray
+    lens: Lens
+
+
+def write_capture(
+    folder: Path,
+    capture: Capture,
+    placed: PlacedImages,
+    output: Path,
+    num_downscales: int,
+    views: Views | None,
+) -> None:
+    """Write the data folder of a capture, and report how many of its cameras are in it and why others are not.
+
+    A data folder has one model of lens. If a capture has several, images of wide lenses are cut into perspective views.
+
+    Args:
+        folder: folder of the photographs.
+        capture: the capture.
+        placed: the image files of its cameras.
+        output: the output folder, claimed by `output.claim`.
+        num_downscales: number of folders of reduced images.
+        views: views that panoramas are cut into; None keeps them whole.
+
+    Raises:
+        DataError: if no image can be used, or panoramas cannot be kept because other lenses were used, too.
+    """
+    # Poses refer to the pixels as they are stored, so images are not turned upright.
+    prepared, unreadable = prepare_all(folder, list(placed.cameras), output / "images", upright=False)
+    posed, misfits = _with_lenses(prepared, placed.cameras, capture.frame, output / "images")
+    spoilt = Counter({"with an unreadable image": len(unreadable), "with an image of another shape": len(misfits)})
+    left_out = capture.left_out + placed.left_out + spoilt
+    if not posed:
+        raise DataError(f"no image of {folder} fits its camera, the first: {misfits[0]}")
+    say(f"{capture.program}: {len(posed)} of {capture.total} cameras are placed{_listed(left_out)}")
+    if misfits:
+        say(f"{len(misfits)} images do not fit their cameras, the first: {misfits[0]}")
+    frames = _frames(posed, _models_to_cut({entry.lens.model for entry in posed}, views), views, output)
+    if capture.points is not None and capture.colors is not None:
+        points = capture.points @ capture.frame[:, :3].T + capture.frame[:, 3]
+        write_points(output / POINTS, points, capture.colors)
+        say(f"{len(points):,} points")
+    masks = [frame.mask for frame in frames if frame.mask is not None]
+    write_pyramid(output / "images", [frame.name for frame in frames], num_downscales)
+    write_pyramid(output / "masks", masks, num_downscales if masks else 0, masks=True)
+    more = {"orientation_override": "none"} if capture.z_is_up else {}
+    name = None if capture.points is None else POINTS
+    write(output / FINISHED, content(frames, capture.frame, name, more))
+    say(ready(output))
+
+
+def _with_lenses(
+    prepared: Iterable[PreparedImage], placed: dict[Path, PosedCamera], frame: np.ndarray, images: Path
+) -> tuple[list[_Posed], list[str]]:
+    """Return the images whose size fits their camera, and messages about the others, which are removed."""
+    posed: list[_Posed] = []
+    misfits: list[str] = []
+    for image in prepared:
+        camera = placed[Path(image.source)]
+        try:
+            lens = camera.lens(image.width, image.height)
+        except DataError as error:
+            misfits.append(f"{image.source}: {error}")
+            (images / image.name).unlink()
+            continue
+        posed.append(_Posed(image, transformed(camera.pose, frame), lens))
+    return posed, misfits
+
+
+def _listed(left_out: Counter[str]) -> str:
+    return f" (left out: {reasons(left_out)})" if left_out.total() else ""
+
+
+def _models_to_cut(models: set[str], views: Views | None) -> set[str]:
+    """Return the models of lenses whose images are cut into views, so that one model remains."""
+    if views is None and PANORAMA in models and len(models) > 1:
+        raise DataError("--panoramas whole: there are images of other lenses, too, and a data folder has one model")
+    if len(models) == 1:
+        return set() if views is None else models & {PANORAMA}
+    return models - {PERSPECTIVE}
+
+
+def _frames(posed: list[_Posed], models: set[str], views: Views | None, output: Path) -> list[Frame]:
+    """Return the frames, after cutting the images of some models of lenses."""
+    whole = [entry for entry in posed if entry.lens.model not in models]
+    wide = [entry for entry in posed if entry.lens.model in models]
+    frames = [Frame(entry.image.name, entry.pose, entry.lens, source=entry.image.source) for entry in whole]
+    if not wide:
+        return frames
+    views = views or Views(8, 90.0)  # fisheye images beside perspective ones
+    names = _view_names([entry.image.name for entry in posed], wide, views)
+
+    def cut_one(index: int) -> list[Frame]:
+        return _cut(wide[index], names[index], views, output)
+
+    made = list(chain.from_iterable(in_parallel(cut_one, range(len(wide)), "Cutting views", len(wide))))
+    if not made:
+        raise DataError("no view shows enough of its image; use a smaller --view-angle")
+    say(f"{len(wide)} images of wide lenses are cut into {len(made)} views of {views.angle:g} degrees")
+    return [*frames, *made]
+
+
+def _view_names(taken: list[str], wide: list[_Posed], views: Views) -> list[list[str]]:
+    """Return a name for each view of each image, different from the names that are taken."""
+    count = len(views.directions)
+    wanted = [Path(name) for name in taken]
+    for entry in wide:
+        path = PurePosixPath(entry.image.name)
+        wanted += [Path(path.with_name(f"{path.stem}_view{number}{path.suffix}")) for number in range(count)]
+    names = output_names(wanted)[len(taken) :]
+    return [names[start : start + count] for start in range(0, len(names), count)]
+
+
+def _cut(entry: _Posed, names: list[str], views: Views, output: Path) -> list[Frame]:
+    """Write the views of an image, with masks where they reach beyond it, and remove the image."""
+    path = output / "images" / entry.image.name
+    with Image.open(path) as opened:
+        pixels = np.asarray(opened.convert("RGBA" if "A" in opened.getbands() else "RGB"))
+    lens = view_lens(entry.lens, views.angle)
+    frames = [_write_view(view, names[view.number], entry, lens, output) for view in cut(pixels, entry.lens, views)]
+    path.unlink()
+    return frames
+
+
+def _write_view(view: View, name: str, entry: _Posed, lens: Lens, output: Path) -> Frame:
+    save(Image.fromarray(view.pixels), output / "images" / name)
+    pose = entry.pose.copy()
+    pose[:3, :3] = entry.pose[:3, :3] @ view.rotation
+    mask = None
+    if not view.seen.all():
+        mask = f"{name}.png"
+        target = output / "masks" / mask
+        target.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.where(view.seen, 255, 0).astype(np.uint8)).save(target)
+    return Frame(name, pose, lens, mask, source=entry.image.source)

@@ -1,0 +1,249 @@
+"""Batches of a teacher's views, in turns with batches of photographs.
+
+A teacher renders views between and around the training cameras, so that its rays lie within what these can see. A batch
+of its views has no image: light, exposure and poses that images have of their own are not learnt from it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerfloom.base.config import TrainConfig
+from nerfloom.base.device import stream_seed
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.cameras import Cameras, subpixels
+from nerfloom.cameras.unseen import unseen_poses
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels.batch import Background, PixelBatch, ViewBatch, background_colors, training_background
+from nerfloom.data.sources import BatchSource, Request, make_source
+from nerfloom.model import Model
+from nerfloom.renderable import RendersFromImages
+from nerfloom.rendering.rendered import Picture
+from nerfloom.training.distillation import TakesTeacher
+from nerfloom.training.teacher import Teacher, load_teacher
+
+VIEWS = 4
+"""Number of views that the pixels of a batch come from."""
+PICTURES = 48
+"""Number of whole pictures that a teacher renders, each when it is first drawn."""
+MAX_SIDE = 800
+"""Maximum longer side of a whole picture in pixels; views of larger images are reduced."""
+OPAQUE = 0.95
+"""Minimum opacity of a pixel for its distance to count."""
+PICTURE_STREAM = -3
+"""Random stream of a whole picture, beside those of steps (`nerfloom.base.device`)."""
+
+
+def is_taught(step: int, share: float) -> bool:
+    """Return whether a step belongs to the teacher.
+
+    The steps are spread evenly by the radical inverse in base 2 (van der Corput 1935), a number in [0, 1) of each step:
+    of any 2^m steps from a multiple of 2^m on, a share of k / 2^m has exactly k. It needs no memory, so that a resumed
+    run goes on with the same steps.
+
+    Args:
+        step: number of training steps done.
+        share: share of the steps that belong to the teacher.
+    """
+    return int(f"{step:b}"[::-1], 2) / 2 ** step.bit_length() < share
+
+
+def unseen_cameras(cameras: Cameras, near: Tensor) -> Cameras:
+    """Return random cameras between and around given ones, with their lenses and sizes.
+
+    Args:
+        cameras: M training cameras.
+        near: (V,) int64 on the CPU, index of a camera for each.
+    """
+    poses = unseen_poses(cameras.camera_to_worlds.cpu(), near)
+    return replace(cameras[near], camera_to_worlds=poses.to(cameras.camera_to_worlds))
+
+
+def known_depths(picture: Picture) -> Tensor:
+    """Return the distances (H, W) along the rays of a picture, 0 where it is not opaque."""
+    return torch.where(picture.accumulation > OPAQUE, picture.median_depth, 0.0)
+
+
+class TaughtPixels(BatchSource):
+    """Draws pixels of views that a teacher renders for the batch.
+
+    Args:
+        teacher: the teacher.
+        dataset: the training images, whose cameras say what can be seen.
+        background: background of transparent pixels, one colour for a view.
+    """
+
+    def __init__(self, teacher: Teacher, dataset: Dataset, background: Background) -> None:
+        self.teacher, self.dataset, self.background = teacher, dataset, background
+
+    def draw(self, request: Request) -> PixelBatch:
+        dataset, device, count = self.dataset, self.dataset.device, max(request.num_pixels // VIEWS, 1)
+        near = torch.randint(len(dataset), (min(VIEWS, request.num_pixels),))
+        cameras, times = unseen_cameras(dataset.cameras, near), None if dataset.times is None else dataset.times[near]
+        behind = background_colors(self.background, len(near), device)
+        numbers, shown = list[Tensor](), list[tuple[Tensor, ...]]()
+        for index in range(len(near)):
+            pixels, values = self._pixels(View.of(cameras, index, times), count, request.rays_per_pixel, behind[index])
+            numbers.append(pixels)
+            shown.append(values)
+        rgb, opacity, distances = (torch.cat(parts) for parts in zip(*shown, strict=True))
+        each = torch.tensor([len(pixels) for pixels in numbers], device=device)
+        own = torch.cat([first + pixels for first, pixels in zip(cameras.ends, numbers, strict=False)])
+        rays = cameras.pixel_rays(
+            own, dataset.scene.near, dataset.scene.far, times, subpixels(request.rays_per_pixel, device)
+        )
+        return PixelBatch(
+            torch.cat([dataset.cameras.ends[n] + pixels for n, pixels in zip(near.tolist(), numbers, strict=True)]),
+            replace(rays, camera_indices=None),
+            rgb,
+            behind.repeat_interleave(each, 0),
+            opacity if dataset.scene.has_alpha else None,
+            distances,
+        )
+
+    def _pixels(self, view: View, count: int, per_pixel: Any, behind: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Return the numbers (P,) of at most `count` pixels of a view, and colours, opacities and distances of each."""
+        height, width = view.camera.sizes[0]
+        stride = max(math.isqrt(height * width // count), 1)
+        view = replace(view, stride=stride, rays_per_pixel=per_pixel)
+        picture = self.teacher.picture(view, behind)
+        numbers = view.pixels().reshape(-1)
+        chosen = torch.randperm(len(numbers))[:count].to(numbers.device)
+        values = picture.rgb.reshape(-1, 3), picture.accumulation.reshape(-1), known_depths(picture).reshape(-1)
+        return numbers[chosen], tuple(each[chosen] for each in values)
+
+    def drawing_from(self, dataset: Dataset) -> TaughtPixels:
+        return TaughtPixels(self.teacher, dataset, self.background)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture of a teacher, before a black background."""
+
+    view: View
+    """Its camera, in the pupil's scene."""
+    rgb: Tensor
+    """(H, W, 3) float16 light."""
+    opacity: Tensor
+    """(H, W) float16."""
+    distances: Tensor
+    """(H, W) distances along the rays, 0 where unknown."""
+
+
+class TaughtViews(BatchSource):
+    """Draws whole pictures of a teacher, from a fixed number of views.
+
+    A field on a CPU takes longer for a picture than Gaussians for a step, so each view is rendered once.
+
+    Args:
+        teacher: the teacher.
+        dataset: the training images, whose cameras say what can be seen.
+        background: background of transparent pixels, one colour for the whole picture.
+        seed: seed of the run.
+    """
+
+    def __init__(self, teacher: Teacher, dataset: Dataset, background: Background, seed: int) -> None:
+        self.teacher, self.dataset, self.background, self.seed = teacher, dataset, background, seed
+        sizes = torch.maximum(dataset.cameras.widths, dataset.cameras.heights)
+        factor = min(1.0, MAX_SIDE / int(sizes.max()))
+        self.cameras = dataset.cameras if factor == 1 else dataset.cameras.scaled(factor)
+        self._shots: dict[int, Shot] = {}
+
+    def draw(self, request: Request) -> ViewBatch:
+        number = int(torch.randint(PICTURES, ()))
+        behind = background_colors(self.background, 1, self.dataset.device)[0]
+        if number not in self._shots:
+            self._shots[number] = self._shot(number)
+        shot = self._shots[number]
+        rgb, opacity = shot.rgb.float(), shot.opacity.float()
+        if not self.dataset.scene.has_alpha:
+            return ViewBatch(None, shot.view, rgb, behind, distances=shot.distances)
+        rgb = rgb + (1 - opacity[..., None]) * behind
+        return ViewBatch(None, shot.view, rgb, behind, opacity, distances=shot.distances)
+
+    def _shot(self, number: int) -> Shot:
+        """Render a picture; its view depends on the seed and its `number` only."""
+        times = self.dataset.times
+        with torch.random.fork_rng(devices=[]):  # whether a picture is new must not change what is drawn after it
+            torch.default_generator.manual_seed(stream_seed(self.seed, number, PICTURE_STREAM))
+            near = torch.randint(len(self.cameras), (1,))
+            view = View.of(unseen_cameras(self.cameras, near), 0, None if times is None else times[near])
+            picture = self.teacher.picture(view, torch.zeros(3, device=self.dataset.device))
+        return Shot(view, picture.rgb.half(), picture.accumulation.half(), known_depths(picture))
+
+    def drawing_from(self, dataset: Dataset) -> TaughtViews:
+        return TaughtViews(self.teacher, dataset, self.background, self.seed)
+
+
+class MixedSource(BatchSource):
+    """Draws batches of photographs, and of a teacher in a share of the steps.
+
+    Args:
+        photographs: source of the photographs.
+        taught: source of the teacher's views.
+        share: share of the teacher at the start; it falls linearly.
+        until: fraction of the budget from which on the share is 0, more than 0.
+    """
+
+    varies = "a teacher renders some of the batches"
+
+    def __init__(self, photographs: BatchSource, taught: BatchSource, share: float, until: float) -> None:
+        self.photographs, self.taught, self.share, self.until = photographs, taught, share, until
+        self.dataset, self.contradicted = photographs.dataset, photographs.contradicted
+
+    def of(self, request: Request) -> BatchSource:
+        """Return the source of the batch for `request`."""
+        share = self.share * max(1 - request.progress / self.until, 0.0)
+        return self.taught if is_taught(request.step, share) else self.photographs
+
+    def draw(self, request: Request) -> Any:
+        return self.of(request).draw(request)
+
+    def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:
+        self.of(request).learn(request, batch, rgb)
+
+    def drawing_from(self, dataset: Dataset) -> MixedSource:
+        return MixedSource(
+            self.photographs.drawing_from(dataset), self.taught.drawing_from(dataset), self.share, self.until
+        )
+
+    def state(self) -> Tensor | None:
+        return self.photographs.state()
+
+    def restore(self, state: Tensor | None) -> None:
+        self.photographs.restore(state)
+
+
+def batch_source(model: Model[Any], dataset: Dataset, config: TrainConfig) -> BatchSource:
+    """Return the source of a model's training batches: photographs, and a teacher's views if there is a teacher.
+
+    A model that asks a teacher itself is given it.
+
+    Args:
+        dataset: the training images, on the device.
+        config: the settings of the run.
+
+    Raises:
+        ConfigError: if settings contradict each other, or the teacher is missing or cannot teach the model.
+    """
+    photographs = make_source(model.batches, dataset, config)
+    if config.teacher is None:
+        return photographs
+    if isinstance(model, RendersFromImages):
+        raise ConfigError("--teacher: a method that renders from photographs has nothing to learn from other pictures")
+    teacher = load_teacher(config.teacher, dataset)
+    if isinstance(model, TakesTeacher):
+        model.take_teacher(teacher)
+    if not config.teacher_share * config.teacher_until:
+        return photographs
+    background = training_background(config.background, dataset.scene.has_alpha)
+    taught: BatchSource = TaughtPixels(teacher, dataset, background)
+    if model.batches == "views":
+        taught = TaughtViews(teacher, dataset, background, config.machine.seed)
+    return MixedSource(photographs, taught, config.teacher_share, config.teacher_until)

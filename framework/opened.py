@@ -20,7 +20,7 @@ class Opened(Loaded):
 
     @classmethod
     def of(cls, loaded: Loaded) -> Opened:
-        """Return what is `loaded` with these methods; both share the images that have been read."""
+        """Return `loaded` with these methods; both share the images that have been read."""
         return cls(**vars(loaded))
 
     def render_path(self, name: str, file: str | Path, **settings: Any) -> None:

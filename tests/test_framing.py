@@ -87,5 +87,5 @@ def test_colours_are_named_or_hexadecimal() -> None:
     assert color_of("white") == (1, 1, 1)
     assert color_of("#ff8000") == (1, 128 / 255, 0)
     for wrong in ("red", "#fff", "#gg0000", "ff8000", ""):
-        with pytest.raises(ConfigError, match="is no colour"):
+        with pytest.raises(ConfigError, match="is not a colour"):
             color_of(wrong)

@@ -26,6 +26,6 @@ def color_of(text: str) -> tuple[float, float, float]:
     if text in NAMES:
         return NAMES[text]
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
-        raise ConfigError(f"{shown(text)} is no colour: take {', '.join(NAMES)}, or #RRGGBB such as #e8e8ea")
+        raise ConfigError(f"{shown(text)} is not a colour: use {', '.join(NAMES)}, or #RRGGBB such as #e8e8ea")
     red, green, blue = (int(text[start : start + 2], 16) / 255 for start in (1, 3, 5))
     return red, green, blue

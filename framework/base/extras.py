@@ -34,7 +34,7 @@ def install_command(extra: str) -> str | None:
 
 
 def require(extra: str, what: str, otherwise: str = "") -> None:
-    """Refuse to go on if packages of an extra are missing.
+    """Check that the packages of an extra are installed.
 
     Args:
         extra: a key of `EXTRAS`.

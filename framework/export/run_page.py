@@ -181,7 +181,7 @@ def start_of(names: Sequence[str], wanted: str | None) -> int:
 
 
 def check_url(url: str | None) -> None:
-    """Refuse an address, `url`, that is none of a page; None is accepted.
+    """Check that `url` is the address of a web page, or None.
 
     Raises:
         FlagError: with what an address begins with.

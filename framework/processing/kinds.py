@@ -48,7 +48,7 @@ def process(name: str, flags: OutputFlags) -> None:
     Raises:
         ConfigError: if a flag is out of range, or COLMAP is missing.
         DataError: if the input cannot be used.
-        Stopped: if a signal ends it; the message says how to go on.
+        Stopped: if a signal ends it; the message says how to continue.
     """
     flags.check()
     try:

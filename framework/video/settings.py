@@ -101,7 +101,7 @@ class PathSettings(FileSettings, ViewSettings):
         """Return the colour behind the scene, 0 to 1; None for the run's.
 
         Raises:
-            ConfigError: if it is no colour.
+            ConfigError: if it is not a colour.
         """
         return None if self.background is None else color_of(self.background)
 

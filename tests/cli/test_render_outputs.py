@@ -326,7 +326,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     assert "--seconds is 0; it must be above zero" in said("interpolate", nowhere, "--seconds", 0)
     assert "--width is 0" in said("time", nowhere, "--width", 0)
     assert "--fov is 180" in said("camera-path", nowhere, "--fov", 180)
-    assert "'pink' is no colour" in said("orbit", nowhere, "--background", "pink")
+    assert "'pink' is not a colour" in said("orbit", nowhere, "--background", "pink")
     words = ("--frame", "exports", "--dataparser-transforms", nowhere)
     assert "--frame exports has none" in said("camera-path", nowhere, *words)
     avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi", status=2)

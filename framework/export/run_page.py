@@ -78,11 +78,7 @@ class Closeness:
 
 
 def export_page(
-    loaded: Loaded,
-    path: Path,
-    settings: WebSettings,
-    splatting: Method,
-    regions: Sequence[Region] = (),
+    loaded: Loaded, path: Path, settings: WebSettings, splatting: Method, regions: Sequence[Region] = ()
 ) -> None:
     """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 

@@ -80,7 +80,7 @@ class Nerfstudio(Captured):
 
         Devices and other programs know which way is up, also where cameras look straight down.
         """
-        stated = content.get("orientation_override")
+        stated: Any = content.get("orientation_override")
         known = self.orientation_method == "auto" and stated in STATED_ORIENTATIONS
         return replace(self, orientation_method=stated) if known else self
 

@@ -14,12 +14,12 @@ from nerfloom.base.optimised import DefersGradient
 from nerfloom.base.protocols import SeesRegistered
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.appearance import Appearance
-from nerfloom.renderable import HasAppearance
+from nerfloom.renderable import HasAppearance, RefinesPoses
 from nerfloom.samplers.base import SkipsCells, StopsEarly
 from nerfloom.samplers.occupancy import OccupancySampler
 
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
-WITH_ATTRIBUTES = (SkipsCells, StopsEarly, HasAppearance, DefersGradient)
+WITH_ATTRIBUTES = (SkipsCells, StopsEarly, HasAppearance, RefinesPoses, DefersGradient)
 
 
 class WithAppearance(nn.Module):

@@ -63,7 +63,8 @@ def framed(cameras: Cameras, width: int | None = None, height: int | None = None
     if fov is not None:
         found = perspective(cameras.camera_to_worlds, width, height, fov)
         numbers = {name: getattr(found, name) for name in ("fx", "fy", "cx", "cy")}
-        return replace(cameras, **numbers, **sizes, model="pinhole", lens=None)
+        pinhole = replace(cameras, model="pinhole", lens=None)
+        return replace(pinhole, **numbers, **sizes)
     scale = (width * height / (before_width * before_height)) ** 0.5
     if cameras.model == "equirectangular" and round(before_width * scale) != width:
         raise ConfigError(

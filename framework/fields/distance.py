@@ -79,7 +79,8 @@ class Distance(nn.Module, ABC):
             intervals: the intervals around the samples; None for points.
         """
         placed = (positions - self.centre) / self.size
-        return stopped_samples(*self(positions), placed, sharpness, intervals)
+        shape: Shape = self(positions)
+        return stopped_samples(shape.distances, shape.gradients, shape.features, placed, sharpness, intervals)
 
 
 class GridDistance(Distance):

@@ -113,7 +113,7 @@ def test_points_judge_too(ball: Path, tmp_path: Path) -> None:
     assert found["normals"] is None
     assert found["left_out"] == {"beyond": 0, "outside": 0, "masked": 0, "hidden": 0}
     assert "normals: the reference has none" in done.stderr
-    assert "points are some 0.02" in done.stderr
+    assert "points are about 0.02" in done.stderr
     assert "every point counts" in done.stderr
 
 

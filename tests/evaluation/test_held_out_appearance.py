@@ -55,6 +55,9 @@ class Lit:
     def view(self, index: int) -> View:
         return View.of(self.cameras, index)
 
+    def refined_poses(self, poses: torch.Tensor, training: bool) -> torch.Tensor:
+        return poses
+
 
 def test_a_view_has_the_light_of_the_nearest_image() -> None:
     lit = Lit()

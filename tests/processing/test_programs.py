@@ -298,7 +298,7 @@ def test_coordinates_of_a_map_lose_nothing(tmp_path: Path) -> None:
     moved = []
     for row in rows:
         name, x, y, z, *rest = row.split(",")
-        moved.append(",".join([name, *(repr(float(a) + b) for a, b in zip((x, y, z), far, strict=True)), *rest]))
+        moved.append(",".join([name, *(repr(float(a) + float(b)) for a, b in zip((x, y, z), far, strict=True)), *rest]))
     file.write_text("\n".join([head, *moved]))
     points = realitycapture_world(0, in_view(0)) + far
     flags = ("--csv", file, "--ply", write_ply(tmp_path / "points.ply", points))

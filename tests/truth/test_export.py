@@ -79,7 +79,7 @@ def test_exported_points_normals_and_colours_are_in_the_captures_frame(
     in_scene = scale * (truth @ transform[:, :3].T + transform[:, 3])
     as_tensors = [torch.from_numpy(x).float() for x in (in_scene, 0.5 + 0.4 * normals, normals @ transform[:, :3].T)]
     found = SurfacePoints(*as_tensors, -as_tensors[2], torch.arange(50))
-    monkeypatch.setattr("nerfloom.export.points.surface_points", lambda *_: iter([found]))
+    monkeypatch.setattr("nerfloom.export.point_cloud.surface_points", lambda *_: iter([found]))
     untrained.save()
     command(
         "ns-export", "pointcloud", "--load-config", tmp_path / "run" / "config.yml", "--output-dir", tmp_path,

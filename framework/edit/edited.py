@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
-from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.poses import Placement, rotation_between
 from nerfloom.cameras.scale import Scale
 from nerfloom.edit.similarity import Similarity
 from nerfloom.export.run_page import moment_of
@@ -19,6 +19,9 @@ from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.placed_files import in_input, write_placed
 from nerfloom.splats.transform import transformed, transformed_in_float64
 from nerfloom.training.loaded import Loaded
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+"""The up direction of scenes, and of Gaussians that have been set up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +38,9 @@ class Edited:
     """Placement of their frame in the scene of `loaded`."""
     loaded: Loaded | None = None
     """The run or file that they are from; None for others."""
-    is_level: bool = False
-    """Whether +z of their frame is up, as `set_up` and `align_floor` make it; if not, `placement` tells."""
+    up: Tensor | None = None
+    """(3,) float64 direction of their frame that `set_up` or `align_floor` has made up; it turns with the Gaussians.
+    None for the up direction of the scene of `loaded`."""
 
     @classmethod
     def of(cls, loaded: Loaded, time: float | None = None) -> Edited:
@@ -87,7 +91,7 @@ class Edited:
             gaussians=transformed_in_float64(self.gaussians, rotation, scale, shift),
             placement=self.placement.after(applied, scale),
             scale=self.scale if scale == 1 else Scale(),
-            is_level=self.is_level and bool(rotation[2, 2] > 1 - 1e-12),
+            up=None if self.up is None else rotation @ self.up,
         )
 
     def in_scene(self) -> Gaussians:
@@ -103,6 +107,8 @@ class Edited:
     def write(self, file: str | Path, max_megabytes: float | None = None) -> list[str]:
         """Write the Gaussians in the format of the file's suffix, about a local origin if they are far from theirs.
 
+        In a .glb file, everything is turned so that `upwards` is +y.
+
         Args:
             file: path of the file, with a suffix of `nerfloom.splats.files.SUFFIXES`.
             max_megabytes: maximum size of the file in millions of bytes; None for any.
@@ -114,8 +120,9 @@ class Edited:
             ConfigError: if the format cannot hold the Gaussians, or no file fits the size.
             OSError: if the file cannot be written.
         """
-        placement = Placement.of(None, 1.0) if self.is_level else self.placement
-        return write_placed(Path(file), self.gaussians, self.look, self.scale, placement, max_megabytes)
+        turned = torch.eye(4, dtype=torch.float64)[:3]
+        turned[:, :3] = rotation_between(self.upwards, UP)
+        return write_placed(Path(file), self.gaussians, self.look, self.scale, Placement(turned, 1.0), max_megabytes)
 
     def photographed(self, step: str) -> Loaded:
         """Return the run or file whose photographs show the Gaussians.
@@ -129,6 +136,12 @@ class Edited:
         if self.loaded is None or self.loaded.source is None:
             raise ConfigError(f"{step} needs the photographs: edit a run, or give --data DIR")
         return self.loaded
+
+    @property
+    def upwards(self) -> Tensor:
+        """Direction (3,) float64 of their frame that is up, of unit length."""
+        found = self.placement.original_directions(UP[None])[0] if self.up is None else self.up
+        return found / found.norm()
 
     @property
     def has_photographs(self) -> bool:

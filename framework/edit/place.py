@@ -11,7 +11,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import rotation_between
 from nerfloom.cameras.scale import Scale, checked
-from nerfloom.edit.edited import Edited
+from nerfloom.edit.edited import UP, Edited
 from nerfloom.edit.floor import find_floor
 from nerfloom.edit.similarity import Similarity, about, axis_rotation, direction, vector
 from nerfloom.geometry.alignment import align
@@ -19,8 +19,6 @@ from nerfloom.geometry.regions import Vector
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 """The origin."""
-Z: Vector = (0.0, 0.0, 1.0)
-"""The direction that is up."""
 
 
 def move(edited: Edited, by: Vector) -> Edited:
@@ -60,7 +58,8 @@ def scale(edited: Edited, factor: float, center: Vector = ORIGIN, unit: str = ""
     moved = edited.moved(about(vector(center), scale=factor))
     if not unit:
         return moved
-    return replace(moved, scale=checked(Scale(factor * edited.scale.factor, unit), "scale"))
+    before = edited.scale
+    return replace(moved, scale=checked(Scale(factor * before.factor, unit, before.relative_error), "scale"))
 
 
 def set_up(edited: Edited, up: Vector) -> Edited:
@@ -72,8 +71,8 @@ def set_up(edited: Edited, up: Vector) -> Edited:
     Raises:
         ConfigError: if it has no length.
     """
-    moved = edited.moved(about(vector(ORIGIN), rotation_between(direction(up, "up"), vector(Z))))
-    return replace(moved, is_level=True)
+    moved = edited.moved(about(vector(ORIGIN), rotation_between(direction(up, "up"), UP)))
+    return replace(moved, up=UP)
 
 
 def align_points(
@@ -103,7 +102,7 @@ def align_points(
 
 def align_floor(
     edited: Edited,
-    up: Vector = Z,
+    up: Vector | None = None,
     max_tilt: float = 45.0,
     tolerance: float | None = None,
     min_opacity: float = 0.5,
@@ -114,7 +113,8 @@ def align_floor(
     The floor is the plane on which most opaque Gaussians have their centres, and few below.
 
     Args:
-        up: the direction that is about upwards, of any length but 0.
+        up: the direction that is about upwards, of any length but 0; None for that of the last `set_up` or
+            `align_floor`, or else of the scene, which the cameras of photographs tell.
         max_tilt: maximum angle between it and the floor's normal, degrees.
         tolerance: maximum distance of the floor's centres from it; None for 1 % of the scene's size.
         min_opacity: minimum opacity of the Gaussians that count.
@@ -125,10 +125,11 @@ def align_floor(
     """
     gaussians = edited.gaussians
     opaque = gaussians.means[torch.sigmoid(gaussians.logits) >= min_opacity]
-    floor = find_floor(opaque, direction(up, "up"), max_tilt, tolerance, seed)
-    rotation = rotation_between(floor.normal, vector(Z))
-    tilt = math.degrees(2 * math.asin(min(float((floor.normal - vector(Z)).norm()) / 2, 1.0)))
+    upwards = edited.upwards if up is None else direction(up, "up")
+    floor = find_floor(opaque, upwards, max_tilt, tolerance, seed)
+    rotation = rotation_between(floor.normal, UP)
+    tilt = math.degrees(2 * math.asin(min(float((floor.normal - UP).norm()) / 2, 1.0)))
     say(f"align_floor: {floor.share:.0%} of the opaque Gaussians are on the floor, which was tilted by {tilt:.2f}°")
     place = floor.center * vector((1.0, 1.0, 0.0))
     moved = edited.moved(Similarity(rotation, 1.0, place - rotation @ floor.center))
-    return replace(moved, is_level=True)
+    return replace(moved, up=UP)

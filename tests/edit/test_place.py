@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale
 from nerfloom.edit.edited import Edited
+from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from tests.edit.clouds import at, scattered
-from tests.splats.test_files import covariances, directions, published
+from tests.splats.test_files import covariances, directions, published, seen
+from tests.splats.test_gltf import light_from, read
 
 SHIFT = torch.tensor([5e5, 5.4e6, 300.0], dtype=torch.float64)
 
@@ -63,6 +66,8 @@ def test_a_scale_names_the_unit_or_forgets_it() -> None:
     assert edit.rotate(metres, (1.0, 0.0, 0.0), 30.0).scale == Scale(0.5, "m")
     assert edit.scale(metres, 100.0).scale == Scale()
     assert edit.scale(metres, 100.0, unit="cm").scale == Scale(50.0, "cm")
+    rough = dataclasses.replace(metres, scale=Scale(0.5, "m", 0.02))
+    assert edit.scale(rough, 100.0, unit="cm").scale == Scale(50.0, "cm", 0.02)
     with pytest.raises(FlagError, match="short name"):
         edit.scale(metres, 2.0, unit="<script>")
 
@@ -170,9 +175,48 @@ def test_a_floor_of_another_up_direction() -> None:
     assert float((found[:, 2] - heights).abs().max()) < 1e-6
 
 
+@pytest.mark.parametrize("degrees", [-90.0, 100.0, 180.0])
+def test_a_floor_is_found_where_the_scene_is_up(degrees: float) -> None:
+    """In the axes of a scene whose up direction is another one, or after set_up."""
+    edited, heights = room(0.0)
+    turned = edit.rotate(edited, (1.0, 0.0, 0.0), degrees)
+    assert float((edit.align_floor(turned).gaussians.means[:, 2] - heights).abs().max()) < 1e-6
+    radians = math.radians(degrees)
+    alone = edit.set_up(Edited(turned.gaussians), (0.0, -math.sin(radians), math.cos(radians)))
+    again = edit.align_floor(edit.rotate(alone, (0.0, 1.0, 0.0), degrees))
+    assert float((again.gaussians.means[:, 2] - heights).abs().max()) < 1e-6
+
+
 def test_no_floor_is_said() -> None:
     with pytest.raises(ConfigError, match="opaque"):
         edit.align_floor(Edited(at(torch.randn(50, 3), logit=-5.0)))
     vertical = torch.stack([torch.zeros(300), torch.rand(300), torch.rand(300)], -1)
     with pytest.raises(ConfigError, match="no floor is found"):
         edit.align_floor(Edited(at(vertical)), max_tilt=20.0)
+
+
+COLMAP = torch.tensor([[1.0, 0, 0, 2.0], [0, 0, 1.0, -1.0], [0, -1.0, 0, 5.0]], dtype=torch.float64)
+"""From axes x right, y down, z ahead to a scene whose up is +z, with a shift."""
+
+
+@pytest.mark.parametrize("known", ["set_up", "scene"])
+def test_up_is_y_in_a_glb_file(known: str, tmp_path: Path) -> None:
+    """Heights are -y of COLMAP's axes, whether set_up or the scene says so, and after later rotations."""
+    given, up = scattered(30, terms=15), (0.0, -1.0, 0.0)
+    by_scene = dataclasses.replace(given, placement=Placement(COLMAP, 0.25))
+    edited = edit.set_up(given, up) if known == "set_up" else by_scene
+    heights = -given.gaussians.means[:, 1].numpy()
+    colours = seen(given.gaussians, torch.tensor(up).double()).numpy()
+    for each in (edited, edit.rotate(edited, (1.0, 0.0, 0.0), 70.0), edit.rotate(edited, (0.0, 0.0, 1.0), 30.0)):
+        each.write(tmp_path / "a.glb")
+        found = read(tmp_path / "a.glb")[1]
+        np.testing.assert_allclose(found["POSITION"][:, 1], heights, rtol=0, atol=1e-5)
+        light = light_from(found, torch.tensor([0.0, 1.0, 0.0]).double())
+        np.testing.assert_allclose(light, colours, rtol=0, atol=1e-5)
+        each.write(tmp_path / "a.ply")  # which is not turned
+        positions = read_gaussians(tmp_path / "a.ply").gaussians.means
+        torch.testing.assert_close(positions, each.gaussians.means.float(), rtol=0, atol=0)
+    level = edit.scale(edit.set_up(by_scene, up), 2.0)
+    level.write(tmp_path / "a.glb")
+    np.testing.assert_allclose(read(tmp_path / "a.glb")[1]["POSITION"][:, 1], 2 * heights, rtol=0, atol=1e-5)
+    torch.testing.assert_close(level.gaussians.means[:, 2], 2 * torch.from_numpy(heights), rtol=0, atol=1e-9)

@@ -35,6 +35,9 @@ def merge(edited: Edited, files: tuple[Path, ...]) -> Edited:
         unit = read_scale(file).unit
         if unit and edited.scale.unit and unit != edited.scale.unit:
             raise ConfigError(f"merge: {file} is in {unit}, and the others in {edited.scale.unit}: scale it first")
+        if unit != edited.scale.unit:
+            known = f"{file} is in {unit}, and the unit of the others" if unit else f"the unit of {file}"
+            say(f"warning: {known} is not known: lengths are taken as they are")
         if look != edited.look:
             say(f"warning: {file} was drawn otherwise ({look.words()}), and is drawn as the others from now on")
         parts.append(replace(found, means=found.means.double() + read_offset(file)))

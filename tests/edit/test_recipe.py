@@ -142,13 +142,18 @@ def test_files_are_merged_where_they_are(tmp_path: Path) -> None:
     assert torch.equal(merged.colors, torch.cat([given.gaussians.colors, near.colors, far.colors]))
 
 
-def test_files_in_another_unit_are_refused(tmp_path: Path) -> None:
+def test_files_in_another_unit_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_gaussians(tmp_path / "a.ply", at(torch.randn(5, 3)).map(torch.Tensor.float))
     write_scale(tmp_path / "a.ply", Scale(2.0, "cm"))
     metres = Edited(at(torch.randn(5, 3)), scale=Scale(1.0, "m"))
     with pytest.raises(ConfigError, match="in cm"):
         edit.merge(metres, (tmp_path / "a.ply",))
     assert len(edit.merge(Edited(metres.gaussians), (tmp_path / "a.ply",))) == 10
+    said = " ".join(capsys.readouterr().err.split())
+    assert "is in cm, and the unit of the others is not known" in said
+    write_scale(tmp_path / "a.ply", Scale())
+    assert len(edit.merge(metres, (tmp_path / "a.ply",))) == 10
+    assert "is not known: lengths are taken as they are" in " ".join(capsys.readouterr().err.split())
 
 
 def test_reduction_by_opacity_and_area() -> None:

@@ -27,7 +27,7 @@ class EditFlags(RegionFlags, OpenFlags):
     the frame and unit of exports. Where photographs are known, a line says what each step costs on held-out ones."""
 
     output_path: Path
-    """File to write, .ply or .spz."""
+    """File to write, .ply, .spz, .sog or .glb."""
     recipe: Path | None = None
     """YAML file of steps with their settings (docs/guides/edit.md)."""
     min_opacity: float | None = None
@@ -113,6 +113,7 @@ def _command(arguments: list[str]) -> None:
 
     loaded = load(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
     edited = take_steps(Edited.of(loaded, flags.time), steps, HeldOut.of(loaded, flags.max_images))
+    say(f"{len(edited):,} Gaussians are written")
     for sentence in edited.write(flags.output_path, flags.max_megabytes):
         say(sentence)
     if flags.save_recipe is not None:
@@ -120,7 +121,7 @@ def _command(arguments: list[str]) -> None:
     if edited.placement is not loaded.placement and edited.has_photographs:
         say("the file is in another frame than the photographs, so that commands cannot compare it with them")
     size = flags.output_path.stat().st_size / 1e6
-    say(f"{len(edited):,} Gaussians, {size:.2f} MB, {edited.look.words()}: {flags.output_path}")
+    say(f"{size:.2f} MB, {edited.look.words()}: {flags.output_path}")
 
 
 def _check(flags: EditFlags) -> None:

@@ -61,13 +61,13 @@ def decide(config: MovingGaussiansConfig, scene: Scene) -> tuple[MovingGaussians
     Returns:
         Settings without open ones, and a record of each setting that was filled in.
     """
-    interval = 1 / (scene.num_times or scene.num_cameras)
+    shortest = max(0.5 / (scene.num_times or scene.num_cameras), DURATIONS[0])
     made: list[Decision] = []
     if scene.moving:
         blurred = "a field of all times is blurred"
         config, made = fill(config, Choice("field_depth_mult", 0.0, blurred, "weight of a field's distances"))
     config, of_splats = gaussian_splatting.decide(config, scene)
-    config, of_time = fill(config, Choice("min_duration", interval / 2, "images are twice as far apart in time"))
+    config, of_time = fill(config, Choice("min_duration", shortest, "images are twice as far apart in time"))
     if not scene.moving:
         of_time = [Decision("motion", "left out", "the images have no times")]
     return config, made + of_splats + of_time

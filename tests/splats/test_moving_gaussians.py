@@ -309,6 +309,7 @@ def test_the_minimum_duration_follows_the_images_times() -> None:
         (MOVING, 1 / 16),
         (dataclasses.replace(MOVING, num_times=150, num_cameras=3_000), 1 / 300),
         (dataclasses.replace(MOVING, num_times=0, num_cameras=20), 1 / 40),
+        (dataclasses.replace(MOVING, num_times=20_000), 1e-4),  # the least that may be set
     ):
         config, made = decide(MovingGaussiansConfig(), scene)
         assert config.min_duration == pytest.approx(expected)

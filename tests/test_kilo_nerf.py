@@ -20,6 +20,7 @@ from nerfloom.training import distillation
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.distillation import MatterPoints, distil, point_errors, random_directions
 from nerfloom.training.teacher import Teacher
+from tests.other_device import OTHER, other_device
 from tests.training.helpers import TINY, tiny_trainer
 from tests.training.taught import BOX, marble
 
@@ -123,6 +124,19 @@ def test_learning_at_points_ends_with_its_time(monkeypatch: pytest.MonkeyPatch) 
     before = [parameter.detach().clone() for parameter in model.field.parameters()]
     distil(model, Teacher(marble(), IDENTITY, IDENTITY), 10**6, 0.0)
     moved = [not torch.equal(a, b) for a, b in zip(before, model.field.parameters(), strict=True)]
+    assert all(moved)
+
+
+@pytest.mark.medium
+def test_a_field_is_learnt_on_another_device_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The box of a scene is on the CPU, wherever its model is."""
+    monkeypatch.setattr(distillation, "POINTS", 64)
+    monkeypatch.setattr(distillation, "CELLS", 4)
+    with other_device():
+        model = pupil().to(OTHER)
+        before = [parameter.detach().clone() for parameter in model.field.parameters()]
+        distil(model, Teacher(marble().to(OTHER), IDENTITY, IDENTITY), 2, math.inf)
+        moved = [bool((a != b).any()) for a, b in zip(before, model.field.parameters(), strict=True)]
     assert all(moved)
 
 

@@ -161,11 +161,10 @@ class TaughtViews(BatchSource):
         if number not in self._shots:
             self._shots[number] = self._shot(number)
         shot = self._shots[number]
-        rgb, opacity = shot.rgb.float(), shot.opacity.float()
-        if not self.dataset.scene.has_alpha:
-            return ViewBatch(None, shot.view, rgb, behind, distances=shot.distances)
-        rgb = rgb + (1 - opacity[..., None]) * behind
-        return ViewBatch(None, shot.view, rgb, behind, opacity, distances=shot.distances)
+        opacity = shot.opacity.float()
+        rgb = shot.rgb.float() + (1 - opacity[..., None]) * behind
+        alpha = opacity if self.dataset.scene.has_alpha else None
+        return ViewBatch(None, shot.view, rgb, behind, alpha, distances=shot.distances)
 
     def _shot(self, number: int) -> Shot:
         """Render a picture; its view depends on the seed and its `number` only."""

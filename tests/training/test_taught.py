@@ -213,6 +213,16 @@ def test_photographs_without_alpha_have_none_of_the_teacher_either() -> None:
     assert not bool(batch.background.any())
 
 
+def test_whole_pictures_without_alpha_have_the_background_that_was_asked_for() -> None:
+    dataset = ball_under_a_sky()
+    teacher = octree_teacher(dataset)[2]
+    batch = drawn(TaughtViews(teacher, dataset, "white", seed=5), 0)
+    assert batch.alpha is None
+    expected = teacher.picture(batch.view, torch.ones(3))
+    assert float(expected.accumulation.min()) < 0.5
+    torch.testing.assert_close(batch.rgb, expected.rgb, rtol=0, atol=3e-3)
+
+
 def test_gaussians_teach_pixels() -> None:
     dataset = ball_in_a_box()
     gaussians = from_points(0.3 * torch.randn(200, 3), torch.rand(200, 3), 0)

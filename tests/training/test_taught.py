@@ -34,6 +34,7 @@ from nerfloom.training.run import read_run
 from nerfloom.training.taught import MixedSource, TaughtPixels, TaughtViews, is_taught
 from nerfloom.training.teacher import Teacher
 from nerfloom.training.trainer import Trainer
+from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.octrees.balls import CELL, RADIUS, ball
 from tests.octrees.test_drawn import front
@@ -359,6 +360,21 @@ def test_a_teacher_that_is_not_there(shared_tiny: Path, tmp_path: Path, refused:
     said = refused(train_command.main, "instant-ngp", *words)
     assert f"--teacher {missing}: there is no such run or file" in said
     assert not out.exists()
+
+
+@pytest.mark.medium
+def test_a_run_goes_on_without_a_teacher_that_is_gone(shared_tiny: Path, tmp_path: Path, refused: Refused) -> None:
+    """If one says so. A trained run is opened without."""
+    file = octree_file(tmp_path)
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", teacher=file, max_num_iterations=2)
+    trainer.train_step()
+    trainer.save()
+    file.unlink()
+    assert "--teacher None" in refused(train_command.main, "--resume", tmp_path / "run")
+    assert loading.load(tmp_path / "run", device_type="cpu").step == 1
+    done = called("ns-train", "--resume", tmp_path / "run", "--teacher", "None", "--max-eval-images", 0)
+    assert done.returncode == 0, done.stderr
+    assert loading.load(tmp_path / "run", device_type="cpu").step == 2
 
 
 def test_a_teacher_that_has_not_learnt_and_a_folder_of_runs(shared_tiny: Path, tmp_path: Path) -> None:

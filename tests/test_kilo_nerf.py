@@ -156,10 +156,10 @@ def test_a_run_is_distilled_once(shared_tiny: Path, tmp_path: Path, monkeypatch:
     assert model.teacher is not None
     assert all("teacher" not in name for name in model.state_dict())
     trainer.prepare()
-    assert model.teacher is None
     pairs = zip(model.field.parameters(), plain.model.field.parameters(), strict=True)
     assert not any(torch.equal(one, other) for one, other in pairs)
     trainer.train_step()
+    assert model.teacher is None
     checkpoint = trainer.save()
     assert checkpoint is not None
     trainer.train()
@@ -169,5 +169,7 @@ def test_a_run_is_distilled_once(shared_tiny: Path, tmp_path: Path, monkeypatch:
     resumed.restore(load_checkpoint(checkpoint))
     monkeypatch.setattr("nerfloom.methods.kilo_nerf.distil", lambda *_: pytest.fail("distilled again"))
     resumed.train()
+    assert isinstance(resumed.model, KiloNeRF)
+    assert resumed.model.teacher is None
     for one, other in zip(resumed.model.parameters(), model.parameters(), strict=True):
         assert torch.equal(one, other)

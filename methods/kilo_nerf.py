@@ -120,7 +120,11 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
         if self.teacher is not None:
             seconds = self.config.distill_share * (self.config.max_seconds or math.inf)
             distil(self, self.teacher, self.config.distill_steps, seconds)
-            self.teacher = None
+
+    def before_step(self, step: int, progress: float) -> None:
+        """Release the teacher, also where a resumed model did not need it, and update the sampler for `step`."""
+        self.teacher = None
+        super().before_step(step, progress)
 
 
 def decide(config: KiloNeRFConfig, scene: Scene) -> tuple[KiloNeRFConfig, list[Decision]]:

@@ -20,6 +20,7 @@ from nerfloom.training import distillation
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.distillation import MatterPoints, distil, point_errors, random_directions
 from nerfloom.training.teacher import Teacher
+from tests.other_device import OTHER, other_device
 from tests.training.helpers import TINY, tiny_trainer
 from tests.training.taught import BOX, marble
 
@@ -126,6 +127,19 @@ def test_learning_at_points_ends_with_its_time(monkeypatch: pytest.MonkeyPatch) 
     assert all(moved)
 
 
+@pytest.mark.medium
+def test_a_field_is_learnt_on_another_device_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The box of a scene is on the CPU, wherever its model is."""
+    monkeypatch.setattr(distillation, "POINTS", 64)
+    monkeypatch.setattr(distillation, "CELLS", 4)
+    with other_device():
+        model = pupil().to(OTHER)
+        before = [parameter.detach().clone() for parameter in model.field.parameters()]
+        distil(model, Teacher(marble().to(OTHER), IDENTITY, IDENTITY), 2, math.inf)
+        moved = [bool((a != b).any()) for a, b in zip(before, model.field.parameters(), strict=True)]
+    assert all(moved)
+
+
 # -- a run ----------------------------------------------------------------------------------------------------------
 
 
@@ -142,10 +156,10 @@ def test_a_run_is_distilled_once(shared_tiny: Path, tmp_path: Path, monkeypatch:
     assert model.teacher is not None
     assert all("teacher" not in name for name in model.state_dict())
     trainer.prepare()
-    assert model.teacher is None
     pairs = zip(model.field.parameters(), plain.model.field.parameters(), strict=True)
     assert not any(torch.equal(one, other) for one, other in pairs)
     trainer.train_step()
+    assert model.teacher is None
     checkpoint = trainer.save()
     assert checkpoint is not None
     trainer.train()
@@ -155,5 +169,7 @@ def test_a_run_is_distilled_once(shared_tiny: Path, tmp_path: Path, monkeypatch:
     resumed.restore(load_checkpoint(checkpoint))
     monkeypatch.setattr("nerfloom.methods.kilo_nerf.distil", lambda *_: pytest.fail("distilled again"))
     resumed.train()
+    assert isinstance(resumed.model, KiloNeRF)
+    assert resumed.model.teacher is None
     for one, other in zip(resumed.model.parameters(), model.parameters(), strict=True):
         assert torch.equal(one, other)

@@ -18,7 +18,7 @@ from nerfloom.cameras.moved import moved_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, refined_cameras
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import Look
@@ -46,13 +46,13 @@ class Blocks(Renderable):
 
     Blocks within reach of the camera are rendered, and blended by their inverse distance. Frames are converted in
     float64 by the blocks' placements, so blocks need not share one. What a view shows of a block is estimated by the
-    mean opacity of a small picture of it.
+    mean opacity of a small picture of it. Where a block refined its poses, a camera moves as its training cameras did.
     """
 
     def __init__(
         self, blocks: Sequence[TrainedBlock], opened: Callable[[int], Opened], placement: Placement, scene: Scene
     ) -> None:
-        """Open the first block, whose device and rays per pixel are those of all.
+        """Open the first block, whose device, rays per pixel and background are those of all.
 
         Args:
             blocks: the blocks.
@@ -62,7 +62,7 @@ class Blocks(Renderable):
         """
         self.blocks, self.opened, self.placement, self.scene = tuple(blocks), opened, placement, scene
         first = opened(0).model
-        self._device, self._rays_per_pixel = first.device, first.rays_per_pixel
+        self._device, self._rays_per_pixel, self._background = first.device, first.rays_per_pixel, first.background
         self._centers = torch.tensor([block.center for block in self.blocks], dtype=torch.float64)
         self._radii = torch.tensor([block.radius for block in self.blocks], dtype=torch.float64)
 
@@ -73,6 +73,10 @@ class Blocks(Renderable):
     @property
     def rays_per_pixel(self) -> int:
         return self._rays_per_pixel
+
+    @property
+    def background(self) -> Tensor:
+        return self._background
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         shares = self.shares(view, background)
@@ -112,7 +116,8 @@ class Blocks(Renderable):
         """
         model, placement = self.opened(number)
         rotation, scale, shift = self.placement.similarity_to(placement)
-        camera = moved_cameras(view.camera, rotation, scale, shift)
+        given = moved_cameras(view.camera, rotation, scale, shift)
+        camera = refined_cameras(model, given, training=False)  # where the block's own cameras have drifted to
         picture = model.render_view(replace(view, camera=camera, image=None), background)
         depths = picture.depth / scale, picture.median_depth / scale
         return Picture(picture.rgb, *depths, picture.accumulation, num_rays=picture.num_rays)

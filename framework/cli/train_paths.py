@@ -40,7 +40,7 @@ def check_paths(flags: list[str], recipe: Path | None = None, folder: Path | Non
             raise CheckpointError(f"{name} {start}: there is no such file or folder")
     teacher = _value(flags, "--teacher") or settings.get("teacher")
     if isinstance(teacher, str) and teacher != "None" and not os.path.exists(teacher):
-        raise ConfigError(f"--teacher {teacher}: there is no such run or file")
+        raise ConfigError(f"--teacher {teacher}: there is no such run or file; name another, or none: --teacher None")
     output = _value(flags, "--output-dir") or settings.get("output_dir") or TrainConfig.output_dir
     check_writable(folder or Path(str(output)), "the run's folder")
 

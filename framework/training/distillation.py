@@ -119,7 +119,7 @@ def distil(model: RayModel[Any], teacher: Teacher, steps: int, seconds: float) -
     Raises:
         ConfigError: if the teacher has no field.
     """
-    box, begun = model.scene.box, time.perf_counter()
+    box, begun = model.scene.box.to(model.device), time.perf_counter()
     length = LENGTH_SHARE * float((box[1] - box[0]).norm())
     points, optimizer = MatterPoints(teacher, box, length), make_optimizer(model, model.config)
     model.train()

@@ -36,6 +36,8 @@ MAX_SIDE = 800
 """Maximum longer side of a whole picture in pixels; views of larger images are reduced."""
 OPAQUE = 0.95
 """Minimum opacity of a pixel for its distance to count."""
+GOLDEN = (5**0.5 - 1) / 2
+"""Fractional part of the golden ratio, whose multiples are the most evenly spread of all."""
 PICTURE_STREAM = -3
 """Random stream of a whole picture, beside those of steps (`nerfloom.base.device`)."""
 
@@ -43,15 +45,15 @@ PICTURE_STREAM = -3
 def is_taught(step: int, share: float) -> bool:
     """Return whether a step belongs to the teacher.
 
-    The steps are spread evenly by the radical inverse in base 2 (van der Corput 1935), a number in [0, 1) of each step:
-    of any 2^m steps from a multiple of 2^m on, a share of k / 2^m has exactly k. It needs no memory, so that a resumed
-    run goes on with the same steps.
+    The steps are spread evenly by the fractional parts of multiples of the golden ratio (Weyl 1916). So are those among
+    every second step, every fourth, and so on: what a method does at such steps only, it learns from both. No memory is
+    needed, so a resumed run goes on with the same steps.
 
     Args:
         step: number of training steps done.
         share: share of the steps that belong to the teacher.
     """
-    return int(f"{step:b}"[::-1], 2) / 2 ** step.bit_length() < share
+    return step * GOLDEN % 1 < share
 
 
 def unseen_cameras(cameras: Cameras, near: Tensor) -> Cameras:
@@ -161,11 +163,10 @@ class TaughtViews(BatchSource):
         if number not in self._shots:
             self._shots[number] = self._shot(number)
         shot = self._shots[number]
-        rgb, opacity = shot.rgb.float(), shot.opacity.float()
-        if not self.dataset.scene.has_alpha:
-            return ViewBatch(None, shot.view, rgb, behind, distances=shot.distances)
-        rgb = rgb + (1 - opacity[..., None]) * behind
-        return ViewBatch(None, shot.view, rgb, behind, opacity, distances=shot.distances)
+        opacity = shot.opacity.float()
+        rgb = shot.rgb.float() + (1 - opacity[..., None]) * behind
+        alpha = opacity if self.dataset.scene.has_alpha else None
+        return ViewBatch(None, shot.view, rgb, behind, alpha, distances=shot.distances)
 
     def _shot(self, number: int) -> Shot:
         """Render a picture; its view depends on the seed and its `number` only."""

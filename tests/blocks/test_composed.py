@@ -61,6 +61,33 @@ def test_each_block_sees_the_camera_in_its_own_scene(two: tuple[Blocks, Shown, S
         torch.testing.assert_close(shown.views[-1].camera.camera_to_worlds, own.poses(pose).float())
 
 
+class White(Shown):
+    """Its settings ask for a white background, though its images have no alpha."""
+
+    @property
+    def background(self) -> torch.Tensor:
+        return torch.ones(3)
+
+
+def test_the_background_is_that_of_the_runs() -> None:
+    whole = composed([block((0.0, 0.0, 0.0), 5.0)], [White(torch.zeros(3, 4))], [placement(1.0)], placement(1.0))
+    assert whole.background.tolist() == [1.0, 1.0, 1.0]
+
+
+class Drifted(Shown):
+    """Its training cameras have moved by 1 along z in its scene, all of them."""
+
+    def refined_poses(self, poses: torch.Tensor, training: bool) -> torch.Tensor:
+        return poses + torch.tensor([0.0, 0.0, 1.0])[:, None] * torch.tensor([0.0, 0.0, 0.0, 1.0])
+
+
+def test_a_block_that_refined_its_poses_moves_the_camera_likewise() -> None:
+    model = Drifted(torch.zeros(3, 4))
+    whole = composed([block((0.0, 0.0, 0.0), 5.0)], [model], [placement(3.0)], placement(0.5))
+    whole.render_view(View(cameras([(0.5, 0.0, 0.25)])), BLACK)  # (1, 0, 0.5) in the input
+    assert model.views[-1].camera.camera_to_worlds[0, :, 3].tolist() == pytest.approx([3.0, 0.0, 2.5])
+
+
 def test_what_is_far_is_not_opened() -> None:
     blocks = [block((10.0 * number, 0.0, 0.0), 8.0) for number in range(50)]
     asked: list[int] = []

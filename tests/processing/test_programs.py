@@ -152,6 +152,20 @@ def test_a_component_leads_to_the_globe_and_up_is_away_from_it(tmp_path: Path) -
     np.testing.assert_allclose(scene.transform[:, :3].numpy(), applied[:, :3], atol=1e-12)
 
 
+def test_a_component_is_on_the_globe_whatever_another_one_lacks(tmp_path: Path) -> None:
+    """The other component has no transform: too few of its photographs state where they were taken."""
+    component = f'<components><component id="0">{transform((ROTATION, PLACE, 12.35))}</component></components>'
+    cameras = "".join(
+        camera(index, Path(name).stem, more=f'component_id="{int(index == 0)}"') for index, name in enumerate(NAMES)
+    )
+    capture = metashape.read_capture(write_cameras(tmp_path, sensor(0, "frame", FRAME), cameras, component))
+    assert capture.z_is_up
+    assert [item.name for item in capture.cameras] == [Path(name).stem for name in NAMES[1:]]
+    assert capture.left_out[metashape.OTHER] == 1
+    placed = [capture.frame[:, :3] @ item.pose[:3, 3] + capture.frame[:, 3] for item in capture.cameras]
+    assert np.abs(placed).max() < 100
+
+
 def test_cameras_that_are_left_out_are_counted_with_reasons(tmp_path: Path) -> None:
     sensors = sensor(0, "frame", FRAME) + sensor(1, "cylindrical", FRAME) + sensor(2, "frame", None)
     sensors += sensor(3, "frame", {**FRAME, "b2": 40.0})

@@ -184,6 +184,14 @@ def test_cameras_that_are_left_out_are_counted_with_reasons(tmp_path: Path) -> N
         assert reason in said, reason
 
 
+def test_a_sensor_of_photographs_that_were_never_aligned_needs_no_size(tmp_path: Path) -> None:
+    sensors = sensor(0, "frame", FRAME) + '<sensor id="1" label="unknown" type="frame"/>'
+    cameras = all_cameras() + camera(COUNT, "DSC_0099", 1, placed=False)
+    capture = metashape.read_capture(write_cameras(tmp_path, sensors, cameras))
+    assert len(capture.cameras) == COUNT
+    assert dict(capture.left_out) == {"not aligned": 1, metashape.OTHER: 0}
+
+
 def test_of_components_that_are_not_connected_the_largest_is_taken(tmp_path: Path) -> None:
     cameras = "".join(
         camera(index, Path(name).stem, more=f'component_id="{int(index == 0)}"') for index, name in enumerate(NAMES)

@@ -405,6 +405,17 @@ def test_opensfm(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [[0.5 * i, 1, -2] for i in range(4)])
 
 
+def test_photographs_in_the_output_folder_are_not_removed(tmp_path: Path) -> None:
+    write_odm(tmp_path / "project")
+    (tmp_path / "out").mkdir()
+    photographs = (tmp_path / "project" / "images").rename(tmp_path / "out" / "images")
+    words = ("--output-dir", tmp_path / "out", "--images-dir", photographs, "--overwrite")
+    done = called("ns-process-data", "odm", "--data", tmp_path / "project", *words)
+    assert done.returncode != 0
+    assert "overlaps" in " ".join(done.stderr.split())
+    assert len(list(photographs.iterdir())) == COUNT
+
+
 JSON: dict[str, Callable[[Any], Any]] = {
     "an object of nothing": lambda c: {},
     "a number": lambda c: 3,

@@ -14,7 +14,7 @@ from PIL import Image
 from nerfloom.base.errors import DataError
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.processing import bundler, metashape, opensfm, realitycapture
+from nerfloom.processing import bundler, metashape, opensfm, point_files, realitycapture
 from nerfloom.processing.geocentric import EQUATOR, POLE, east_north_up
 from tests.cli.helpers import called
 from tests.processing.programs import (
@@ -309,6 +309,17 @@ def test_points_of_another_coordinate_system_are_refused(tmp_path: Path) -> None
     done = called("ns-process-data", "metashape", "--data", tmp_path / "photographs", *words)
     assert done.returncode != 0
     assert "another coordinate system" in " ".join(done.stderr.split())
+
+
+def test_of_a_dense_cloud_some_points_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_files, "MAX_POINTS", 4)
+    capture = metashape.read_capture(write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras()))
+    points = in_view(0, count=10)
+    found = point_files.with_points(capture, write_ply(tmp_path / "points.ply", points)).points
+    assert found is not None
+    np.testing.assert_allclose(found, points[[0, 3, 6, 9]])
+    with pytest.raises(DataError, match=r"none\.ply has no point"):
+        point_files.with_points(capture, write_ply(tmp_path / "none.ply", points[:0]))
 
 
 def test_coordinates_of_a_map_lose_nothing(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from nerfloom.cameras.moved import moved_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, refined_cameras
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import Look
@@ -45,8 +45,9 @@ class Blocks(Renderable):
     """Several blocks of a scene in one picture: Block-NeRF (Tancik et al. 2022, arXiv:2202.05263), section 4.3.
 
     Blocks within reach of the camera are rendered, and blended by their inverse distance. Frames are converted in
-    float64 by the blocks' placements, so blocks need not share one. What a view shows of a block is estimated by the
-    mean opacity of a small picture of it.
+    float64 by the blocks' placements, so blocks need not share one. Views are in the frame of the data's cameras; each
+    block sees them where its own refined poses lead. What a view shows of a block is estimated by the mean opacity of a
+    small picture of it.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class Blocks(Renderable):
         """
         model, placement = self.opened(number)
         rotation, scale, shift = self.placement.similarity_to(placement)
-        camera = moved_cameras(view.camera, rotation, scale, shift)
+        camera = refined_cameras(model, moved_cameras(view.camera, rotation, scale, shift), training=False)
         picture = model.render_view(replace(view, camera=camera, image=None), background)
         depths = picture.depth / scale, picture.median_depth / scale
         return Picture(picture.rgb, *depths, picture.accumulation, num_rays=picture.num_rays)

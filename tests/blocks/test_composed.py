@@ -14,7 +14,7 @@ from nerfloom.blocks.matching import matched
 from nerfloom.cameras.moved import moved_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
-from tests.blocks.fakes import Shown, block, cameras, placement, plain, scene
+from tests.blocks.fakes import Drifted, Shown, block, cameras, placement, plain, scene
 
 BLACK = torch.zeros(3)
 
@@ -59,6 +59,13 @@ def test_each_block_sees_the_camera_in_its_own_scene(two: tuple[Blocks, Shown, S
         pose = torch.eye(4)[None, :3].double()
         pose[0, :, 3] = torch.tensor([2.0, 1.0, 0.5])
         torch.testing.assert_close(shown.views[-1].camera.camera_to_worlds, own.poses(pose).float())
+
+
+def test_a_block_sees_the_camera_where_its_refined_poses_lead() -> None:
+    shown = Drifted(torch.zeros(3, 4))
+    model = composed([block((0.0, 0.0, 0.0), 5.0)], [shown], [placement(3.0)], placement(0.5))
+    model.render_view(View(cameras([(0.5, 0.0, 0.0)])), BLACK)  # (1, 0, 0) in the input
+    torch.testing.assert_close(shown.views[-1].camera.camera_to_worlds[0, :, 3], torch.tensor([3.5, 0.0, 0.0]))
 
 
 def test_what_is_far_is_not_opened() -> None:

@@ -76,8 +76,11 @@ def test_a_panorama_keeps_its_shape() -> None:
     fx, fy, cx, cy = (torch.tensor([value]) for value in panorama(200, 100))
     sizes = torch.tensor([200]), torch.tensor([100])
     whole = Cameras(torch.eye(4)[None, :3], fx, fy, cx, cy, *sizes, "equirectangular")
-    found = framed(whole, 400)
-    assert [float(each) for each in (found.fx, found.fy, found.cx, found.cy)] == pytest.approx(list(panorama(400, 200)))
+    for width, height in ((400, 200), (401, 200), (33, 16)):  # sides that are odd have a ratio near 2
+        found = framed(whole, width)
+        assert (int(found.widths[0]), int(found.heights[0])) == (width, height)
+        shown = [float(each) for each in (found.fx, found.fy, found.cx, found.cy)]
+        assert shown == pytest.approx(list(panorama(width, height)))
     with pytest.raises(ConfigError, match="keep their aspect ratio"):
         framed(whole, 400, 300)
     assert framed(whole, 400, 300, fov=60).model == "pinhole"

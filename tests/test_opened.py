@@ -1,17 +1,20 @@
 """Python writes what the commands write, to the byte, and its namespace is its interface."""
 
 import dataclasses
+import json
 import math
 import types
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 
 import nerfloom
 from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.scale import Scale
 from nerfloom.cli.process_data import main as process_data
 from nerfloom.geometry.regions import Box, Sphere
 from nerfloom.kernels.splats.project import DC
@@ -61,6 +64,20 @@ def test_a_path_is_rendered_as_by_the_command(run: Path, tmp_path: Path) -> None
     depths = {"depth/00000.npy", "depth/00001.npy", "depth/depth.json"}
     assert {"00000.png", "00001.png", "render.json"} | depths == found.keys()
     assert iio.imread(tmp_path / "python" / "00000.png").shape == (16, 16, 3)
+
+
+def test_depth_is_in_the_unit_of_a_scale_and_says_so(ball: Path, tmp_path: Path) -> None:
+    opened: Any = nerfloom.load(ball)
+    settings: dict[str, Any] = {"num_frames": 1, "width": 16, "rendered_output_names": ("depth",)}
+    distances, said = [], []
+    for name, run in (("input", opened), ("metres", opened.scaled(Scale(2.5, "m")))):
+        run.render_path("orbit", tmp_path / name, depth_format="npy", **settings)
+        distances.append(np.load(tmp_path / name / "depth" / "00000.npy"))
+        said.append(json.loads((tmp_path / name / "depth" / "depth.json").read_text())["distance"])
+    assert float(distances[0].max()) > 0
+    np.testing.assert_allclose(distances[1], 2.5 * distances[0], rtol=1e-5)
+    assert "in units of the input:" in said[0]
+    assert "in m:" in said[1]
 
 
 def test_files_are_exported_as_by_the_command(run: Path, ball: Path, tmp_path: Path) -> None:

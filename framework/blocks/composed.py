@@ -45,8 +45,9 @@ class Blocks(Renderable):
     """Several blocks of a scene in one picture: Block-NeRF (Tancik et al. 2022, arXiv:2202.05263), section 4.3.
 
     Blocks within reach of the camera are rendered, and blended by their inverse distance. Frames are converted in
-    float64 by the blocks' placements, so blocks need not share one. What a view shows of a block is estimated by the
-    mean opacity of a small picture of it. Where a block refined its poses, a camera moves as its training cameras did.
+    float64 by the blocks' placements, so blocks need not share one. Views are in the frame of the data's cameras; each
+    block sees them where its own refined poses lead. What a view shows of a block is estimated by the mean opacity of a
+    small picture of it.
     """
 
     def __init__(

@@ -57,21 +57,22 @@ def framed(cameras: Cameras, width: int | None = None, height: int | None = None
     Raises:
         ConfigError: if a panorama was to have another aspect ratio.
     """
-    before_width, before_height = int(cameras.widths[0]), int(cameras.heights[0])
-    width, height = size_of((before_width, before_height), width, height)
+    before = before_width, before_height = int(cameras.widths[0]), int(cameras.heights[0])
+    width, height = size_of(before, width, height)
     sizes = {"widths": torch.full_like(cameras.widths, width), "heights": torch.full_like(cameras.heights, height)}
     if fov is not None:
         found = perspective(cameras.camera_to_worlds, width, height, fov)
         numbers = {name: getattr(found, name) for name in ("fx", "fy", "cx", "cy")}
         pinhole = replace(cameras, model="pinhole", lens=None)
         return replace(pinhole, **numbers, **sizes)
-    scale = (width * height / (before_width * before_height)) ** 0.5
-    if cameras.model == "equirectangular" and round(before_width * scale) != width:
+    across, down = width / before_width, height / before_height
+    if cameras.model != "equirectangular":
+        across = down = (across * down) ** 0.5
+    elif (width, height) not in (size_of(before, width, None), size_of(before, None, height)):
         raise ConfigError(
             f"panoramas of {before_width}x{before_height} keep their aspect ratio: give --width or --height alone, or "
             "--fov for a perspective"
         )
-    focal = {name: getattr(cameras, name) * scale for name in ("fx", "fy")}
-    cx = width / 2 + (cameras.cx - before_width / 2) * scale
-    cy = height / 2 + (cameras.cy - before_height / 2) * scale
-    return replace(cameras, **focal, cx=cx, cy=cy, **sizes)
+    cx = width / 2 + (cameras.cx - before_width / 2) * across
+    cy = height / 2 + (cameras.cy - before_height / 2) * down
+    return replace(cameras, fx=cameras.fx * across, fy=cameras.fy * down, cx=cx, cy=cy, **sizes)

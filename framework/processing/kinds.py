@@ -200,12 +200,13 @@ def _convert_bundler(flags: BundlerFlags) -> None:
 
 def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
     from nerfloom.processing.named_images import placed_images
-    from nerfloom.processing.output import claim
+    from nerfloom.processing.output import check_apart, claim
     from nerfloom.processing.posed_folder import write_capture
     from nerfloom.processing.views import Views
 
     if not images.is_dir():
         raise DataError(f"{images} is not a folder; it must be that of the photographs")
+    check_apart(flags.output_dir, images)
     placed = placed_images(images, capture)
     claim(flags.output_dir, flags.data, flags.overwrite)
     views = Views(flags.num_views, flags.view_angle, flags.views_up_and_down)

@@ -78,11 +78,11 @@ def read_capture(file: Path) -> Capture:
         say(f"{file} has {len(chunks)} chunks; the first is read")
     left_out: Counter[str] = Counter()
     aligned = list(_aligned(chunks[0], file, left_out))
-    geocentric = _is_geocentric(chunks[0], aligned)
-    if not geocentric and aligned:
+    if aligned and not _is_geocentric(chunks[0], aligned):
         largest, _ = Counter(each.component for each in aligned).most_common(1)[0]
         left_out[OTHER] += sum(each.component != largest for each in aligned)
         aligned = [each for each in aligned if each.component == largest]
+    geocentric = _is_geocentric(chunks[0], aligned)
     cameras = [each.camera for each in aligned]
     if not cameras:
         return Capture(PROGRAM, [], left_out)
@@ -173,10 +173,14 @@ def _pose(camera: Element, world: Similarity, where: str) -> np.ndarray:
 
 
 def _is_geocentric(chunk: Element, aligned: list[_Aligned]) -> bool:
-    """Return whether the world's frame is geocentric: not declared as local, and with cameras near the surface."""
-    reference = (chunk.findtext("reference") or "").strip().upper()
-    centre, _ = spread_of([each.camera for each in aligned]) if aligned else (np.zeros(3), 0.0)
-    return not reference.startswith("LOCAL") and is_near_surface(centre)
+    """Return whether the world's frame is geocentric: not declared as local, and each component is near the surface."""
+    if (chunk.findtext("reference") or "").strip().upper().startswith("LOCAL"):
+        return False
+    by_component: dict[str, list[PosedCamera]] = {}
+    for each in aligned:
+        by_component.setdefault(each.component, []).append(each.camera)
+    # Not their common mean: a component that is not georeferenced is near the centre of the Earth.
+    return bool(aligned) and all(is_near_surface(spread_of(cameras)[0]) for cameras in by_component.values())
 
 
 def _east_north_up(cameras: list[PosedCamera]) -> np.ndarray:

@@ -57,13 +57,13 @@ def lens_of(sensor: Element, where: str) -> Lens:
     if kind not in TYPES:
         raise UnsupportedSensor(f"of {shown(kind)} sensors")
     calibration = _calibration(sensor)
+    if calibration is None and kind != "spherical":
+        raise UnsupportedSensor("of sensors without calibration")
     width, height = _size(sensor, calibration, where)
-    if kind == "spherical":
+    if calibration is None or kind == "spherical":
         half = width / 2
         values = {"w": width, "h": height, "fl_x": half, "fl_y": half, "cx": half, "cy": height / 2}
         return Lens("EQUIRECTANGULAR", values)
-    if calibration is None:
-        raise UnsupportedSensor("of sensors without calibration")
     given = _coefficients(calibration, where)
     shift = displacement(given, width, height, kind in FISHEYES)
     if not shift <= MAX_DISPLACEMENT:

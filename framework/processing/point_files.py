@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from nerfloom.base.console import say
+from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.data.ply import read_columns, read_header, vertices
 from nerfloom.processing.capture import Capture, check_points
 
@@ -15,28 +17,35 @@ COLORS = ("red", "green", "blue")
 """Properties of coloured vertices."""
 GREY = 128
 """Colour of points without colour."""
+MAX_POINTS = 2_000_000
+"""Maximum number of points that are taken. A dense cloud may have a hundred million, and points are written as text."""
 
 
 def with_points(capture: Capture, file: Path | None) -> Capture:
-    """Return a capture with the points of a PLY file in place of its own.
+    """Return a capture with the points of a PLY file in place of its own: at most `MAX_POINTS`, evenly spaced in it.
 
     Args:
         capture: the capture.
         file: the PLY file, in the frame of the program; None leaves the capture as it is.
 
     Raises:
-        DataError: if the file cannot be read, has no vertices, or most of them are far from the cameras.
+        DataError: if the file cannot be read, has no finite vertices, or most of them are far from the cameras.
     """
     if file is None:
         return capture
     element = vertices(file, read_header(file))
     colored = set(COLORS) <= set(element.names)
-    columns = read_columns(file, element, [*"xyz", *(COLORS if colored else ())])
+    chosen = evenly_spaced(element.count, MAX_POINTS).numpy()
+    columns = [values[chosen] for values in read_columns(file, element, [*"xyz", *(COLORS if colored else ())])]
+    if len(chosen) < element.count:
+        say(f"{file}: {len(chosen):,} of {element.count:,} points are taken, evenly spaced in the file")
     points = np.stack(columns[:3], axis=1).astype(np.float64)
     colors = np.stack(columns[3:], axis=1) if colored else np.full(points.shape, GREY)
     if dict(element.columns).get("red", "u1").startswith("f"):
         colors = colors * 255.0  # colours that are not whole numbers are from 0 to 1
     finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        raise DataError(f"{file} has no point that is finite; leave it out, or export it again")
     if not finite.all():
         say(f"{file}: {int((~finite).sum()):,} of {len(points):,} points are not finite and left out")
     kept = np.nan_to_num(colors[finite].astype(np.float64)).clip(0, 255).round().astype(np.uint8)

@@ -80,7 +80,8 @@ def write_capture(
     more = {"orientation_override": "none"} if capture.z_is_up else {}
     name = None if capture.points is None else POINTS
     write(output / FINISHED, content(frames, capture.frame, name, more))
-    say(ready(output))
+    # Gaussians cannot be drawn as a panorama.
+    say(ready(output, "nerfacto" if frames[0].lens.model == PANORAMA else "gaussian-splatting"))
 
 
 def _with_lenses(
@@ -135,12 +136,16 @@ def _frames(posed: list[_Posed], models: set[str], views: Views | None, output: 
 
 
 def _view_names(taken: list[str], wide: list[_Posed], views: Views) -> list[list[str]]:
-    """Return a name for each view of each image, different from the names that are taken."""
+    """Return a name for each view of each image, different from the names that are taken.
+
+    Views of one direction follow each other, as in `panoramas.view_names`: every eighth image by name is held out, and
+    of eight views of each image that would always be the first, so that no image showed what is ahead.
+    """
     count = len(views.directions)
     wanted = [Path(name) for name in taken]
     for entry in wide:
         path = PurePosixPath(entry.image.name)
-        wanted += [Path(path.with_name(f"{path.stem}_view{number}{path.suffix}")) for number in range(count)]
+        wanted += [Path(path.with_name(f"view_{number}_{path.name}")) for number in range(count)]
     names = output_names(wanted)[len(taken) :]
     return [names[start : start + count] for start in range(0, len(names), count)]
 

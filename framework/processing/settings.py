@@ -206,7 +206,7 @@ class MetashapeFlags(ProgramFlags):
     xml: Path
     """File of the cameras: File > Export > Export Cameras, as Agisoft XML."""
     ply: Path | None = None
-    """Points (PLY), exported in the coordinate system of the chunk."""
+    """Points (PLY), in local coordinates; of a georeferenced chunk, in WGS 84 geocentric coordinates (EPSG:4978)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.ray_model import RayModel
-from nerfloom.renderable import Renderable, RendersFromImages, parts
+from nerfloom.renderable import Renderable, RendersFromImages, parts, refined_cameras
 from nerfloom.rendering.rendered import Picture
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.training.loaded import Loaded
@@ -43,12 +43,13 @@ class Teacher:
         self.rotation, self.scale, self.shift = pupil.similarity_to(placement)
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Return cameras of the pupil's scene in the teacher's.
+        """Return cameras of the pupil's data in the teacher's scene, where its refined poses lead.
 
         Args:
-            cameras: M cameras.
+            cameras: M cameras in the pupil's scene.
         """
-        return moved_cameras(cameras, self.rotation, self.scale, self.shift)
+        moved = moved_cameras(cameras, self.rotation, self.scale, self.shift)
+        return refined_cameras(self.model, moved, training=False)
 
     @torch.no_grad()
     def picture(self, view: View, background: Tensor) -> Picture:

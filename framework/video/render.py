@@ -77,7 +77,7 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
         frames.render(render)
     if bound is not None:
         say(f"--max-error: rays ended where the rest could change a colour by at most {bound:.2g}")
-    _write(settings, frames, target, views, facts, outputs)
+    _write(settings, frames, target, views, facts, outputs, loaded.scale.unit or "units of the input")
     frames.remove()
 
 
@@ -143,17 +143,22 @@ def _write(
     views: Views,
     facts: dict[str, Any],
     outputs: Sequence[Output],
+    lengths: str,
 ) -> None:
-    """Write the requested files, and print their paths."""
+    """Write the requested files, and print their paths; distances are in the unit `lengths`."""
     is_folder = not output.suffix
     names = [each.name for each in outputs]
     kinds = {each.name: each.kind for each in outputs}
     stems = views.names or tuple(f"{index:05d}" for index in range(frames.count))
     if settings.depth_format != "color":
         for name in [name for name in names if kinds[name] == "distance"]:
-            _write_depths(settings, frames, output / name, stems, name)
+            _write_depths(settings, frames, output / name, stems, name, lengths)
             names.remove(name)
-    ranges = {name: _colored_range(settings, frames, name, kinds[name]) for name in names if kinds[name] in NUMBERS}
+    ranges = {
+        name: _colored_range(settings, frames, name, f", in {lengths}" if kinds[name] == "distance" else None)
+        for name in names
+        if kinds[name] in NUMBERS
+    }
     apart = settings.shows_images and is_folder if settings.apart is None else settings.apart
     for group in [[name] for name in names] if apart else [names] if names else []:
         pictures = (side_by_side([shown_output(kept, name, ranges) for name in group]) for kept in frames)
@@ -174,18 +179,27 @@ def _write(
         write_file(output / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
 
 
-def _colored_range(settings: PathSettings, frames: Frames, name: str, kind: str) -> tuple[float, float]:
-    """Return and print the values at the ends of an output's colour map; settings give the range of distances."""
+def _colored_range(settings: PathSettings, frames: Frames, name: str, unit: str | None) -> tuple[float, float]:
+    """Return and print the values at the ends of an output's colour map; settings give the range of distances.
+
+    Args:
+        settings: settings of the path.
+        frames: the rendered frames.
+        name: name of the output.
+        unit: end of the message about distances; None for other numbers.
+    """
     given = settings.depth_near_plane, settings.depth_far_plane
-    near, far = given if kind == "distance" else (None, None)
+    near, far = (None, None) if unit is None else given
     if near is None or far is None:
         found = distance_range(track(frames, "Measuring ranges", total=frames.count), name)
         near, far = found[0] if near is None else near, found[1] if far is None else far
-    say(f"{name}: {near:.4g} (dark) to {far:.4g} (light){', in units of the input' if kind == 'distance' else ''}")
+    say(f"{name}: {near:.4g} (dark) to {far:.4g} (light){unit or ''}")
     return near, far
 
 
-def _write_depths(settings: PathSettings, frames: Frames, folder: Path, stems: Sequence[str], name: str) -> None:
+def _write_depths(
+    settings: PathSettings, frames: Frames, folder: Path, stems: Sequence[str], name: str, lengths: str
+) -> None:
     """Write distances as numbers, with depth.json, which gives their unit."""
     packed = settings.depth_format == "png16"
     farthest = settings.depth_far_plane
@@ -196,7 +210,7 @@ def _write_depths(settings: PathSettings, frames: Frames, folder: Path, stems: S
     suffix = ".png" if packed else ".npy"
     paths = [folder / f"{stem}{suffix}" for stem in stems]
     write_distances(paths, track(distances, "Writing", total=frames.count), unit)
-    meaning = {"unit": unit, "distance": "along the ray, in units of the input: the file's value times 'unit'"}
+    meaning = {"unit": unit, "distance": f"along the ray, in {lengths}: the file's value times 'unit'"}
     meaning |= {"unknown": 0, "saturated": MAX_UINT16} if packed else {"unknown": 0}
     write_file(folder / "depth.json", (json.dumps(meaning, indent=2) + "\n").encode())
-    say(f"{frames.count} maps of {name} (unit {unit:.6g} of the input): {folder}")
+    say(f"{frames.count} maps of {name} (values times {unit:.6g}, in {lengths}): {folder}")

@@ -28,7 +28,7 @@ class ViewSettings:
     is absorbed; accumulation: opacity; outputs of the method, such as normals; with 'dataset' also gt-rgb: the
     photograph, and error: the difference from it."""
     depth_near_plane: float | None = None
-    """Distance at the dark end of the depth colours, units of the input. Default: from all frames."""
+    """Distance at the dark end of the depth colours, units of exports. Default: from all frames."""
     depth_far_plane: float | None = None
     """Distance at the light end, and the largest in 16-bit files. Default: from all frames."""
     background: str | None = None
@@ -51,7 +51,7 @@ class FileSettings:
     """Image format in a folder."""
     depth_format: Literal["color", "png16", "npy"] = "color"
     """Depth in a folder: colours, 16-bit PNG (depth.json gives the unit) or float32 .npy; distances along the ray in
-    units of the input, 0 where nothing is seen."""
+    units of exports, 0 where nothing is seen."""
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,15 @@ class Shown(Renderable):
         return Picture(rgb, depth, depth + 1, opaque, num_rays=flat.numel())
 
 
+class Drifted(Shown):
+    """Pictures of a scene that has drifted by half a unit along x while poses were refined."""
+
+    def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
+        moved = poses.clone()
+        moved[:, 0, 3] += 0.5
+        return moved
+
+
 def plain(red: float, green: float, blue: float, distance: float = 1.0, opacity: float = 1.0) -> Shown:
     """Pictures of one colour."""
     matrix = torch.zeros(3, 4)

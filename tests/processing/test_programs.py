@@ -14,7 +14,7 @@ from PIL import Image
 from nerfloom.base.errors import DataError
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.processing import bundler, metashape, opensfm, realitycapture
+from nerfloom.processing import bundler, metashape, opensfm, point_files, realitycapture
 from nerfloom.processing.geocentric import EQUATOR, POLE, east_north_up
 from tests.cli.helpers import called
 from tests.processing.programs import (
@@ -113,7 +113,8 @@ def test_panoramas_of_metashape_may_stay_whole(tmp_path: Path) -> None:
     write_images(tmp_path / "photographs", size=(WIDTH, WIDTH // 2))
     (tmp_path / "cameras.xml").write_text(document(sensor(0, "spherical", None, (WIDTH, WIDTH // 2)), all_cameras()))
     flags = ("--xml", tmp_path / "cameras.xml", "--panoramas", "whole")
-    content, _ = process("metashape", tmp_path / "photographs", tmp_path / "out", *flags)
+    content, said = process("metashape", tmp_path / "photographs", tmp_path / "out", *flags)
+    assert "ns-train nerfacto --data" in said
 
     def expected(index: int) -> tuple[np.ndarray, np.ndarray]:
         local = in_view(index, 3.0)
@@ -152,6 +153,20 @@ def test_a_component_leads_to_the_globe_and_up_is_away_from_it(tmp_path: Path) -
     np.testing.assert_allclose(scene.transform[:, :3].numpy(), applied[:, :3], atol=1e-12)
 
 
+def test_a_component_is_on_the_globe_whatever_another_one_lacks(tmp_path: Path) -> None:
+    """The other component has no transform: too few of its photographs state where they were taken."""
+    component = f'<components><component id="0">{transform((ROTATION, PLACE, 12.35))}</component></components>'
+    cameras = "".join(
+        camera(index, Path(name).stem, more=f'component_id="{int(index == 0)}"') for index, name in enumerate(NAMES)
+    )
+    capture = metashape.read_capture(write_cameras(tmp_path, sensor(0, "frame", FRAME), cameras, component))
+    assert capture.z_is_up
+    assert [item.name for item in capture.cameras] == [Path(name).stem for name in NAMES[1:]]
+    assert capture.left_out[metashape.OTHER] == 1
+    placed = [capture.frame[:, :3] @ item.pose[:3, 3] + capture.frame[:, 3] for item in capture.cameras]
+    assert np.abs(placed).max() < 100
+
+
 def test_cameras_that_are_left_out_are_counted_with_reasons(tmp_path: Path) -> None:
     sensors = sensor(0, "frame", FRAME) + sensor(1, "cylindrical", FRAME) + sensor(2, "frame", None)
     sensors += sensor(3, "frame", {**FRAME, "b2": 40.0})
@@ -168,6 +183,14 @@ def test_cameras_that_are_left_out_are_counted_with_reasons(tmp_path: Path) -> N
         "1 of sensors without calibration", "1 in a rig without transforms", "1 of sensors whose B2",
     ):  # fmt: skip
         assert reason in said, reason
+
+
+def test_a_sensor_of_photographs_that_were_never_aligned_needs_no_size(tmp_path: Path) -> None:
+    sensors = sensor(0, "frame", FRAME) + '<sensor id="1" label="unknown" type="frame"/>'
+    cameras = all_cameras() + camera(COUNT, "DSC_0099", 1, placed=False)
+    capture = metashape.read_capture(write_cameras(tmp_path, sensors, cameras))
+    assert len(capture.cameras) == COUNT
+    assert dict(capture.left_out) == {"not aligned": 1, metashape.OTHER: 0}
 
 
 def test_of_components_that_are_not_connected_the_largest_is_taken(tmp_path: Path) -> None:
@@ -289,6 +312,17 @@ def test_points_of_another_coordinate_system_are_refused(tmp_path: Path) -> None
     assert "another coordinate system" in " ".join(done.stderr.split())
 
 
+def test_of_a_dense_cloud_some_points_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(point_files, "MAX_POINTS", 4)
+    capture = metashape.read_capture(write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras()))
+    points = in_view(0, count=10)
+    found = point_files.with_points(capture, write_ply(tmp_path / "points.ply", points)).points
+    assert found is not None
+    np.testing.assert_allclose(found, points[[0, 3, 6, 9]])
+    with pytest.raises(DataError, match=r"none\.ply has no point"):
+        point_files.with_points(capture, write_ply(tmp_path / "none.ply", points[:0]))
+
+
 def test_coordinates_of_a_map_lose_nothing(tmp_path: Path) -> None:
     """Half a million metres east and five north: points keep fractions of a millimetre."""
     far = np.array([500_000.25, 5_000_000.5, 120.0])
@@ -381,6 +415,17 @@ def test_opensfm(kind: str, tmp_path: Path) -> None:
     assert "5 of 6 cameras are placed (left out: 1 in unconnected reconstructions)" in said
     found = read_points(tmp_path / "out" / "sparse_pc.ply").numpy()
     np.testing.assert_allclose(found, [[0.5 * i, 1, -2] for i in range(4)])
+
+
+def test_photographs_in_the_output_folder_are_not_removed(tmp_path: Path) -> None:
+    write_odm(tmp_path / "project")
+    (tmp_path / "out").mkdir()
+    photographs = (tmp_path / "project" / "images").rename(tmp_path / "out" / "images")
+    words = ("--output-dir", tmp_path / "out", "--images-dir", photographs, "--overwrite")
+    done = called("ns-process-data", "odm", "--data", tmp_path / "project", *words)
+    assert done.returncode != 0
+    assert "overlaps" in " ".join(done.stderr.split())
+    assert len(list(photographs.iterdir())) == COUNT
 
 
 JSON: dict[str, Callable[[Any], Any]] = {

@@ -172,6 +172,7 @@ def test_panoramas_beside_photographs_become_views(tmp_path: Path) -> None:
     views = [frame for frame in content["frames"] if "view" in frame["file_path"]]
     assert len(views) == 8
     assert len(content["frames"]) == 9
+    assert "images/view_3_pano_9.png" in {frame["file_path"] for frame in views}  # sorted by direction
     for frame in views:
         with Image.open(tmp_path / "out" / frame["file_path"]) as image:
             pixels = np.asarray(image).astype(float)

@@ -34,6 +34,7 @@ from nerfloom.training.run import read_run
 from nerfloom.training.taught import MixedSource, TaughtPixels, TaughtViews, is_taught
 from nerfloom.training.teacher import Teacher
 from nerfloom.training.trainer import Trainer
+from tests.blocks.fakes import Drifted, cameras, placement
 from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.octrees.balls import CELL, RADIUS, ball
@@ -130,6 +131,12 @@ def test_rays_are_those_of_the_pupils_cameras(model: str) -> None:
     origins = scale * given.origins.double() @ rotation.T + shift
     torch.testing.assert_close(found.origins.double(), origins, rtol=0, atol=1e-4)
     torch.testing.assert_close(found.directions.double(), given.directions.double() @ rotation.T, rtol=0, atol=1e-5)
+
+
+def test_a_teacher_that_has_refined_its_poses_sees_cameras_where_its_scene_is() -> None:
+    teacher = Teacher(Drifted(torch.zeros(3, 4)), placement(3.0), placement(0.5))
+    found = teacher.cameras(cameras([(0.5, 0.0, 0.0)])).camera_to_worlds
+    torch.testing.assert_close(found[0, :, 3], torch.tensor([3.5, 0.0, 0.0]))
 
 
 def test_a_picture_is_the_same_in_another_frame() -> None:

@@ -59,12 +59,19 @@ def framed(cameras: Cameras, width: int | None = None, height: int | None = None
     """
     before = before_width, before_height = int(cameras.widths[0]), int(cameras.heights[0])
     width, height = size_of(before, width, height)
-    sizes = {"widths": torch.full_like(cameras.widths, width), "heights": torch.full_like(cameras.heights, height)}
     if fov is not None:
         found = perspective(cameras.camera_to_worlds, width, height, fov)
-        numbers = {name: getattr(found, name) for name in ("fx", "fy", "cx", "cy")}
-        pinhole = replace(cameras, model="pinhole", lens=None)
-        return replace(pinhole, **numbers, **sizes)
+        return replace(
+            cameras,
+            model="pinhole",
+            lens=None,
+            fx=found.fx,
+            fy=found.fy,
+            cx=found.cx,
+            cy=found.cy,
+            widths=found.widths,
+            heights=found.heights,
+        )
     across, down = width / before_width, height / before_height
     if cameras.model != "equirectangular":
         across = down = (across * down) ** 0.5
@@ -75,4 +82,6 @@ def framed(cameras: Cameras, width: int | None = None, height: int | None = None
         )
     cx = width / 2 + (cameras.cx - before_width / 2) * across
     cy = height / 2 + (cameras.cy - before_height / 2) * down
-    return replace(cameras, fx=cameras.fx * across, fy=cameras.fy * down, cx=cx, cy=cy, **sizes)
+    widths, heights = torch.full_like(cameras.widths, width), torch.full_like(cameras.heights, height)
+    fx, fy = cameras.fx * across, cameras.fy * down
+    return replace(cameras, fx=fx, fy=fy, cx=cx, cy=cy, widths=widths, heights=heights)

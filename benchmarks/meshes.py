@@ -28,7 +28,7 @@ from nerfloom.base.errors import NerfloomError
 from nerfloom.data.ply import read_points
 from nerfloom.evaluation.surface_files import read_mesh
 from nerfloom.evaluation.surfaces import Surface, drawn, nearest
-from nerfloom.evaluation.visibility import OCCLUDERS, count_sightings
+from nerfloom.evaluation.visibility import count_sightings
 from nerfloom.export.mesh import Mesh, closedness
 from nerfloom.kernels import native
 from nerfloom.training.machine import machine
@@ -36,8 +36,8 @@ from nerfloom.training.run import read_run
 
 SURFACE_POINTS = 20_000
 """Number of points on the exact surface."""
-MESH_POINTS = 300_000
-"""Number of points on a mesh."""
+MESH_POINTS, OCCLUDERS = 300_000, 1_000_000
+"""Numbers of points on a mesh, and of those that hide points behind them."""
 EYES = 20
 """Number of training cameras used to determine visibility."""
 

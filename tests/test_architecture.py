@@ -212,16 +212,21 @@ FRONTS = ("nerfloom", "nerfloom.edit", "nerfloom.testing")
 
 def test_names_are_imported_from_the_file_that_defines_them() -> None:
     files = {module_of(file).removesuffix(".__init__"): file for file in FILES}
+
+    @functools.cache
+    def borrowed(module: str) -> set[str]:
+        nodes = ast.walk(tree(files[module]))
+        return {name.asname or name.name for n in nodes if isinstance(n, ast.ImportFrom) for name in n.names}
+
     elsewhere = []
     for file in [*FILES, *(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
         for node in ast.walk(tree(file)):
             if not isinstance(node, ast.ImportFrom) or node.module not in files or node.module in FRONTS:
                 continue
-            body = ast.walk(tree(files[node.module]))
-            borrowed = {name.asname or name.name for n in body if isinstance(n, ast.ImportFrom) for name in n.names}
             named = {alias.name for alias in node.names if f"{node.module}.{alias.name}" not in files}
             elsewhere += [
-                f"{file.relative_to(ROOT)}: {node.module} borrows {name}" for name in sorted(named & borrowed)
+                f"{file.relative_to(ROOT)}: {node.module} borrows {name}"
+                for name in sorted(named & borrowed(node.module))
             ]
     assert elsewhere == []
 

@@ -26,10 +26,12 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.evaluation.surfaces import Samples, Surface, drawn, nearest
-from nerfloom.evaluation.visibility import OCCLUDERS, Shown, count_sightings
+from nerfloom.evaluation.visibility import Shown, count_sightings
 
 NUM_POINTS = 100_000
 """Number of points on each surface."""
+DENSE, OCCLUDERS = 8, 10
+"""Numbers of points that find nearest faces, and that hide points behind them, for each judged point."""
 F_SCORE_AT = (0.0025, 0.01)
 """Default distances of F-scores, in sides of the reference's bounding box."""
 ELSEWHERE = 0.2
@@ -173,7 +175,7 @@ def judge_surface(
     views: Views | None = None,
     f_score_at: Sequence[float] = (),
     crop: float | None = None,
-    count: int = NUM_POINTS,
+    count: int | None = None,
 ) -> Geometry:
     """Compare a reconstructed mesh with a reference, in the reference's frame and unit.
 
@@ -184,18 +186,19 @@ def judge_surface(
         f_score_at: distances of F-scores; if empty, `F_SCORE_AT` of the reference's side.
         crop: if given, only points in the reference's bounding box count; the box is enlarged on all sides by this many
             of its longest sides.
-        count: number of points on each surface.
+        count: number of points on each surface; None for `NUM_POINTS`.
 
     Raises:
         ConfigError: if no point of a surface counts.
     """
-    side = reference.side
+    count = NUM_POINTS if count is None else count
+    side, dense = reference.side, DENSE * count
     region = None if crop is None else region_of(reference, crop)
     kept, opaque = (None, None) if views is None else (views.kept, views.opaque)
     ours, our_share = _counted(surface, "the surface", count, region, views, kept)
     theirs, their_share = _counted(reference, "the reference", count, None, views, opaque)
-    there, normals_there = nearest(ours.positions, reference)
-    back, normals_back = nearest(theirs.positions, surface)
+    there, normals_there = nearest(ours.positions, reference, dense)
+    back, normals_back = nearest(theirs.positions, surface, dense)
     near = sorted(f_score_at) or [share * side for share in F_SCORE_AT]
     errors = [_cosines(ours.normals, normals_there), _cosines(theirs.normals, normals_back)]
     return Geometry(
@@ -232,7 +235,7 @@ def _counted(
     seen = torch.ones(len(points.positions), dtype=torch.bool)
     unseen = [0, 0, 0]
     if views is not None and pixels is not None and len(seen):
-        places = [part.placed(views.placement) for part in (points, drawn(surface, OCCLUDERS, seed=1))]
+        places = [part.placed(views.placement) for part in (points, drawn(surface, OCCLUDERS * count, seed=1))]
         found = count_sightings(places[0], places[1], views.cameras, pixels, f"Looking at {name}")
         inside, shown, seen = (number >= views.least for number in (found.inside, found.shown, found.seen))
         unseen = [int(part.sum()) for part in (~inside, inside & ~shown, shown & ~seen)]

@@ -17,7 +17,7 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.triangles import area_vectors, draw_on_triangles, nearest_on_triangles
 
 DENSE = 800_000
-"""Number of points on a mesh where nearest faces are looked for."""
+"""Default number of points on a mesh where nearest faces are looked for."""
 CANDIDATES = 8
 """Number of nearest points on a mesh whose faces are compared exactly."""
 UNIT = 1e-6
@@ -168,7 +168,7 @@ def _some(points: Tensor) -> Tensor:
     return points[:: -(-len(points) // AT_ONCE)]
 
 
-def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]:
+def nearest(positions: Tensor, surface: Surface, dense: int = DENSE) -> tuple[Tensor, Tensor | None]:
     """Return the distances (N,) of positions to a surface, and its normals (N, 3) at the nearest points.
 
     For a mesh, many points are drawn on it, at least one on each face. The faces of the `CANDIDATES` nearest points are
@@ -178,6 +178,7 @@ def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]
     Args:
         positions: (N, 3) float64.
         surface: the surface.
+        dense: number of points drawn on a mesh.
 
     Returns:
         Normals are None for points without normals.
@@ -187,7 +188,7 @@ def nearest(positions: Tensor, surface: Surface) -> tuple[Tensor, Tensor | None]
         normals = None if surface.normals is None else surface.normals[torch.from_numpy(indices)]
         return torch.from_numpy(distances), normals
     corners = surface.corners
-    owners, weights = draw_on_triangles(corners, DENSE)
+    owners, weights = draw_on_triangles(corners, dense)
     bare = torch.ones(len(corners), dtype=torch.bool)
     bare[owners] = False
     # A small face without a point gets its centre.

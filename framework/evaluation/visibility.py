@@ -20,8 +20,6 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.evaluation.surfaces import Samples
 from nerfloom.geometry.lenses import project
 
-OCCLUDERS = 1_000_000
-"""Number of points that hide points behind them."""
 APART = 2.0
 """Width of a depth buffer's cells, in distances between neighbouring points."""
 MOST_CELLS = 4_000_000

@@ -24,6 +24,12 @@ pytest.importorskip("trimesh")
 pytest.importorskip("skimage")
 
 
+@pytest.fixture(autouse=True)
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer points than the default, so that the tests are quick."""
+    monkeypatch.setattr("nerfloom.evaluation.geometry.NUM_POINTS", 20_000)
+
+
 @pytest.fixture(scope="module")
 def ball(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run that has learnt the ball of radius 1."""

@@ -12,12 +12,12 @@ from nerfloom.dataparsers.procedural.scene import trace_rows
 from nerfloom.dataparsers.procedural.solids import SOLIDS, poses_around, surface
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE
 from nerfloom.evaluation.surfaces import Surface, drawn
-from nerfloom.evaluation.visibility import OCCLUDERS, Shown, Sightings, count_sightings
+from nerfloom.evaluation.visibility import Shown, Sightings, count_sightings
 from nerfloom.testing.ball import cameras_at
 from tests.evaluation.surfaces import sphere, square, together
 
 pytest.importorskip("trimesh")
-COUNT = 20_000
+COUNT, OCCLUDERS = 20_000, 200_000
 
 
 def everything(index: int) -> Tensor | None:
@@ -138,7 +138,7 @@ def test_solids_as_rays_see_them() -> None:
     middle, sizes = torch.full((12,), 200.0), torch.full((12,), 400)
     cameras = Cameras(poses, focal, focal, middle, middle, sizes, sizes)
     points = drawn(reference, 4000)
-    occluders = drawn(reference, OCCLUDERS, seed=1)
+    occluders = drawn(reference, 1_000_000, seed=1)
     assert points.normals is not None
     missed, extra = [], []
     for index in range(12):

@@ -1,5 +1,6 @@
 """The integrated directional encoding against scipy, Monte Carlo over its distributions, and finite differences."""
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -52,9 +53,12 @@ def drawn(mean: torch.Tensor, kappa: float, count: int) -> torch.Tensor:
     return cosines[:, None] * mean + across
 
 
+leggauss = cache(np.polynomial.legendre.leggauss)
+
+
 def exact_factor(degree: int, kappa: float) -> float:
     """The mean of Legendre's polynomial over the distribution, by Gauss-Legendre integration."""
-    nodes, weights = np.polynomial.legendre.leggauss(2000)
+    nodes, weights = leggauss(2000)
     kept = weights * np.exp(kappa * (nodes - 1))
     return float((kept * np.polynomial.legendre.Legendre.basis(degree)(nodes)).sum() / kept.sum())
 

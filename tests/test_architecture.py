@@ -224,10 +224,8 @@ def test_names_are_imported_from_the_file_that_defines_them() -> None:
             if not isinstance(node, ast.ImportFrom) or node.module not in files or node.module in FRONTS:
                 continue
             named = {alias.name for alias in node.names if f"{node.module}.{alias.name}" not in files}
-            elsewhere += [
-                f"{file.relative_to(ROOT)}: {node.module} borrows {name}"
-                for name in sorted(named & borrowed(node.module))
-            ]
+            names = sorted(named & borrowed(node.module))
+            elsewhere += [f"{file.relative_to(ROOT)}: {node.module} borrows {name}" for name in names]
     assert elsewhere == []
 
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from nerfloom.base.errors import ConfigError, DataError, FlagError
+from nerfloom.processing import colmap
 from nerfloom.processing.panoramas import camera_parameters, write_views
 from nerfloom.processing.sequence import is_sequence
 from nerfloom.processing.settings import ImagesFlags
@@ -139,6 +140,25 @@ def test_colmap_is_told_the_lens_of_views() -> None:
     np.testing.assert_allclose(values, [50, 50, 50, 50])
 
 
+@pytest.mark.parametrize(("kind", "refined"), [("equirectangular", False), ("perspective", True)])
+def test_colmap_keeps_a_lens_that_is_known(
+    kind: Any, refined: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    found: list[Any] = []
+
+    def incremental_mapping(*_: object, options: Any, **__: object) -> dict[int, Any]:
+        found.append(options)
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", incremental_mapping)
+    flags = ImagesFlags(data=tmp_path, output_dir=tmp_path / "out", camera_type=kind)
+    assert colmap.reconstruct(lambda _: None, tmp_path / "a.db", tmp_path, tmp_path / "sparse", flags) == []
+    assert found[0].ba_refine_focal_length is refined
+    assert found[0].ba_refine_extra_params is refined
+    assert not found[0].ba_refine_principal_point
+
+
 def test_what_is_no_panorama_is_refused(tmp_path: Path) -> None:
     write_images(tmp_path / "in", ["a.png"])
     with pytest.raises(DataError, match=r"a\.png has 64x48 pixels"):
@@ -151,6 +171,8 @@ def test_flags_that_contradict_each_other(tmp_path: Path) -> None:
         ImagesFlags(**flags, camera_model="OPENCV_FISHEYE").check()
     with pytest.raises(ConfigError, match="--masks-dir"):
         ImagesFlags(**flags, masks_dir=tmp_path).check()
+    with pytest.raises(FlagError, match="--refine-intrinsics"):
+        ImagesFlags(**flags, refine_intrinsics=True).check()
     for name, value in {"num_views": 0, "view_angle": 5.0}.items():
         with pytest.raises(FlagError, match=f"--{name.replace('_', '-')}"):
             ImagesFlags(**flags, **{name: value}).check()

@@ -10,9 +10,8 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
-from nerfloom.cameras.cameras import MAX_SIDE
 from nerfloom.processing.capture import resized
-from nerfloom.processing.finite_numbers import finite
+from nerfloom.processing.finite_numbers import finite, side
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
@@ -29,10 +28,8 @@ def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
     Raises:
         TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
     """
-    width, height = (int(finite(value)) for value in size)
+    width, height = (side(value) for value in size)
     fx, fy, cx, cy = (finite(value) for value in intrinsics)
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise ValueError(f"sides must be from 1 to {MAX_SIDE} pixels")
     if min(fx, fy) <= 0:
         raise ValueError("a focal length must be above zero")
     return Lens("OPENCV", {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})

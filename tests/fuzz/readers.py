@@ -353,7 +353,8 @@ def read_bundler(folder: Path) -> Capture:
 
 
 OPENSFM = (
-    "projection_type", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots", "coordinates",
+    "projection_type", "width", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots",
+    "coordinates",
 )  # fmt: skip
 
 

@@ -374,6 +374,7 @@ CSV: dict[str, Callable[[list[str]], list[str]]] = {
     "a word": lambda lines: [lines[0], lines[1].replace("170.3", "north"), *lines[2:]],
     "nan": lambda lines: [lines[0], lines[1].replace("170.3", "nan"), *lines[2:]],
     "endless": lambda lines: [lines[0], lines[1].replace("170.3", "1e400"), *lines[2:]],
+    "decimal commas": lambda lines: [lines[0], *(line.replace(".0,", ",0,") for line in lines[1:])],
     "a short line": lambda lines: [*lines[:3], "DSC_0009.JPG,1,2", *lines[3:]],
     "no name": lambda lines: [lines[0], lines[1].replace("DSC_0000.JPG", ""), *lines[2:]],
     "a focal length of 0": lambda lines: [lines[0], lines[1].replace("24.5", "0.0"), *lines[2:]],
@@ -417,6 +418,15 @@ def test_opensfm(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [[0.5 * i, 1, -2] for i in range(4)])
 
 
+def test_an_image_that_was_turned_since_is_left_out(tmp_path: Path) -> None:
+    """The camera is for images of another shape, whose lens would fit none of its pixels."""
+    write_odm(tmp_path / "project")
+    Image.new("RGB", (HEIGHT, WIDTH)).save(tmp_path / "project" / "images" / NAMES[1])
+    content, said = process("odm", tmp_path / "project", tmp_path / "out")
+    assert [frame["source_path"] for frame in frames_of(content)] == [NAMES[0], *NAMES[2:]]
+    assert "1 with an image of another shape" in said
+
+
 def test_photographs_in_the_output_folder_are_not_removed(tmp_path: Path) -> None:
     write_odm(tmp_path / "project")
     (tmp_path / "out").mkdir()
@@ -440,6 +450,9 @@ JSON: dict[str, Callable[[Any], Any]] = {
     "a huge integer": lambda c: c[0]["shots"][NAMES[0]].update(rotation=[0, 10**400, 0]) or c,
     "no focal length": lambda c: [lens.pop("focal_x") for lens in c[0]["cameras"].values()] and c,
     "a focal length of 0": lambda c: [lens.update(focal_x=0) for lens in c[0]["cameras"].values()] and c,
+    "no width": lambda c: [lens.pop("width") for lens in c[0]["cameras"].values()] and c,
+    "a height of 0": lambda c: [lens.update(height=0) for lens in c[0]["cameras"].values()] and c,
+    "an endless width": lambda c: [lens.update(width=1e400) for lens in c[0]["cameras"].values()] and c,
     "a point without place": lambda c: c[0]["points"]["2"].pop("coordinates") and c,
 }
 

@@ -236,4 +236,4 @@ class BundlerFlags(ProgramFlags):
     bundle: Path
     """File of cameras and points, such as bundle.out."""
     image_list: Path | None = None
-    """List of the images, in the order of the cameras. Default: list.txt beside the bundle."""
+    """List of the images, in the order of the cameras. Default: list.txt beside the bundle or one folder up."""

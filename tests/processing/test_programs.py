@@ -519,6 +519,28 @@ def test_a_broken_bundle_is_refused_in_a_line(name: str, tmp_path: Path) -> None
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("bundle", "listed"),
+    [
+        ("bundle/bundle.out", "list.txt"),
+        ("bundle.out", "list.txt"),
+        ("a.bundle.out", "a.list.txt"),
+        ("a.out", "a.list.txt"),
+    ],
+)
+def test_the_list_of_images_is_found(bundle: str, listed: str, tmp_path: Path) -> None:
+    """Where Bundler writes it, and where COLMAP does; with Windows' mark of UTF-8."""
+    write_bundler(tmp_path / "given")
+    (tmp_path / bundle).parent.mkdir(exist_ok=True)
+    (tmp_path / "given" / "bundle.out").rename(tmp_path / bundle)
+    with pytest.raises(DataError, match="--image-list"):
+        bundler.find_list(tmp_path / bundle)
+    (tmp_path / listed).write_text((tmp_path / "given" / "list.txt").read_text(), encoding="utf-8-sig")
+    found = bundler.find_list(tmp_path / bundle)
+    assert found.resolve() == (tmp_path / listed).resolve()
+    assert [camera.name for camera in bundler.read_capture(tmp_path / bundle, found).cameras] == NAMES
+
+
 def test_a_list_that_is_too_short(tmp_path: Path) -> None:
     write_bundler(tmp_path)
     (tmp_path / "list.txt").write_text("a.jpg\n")

@@ -361,6 +361,17 @@ def test_realitycapture(recent: bool, tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.transform[:, :3].numpy(), np.eye(3), atol=1e-12)  # z is up, as the file says
 
 
+def test_photographs_that_were_not_aligned_are_counted(tmp_path: Path) -> None:
+    """The file has only the cameras that are placed."""
+    write_realitycapture(tmp_path)
+    file = tmp_path / "cameras.csv"
+    file.write_text("\n".join(file.read_text().splitlines()[:3]))
+    write_images(tmp_path / "photographs", ["sketches/plan.png"])
+    _, said = process("realitycapture", tmp_path / "photographs", tmp_path / "out", "--csv", file)
+    assert "2 of 2 cameras are placed" in said
+    assert f"3 other images are of no camera that is placed, the first: {NAMES[2]}" in said
+
+
 def test_heading_pitch_and_roll_have_their_meaning() -> None:
     assert np.allclose(realitycapture.rotation_of(0, 0, 0) @ [0, 0, -1], [0, 0, -1])  # down
     level = realitycapture.rotation_of(90, 90, 0)

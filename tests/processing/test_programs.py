@@ -323,6 +323,35 @@ def test_of_a_dense_cloud_some_points_are_taken(tmp_path: Path, monkeypatch: pyt
         point_files.with_points(capture, write_ply(tmp_path / "none.ply", points[:0]))
 
 
+@pytest.mark.parametrize(("kind", "factor"), [("uchar", 1), ("ushort", 257), ("float", 1 / 255)])
+def test_colours_of_any_type(kind: str, factor: float, tmp_path: Path) -> None:
+    capture = metashape.read_capture(write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras()))
+    points, file = in_view(0, count=3), tmp_path / "points.ply"
+    stored = " ".join(repr(value * factor) for value in (10, 0, 255))
+    text = write_ply(file, points).read_text().replace("property uchar", f"property {kind}").replace("10 20 30", stored)
+    file.write_text(text)
+    found = point_files.with_points(capture, file).colors
+    assert found is not None
+    assert found.tolist() == [[10, 0, 255]] * 3
+
+
+@pytest.mark.parametrize(("kind", "rounded"), [("f4", True), ("f8", False)])
+def test_points_that_single_precision_has_rounded(
+    kind: str, rounded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Geocentric coordinates have six digits before the point, of which float32 keeps half metres."""
+    component = f'<components><component id="0">{transform((ROTATION, PLACE, 1.0))}</component></components>'
+    xml = write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras('component_id="0"'), component)
+    points = np.concatenate([to_world(index, in_view(index), (ROTATION, PLACE, 1.0)) for index in range(COUNT)])
+    name = {"f4": "float", "f8": "double"}[kind]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [*(f"property {name} {axis}" for axis in "xyz"), "end_header\n"]
+    (tmp_path / "points.ply").write_bytes("\n".join(head).encode() + points.astype(f"<{kind}").tobytes())
+    point_files.with_points(metashape.read_capture(xml), tmp_path / "points.ply")
+    said = " ".join(capsys.readouterr().err.split())
+    assert ("rounded its coordinates by up to 0.25" in said) is rounded
+
+
 def test_coordinates_of_a_map_lose_nothing(tmp_path: Path) -> None:
     """Half a million metres east and five north: points keep fractions of a millimetre."""
     far = np.array([500_000.25, 5_000_000.5, 120.0])

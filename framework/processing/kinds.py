@@ -209,8 +209,8 @@ def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
     placed = placed_images(images, capture)
     claim(flags.output_dir, flags.data, flags.overwrite)
     views = Views(flags.num_views, flags.view_angle, flags.views_up_and_down)
-    kept = None if flags.panoramas == "whole" else views
-    write_capture(images, capture, placed, flags.output_dir, flags.num_downscales, kept)
+    whole = flags.panoramas == "whole"
+    write_capture(images, capture, placed, flags.output_dir, flags.num_downscales, views, whole)
 
 
 KINDS: dict[str, Kind] = {

@@ -18,7 +18,8 @@ from nerfloom.processing.transforms import Lens
 from nerfloom.processing.unfinished import VIEWS
 from nerfloom.processing.views import Views, cut, positions, turned, view_lens
 from tests.cli.helpers import called
-from tests.processing.programs import FRAME, camera, document, rotation_at, sensor, write_images
+from tests.processing import programs
+from tests.processing.programs import FRAME, NAMES, camera, document, rotation_at, sensor, write_images
 
 WIDE = 512
 PANORAMA = Lens(
@@ -205,3 +206,17 @@ def test_panoramas_beside_photographs_become_views(tmp_path: Path) -> None:
     done = called("ns-process-data", "metashape", *words, "--overwrite", "--panoramas", "whole")
     assert done.returncode != 0
     assert "--panoramas whole" in " ".join(done.stderr.split())
+
+
+def test_a_fisheye_beside_a_photograph_has_as_many_views_as_asked_for(tmp_path: Path) -> None:
+    """Also where panoramas, of which there are none, would stay whole."""
+    write_images(tmp_path / "photographs", NAMES[:2])
+    sensors = sensor(0, "fisheye", programs.FISHEYE) + sensor(1, "frame", FRAME)
+    cameras = camera(0, Path(NAMES[0]).stem) + camera(1, Path(NAMES[1]).stem, 1)
+    (tmp_path / "cameras.xml").write_text(document(sensors, cameras))
+    words = ("--data", tmp_path / "photographs", "--output-dir", tmp_path / "out", "--xml", tmp_path / "cameras.xml")
+    views = ("--panoramas", "whole", "--num-views", 1, "--view-angle", 60, "--num-downscales", 0)
+    done = called("ns-process-data", "metashape", *words, *views)
+    assert done.returncode == 0, done.stderr
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert {frame["file_path"] for frame in frames} == {"images/view_0_DSC_0000.jpg", "images/DSC_0001.jpg"}

@@ -25,8 +25,27 @@ HEADER = "# Bundle file v0.3"
 """First line."""
 LINES_OF_CAMERA, LINES_OF_POINT = 5, 3
 """Number of lines of a camera: f, k1 and k2; three rows of R; t. And of a point: position; colour; its images."""
+LISTS = ("list.txt", "{}.list.txt", "../list.txt")
+"""Paths of the list of images from the folder of the reconstruction. COLMAP writes NAME.bundle.out and NAME.list.txt,
+Bundler bundle/bundle.out and list.txt."""
 _WITH_FOCAL = re.compile(r"^(.*\S)\s+0\s+[\d.eE+-]+$")
 """A line of the list that states a focal length after the name."""
+
+
+def find_list(file: Path) -> Path:
+    """Return the path of the list of images.
+
+    Args:
+        file: bundle.out.
+
+    Raises:
+        DataError: if there is no list.
+    """
+    name = file.name.removesuffix(".out").removesuffix(".bundle")
+    for place in LISTS:
+        if (found := file.parent / place.format(name)).is_file():
+            return found
+    raise DataError(f"{file.parent} has no list.txt; name the list of the images by --image-list")
 
 
 def read_capture(file: Path, listed: Path) -> Capture:
@@ -82,7 +101,7 @@ def lens_for(focal: float, k1: float, k2: float, width: int, height: int) -> Len
 def _lines(file: Path) -> list[str]:
     """Return the lines of a text that are not empty."""
     try:
-        return [line for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return [line for line in file.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -161,6 +161,8 @@ def reconstruct(report: Report, database: Path, images: Path, output: Path, flag
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = flags.num_threads
     options.min_model_size = 3
+    # The lens of views is known exactly. COLMAP takes both values for single images, too.
+    options.ba_refine_focal_length = options.ba_refine_extra_params = flags.camera_type == "perspective"
     registered = 0
 
     def count_image(pair: bool = False) -> None:

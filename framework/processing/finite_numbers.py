@@ -13,6 +13,8 @@ UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
 """Errors raised if a number in a file is missing or is something else."""
 LARGEST = 1e30
 """Maximum magnitude of `bounded` numbers, whose products are still finite."""
+MAX_SIDE = 10**9
+"""Maximum width or height that a file may state, pixels."""
 MAX_ROUNDING = 0.02
 """Maximum deviation of R R^T from the identity that counts as rounding."""
 
@@ -39,6 +41,18 @@ def bounded(value: Any) -> float:
     if abs(number) > LARGEST:
         raise ValueError(f"{number} is out of range")
     return number
+
+
+def side(value: Any) -> int:
+    """Convert the value `value` of a file to the width or height of an image, from 1 to `MAX_SIDE` pixels.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if it is not such a number (`UNUSABLE`).
+    """
+    length = int(finite(value))
+    if not 1 <= length <= MAX_SIDE:
+        raise ValueError(f"{length} is out of range")
+    return length
 
 
 def finite_array(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:

@@ -192,10 +192,9 @@ def _convert_odm(flags: OdmFlags) -> None:
 
 
 def _convert_bundler(flags: BundlerFlags) -> None:
-    from nerfloom.processing.bundler import read_capture
+    from nerfloom.processing.bundler import find_list, read_capture
 
-    listed = flags.bundle.with_name("list.txt") if flags.image_list is None else flags.image_list
-    _convert(flags, flags.data, read_capture(flags.bundle, listed))
+    _convert(flags, flags.data, read_capture(flags.bundle, flags.image_list or find_list(flags.bundle)))
 
 
 def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
@@ -210,8 +209,8 @@ def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
     placed = placed_images(images, capture)
     claim(flags.output_dir, flags.data, flags.overwrite)
     views = Views(flags.num_views, flags.view_angle, flags.views_up_and_down)
-    kept = None if flags.panoramas == "whole" else views
-    write_capture(images, capture, placed, flags.output_dir, flags.num_downscales, kept)
+    whole = flags.panoramas == "whole"
+    write_capture(images, capture, placed, flags.output_dir, flags.num_downscales, views, whole)
 
 
 KINDS: dict[str, Kind] = {

@@ -18,8 +18,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from nerfloom.base.errors import DataError, shown
-from nerfloom.cameras.cameras import MAX_SIDE
-from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite
+from nerfloom.processing.finite_numbers import UNUSABLE, bounded, side
 from nerfloom.processing.transforms import Lens
 
 FISHEYES = ("fisheye", "equidistant_fisheye")
@@ -115,11 +114,9 @@ def _size(sensor: Element, calibration: Element | None, where: str) -> tuple[int
     inside = None if calibration is None else calibration.find("resolution")
     resolution = sensor.find("resolution") if inside is None else inside
     try:
-        width, height = (int(finite((resolution.attrib if resolution is not None else {})[key])) for key in SIDES)
+        width, height = (side((resolution.attrib if resolution is not None else {})[key]) for key in SIDES)
     except UNUSABLE as error:
         raise DataError(f"{where} has no resolution with width and height") from error
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DataError(f"{where} is for {width}x{height} pixels; sides must be from 1 to {MAX_SIDE}")
     return width, height
 
 

@@ -29,7 +29,8 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
     """Find the image files of a capture's cameras.
 
     A name is matched as in all data sets (`names_on_disk`), and at last by its part after the last slash, without
-    ending, where one camera and one file have it.
+    ending, where one camera and one file have it. Images beside them that no camera has are counted and reported, since
+    some programs list only the cameras that they placed.
 
     Args:
         folder: folder of the photographs.
@@ -58,6 +59,7 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
             f"--data {folder} has the image of none of {len(capture.cameras)} cameras, such as {name!r}: "
             f"{nearest_on_disk(folder / Path(name).name) if _is_possible(name) else 'it has no such name'}"
         )
+    _report_others(folder, placed)
     left_out = {"with the name of another camera": shared, "without image": len(capture.cameras) - shared - len(placed)}
     return PlacedImages(placed, Counter(left_out))
 
@@ -65,6 +67,16 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
 def reasons(left_out: Counter[str]) -> str:
     """Return the numbers in `left_out` with their reasons, as the end of a message."""
     return ", ".join(f"{count} {reason}" for reason, count in left_out.items() if count) or "there are none"
+
+
+def _report_others(folder: Path, placed: Iterable[Path]) -> None:
+    """Report how many images in the folders of the images `placed` are not among these."""
+    ours = {path.as_posix() for path in placed}
+    folders = {name.rpartition("/")[0] for name in ours}
+    others = [name for name in files_below(folder) if name not in ours and name.rpartition("/")[0] in folders]
+    others = [name for name in others if (folder / name).is_file()]  # not the full size of a reduced image
+    if others:
+        say(f"{folder}: {len(others)} other images are of no camera that is placed, the first: {others[0]}")
 
 
 def _is_possible(name: str) -> bool:

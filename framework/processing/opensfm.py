@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,8 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError, shown
 from nerfloom.base.json_files import read_json
-from nerfloom.processing.capture import Capture, PosedCamera, near_origin, relative_name
-from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite_array
+from nerfloom.processing.capture import Capture, PosedCamera, for_size_of, near_origin, relative_name
+from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite_array, side
 from nerfloom.processing.transforms import Lens, opengl_pose
 
 PROGRAM = "OpenSfM"
@@ -97,14 +96,21 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sinc(angle / math.pi) * cross + half**2 / 2 * (cross @ cross)
 
 
-def lens_for(camera: dict[str, float], kind: str, width: int, height: int) -> Lens:
-    """Return the lens of an image.
+def lens_of(camera: dict[str, Any], kind: str, where: str) -> Lens:
+    """Return the lens of a camera, for images of the size that it states.
 
     Args:
-        camera: numbers of the reconstruction's camera by name.
+        camera: a camera of the reconstruction.
         kind: its projection type, a supported one.
-        width, height: size of the image file, pixels.
+        where: name of the camera in messages, with its file.
+
+    Raises:
+        DataError: if a number is missing or invalid.
     """
+    try:
+        width, height = side(camera["width"]), side(camera["height"])
+    except UNUSABLE as error:
+        raise DataError(f"{where} has no width and height of its images") from error
     longer = max(width, height)
     if kind in SPHERICAL:
         half = longer / 2
@@ -112,12 +118,12 @@ def lens_for(camera: dict[str, float], kind: str, width: int, height: int) -> Le
             "EQUIRECTANGULAR",
             {"w": width, "h": height, "fl_x": half, "fl_y": half, "cx": width / 2, "cy": height / 2},
         )
+    given = _numbers(camera, kind, where)
     values = {
-        "w": width, "h": height, "fl_x": camera["focal_x"] * longer, "fl_y": camera["focal_y"] * longer,
-        "cx": width / 2 + camera["c_x"] * longer, "cy": height / 2 + camera["c_y"] * longer,
+        "w": width, "h": height, "fl_x": given["focal_x"] * longer, "fl_y": given["focal_y"] * longer,
+        "cx": width / 2 + given["c_x"] * longer, "cy": height / 2 + given["c_y"] * longer,
     }  # fmt: skip
-    known = PERSPECTIVE | FISHEYE
-    coefficients = {name: camera[name] for name in known[kind]}
+    coefficients = {name: given[name] for name in (PERSPECTIVE | FISHEYE)[kind]}
     return Lens("OPENCV_FISHEYE" if kind in FISHEYE else "OPENCV", values | coefficients)
 
 
@@ -138,9 +144,9 @@ def _camera(name: str, shot: Any, lenses: dict[str, Any], where: str) -> PosedCa
     translation = finite_array(shot.get("translation"), (3,), f"{where}: 'translation'")
     if not isinstance(kind, str) or kind not in (*PERSPECTIVE, *FISHEYE, *SPHERICAL):
         return None
-    numbers = {} if kind in SPHERICAL else _numbers(given, kind, f"{where}: camera {shown(shot['camera'])}")
+    lens = lens_of(given, kind, f"{where}: camera {shown(shot['camera'])}")
     pose = opengl_pose(np.concatenate([rotation, translation[:, None]], axis=1))
-    return PosedCamera(relative_name(name), pose, partial(lens_for, numbers, kind))
+    return PosedCamera(relative_name(name), pose, for_size_of(lens))
 
 
 def _numbers(camera: dict[str, Any], kind: str, where: str) -> dict[str, float]:

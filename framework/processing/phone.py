@@ -10,7 +10,8 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
-from nerfloom.processing.finite_numbers import finite
+from nerfloom.processing.capture import resized
+from nerfloom.processing.finite_numbers import finite, side
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
@@ -27,7 +28,7 @@ def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
     Raises:
         TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
     """
-    width, height = (int(finite(value)) for value in size)
+    width, height = (side(value) for value in size)
     fx, fy, cx, cy = (finite(value) for value in intrinsics)
     if min(fx, fy) <= 0:
         raise ValueError("a focal length must be above zero")
@@ -35,9 +36,10 @@ def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
 
 
 def evenly_spaced(items: list, most: int) -> list:
-    """Return at most `most` evenly spaced `items`, including the first and the last."""
+    """Return at most `most` evenly spaced `items`, including the first and the last; report if there are more."""
     if len(items) <= most:
         return items
+    say(f"{most} of {len(items)} images are taken, evenly spaced (--max-dataset-size)")
     return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
 
 
@@ -47,35 +49,37 @@ def write_folder(
     output: Path,
     num_downscales: int,
     applied: np.ndarray,
+    z_is_up: bool,
     crop: int = 0,
 ) -> None:
     """Prepare images and write a data folder.
 
     Args:
         folder: folder of the images.
-        posed: camera-to-world pose (4, 4) with OpenGL axes, and lens of the uncropped image, by the image's path.
+        posed: camera-to-world pose (4, 4) with OpenGL axes, and lens of the uncropped image, by the image's path; the
+            image may have another size.
         output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
         applied: (3, 4) transform from the phone's frame to that of the poses.
+        z_is_up: whether z is up in the frame of the poses, as the phone has measured; otherwise what is up is estimated
+            from the poses.
         crop: pixels to cut off at each side.
 
     Raises:
-        DataError: if no image is readable, or an image and its lens differ in size.
+        DataError: if no image is readable, or an image and its lens differ in shape.
     """
     prepared, _ = prepare_all(folder, list(posed), output / "images", upright=False, crop=crop)
     frames = []
     for image in prepared:
-        pose, uncropped = posed[Path(image.source)]
-        lens = cropped(uncropped, crop)
-        size = (image.width, image.height)
-        if size != (lens.values["w"], lens.values["h"]):
-            expected = f"{uncropped.values['w']}x{uncropped.values['h']}"
-            actual = f"{size[0] + 2 * crop}x{size[1] + 2 * crop}"
-            raise DataError(f"{folder / image.source} is {actual} pixels, but its camera is for {expected}")
-        frames.append(Frame(image.name, pose, lens, source=image.source))
+        pose, stated = posed[Path(image.source)]
+        try:
+            lens = resized(stated, image.width + 2 * crop, image.height + 2 * crop)
+        except DataError as error:
+            raise DataError(f"{folder / image.source}: {error}") from error
+        frames.append(Frame(image.name, pose, cropped(lens, crop), source=image.source))
     write_pyramid(output / "images", [image.name for image in prepared], num_downscales)
-    # The phone measures gravity, so the up direction need not be estimated from the poses.
-    write(output / FINISHED, content(frames, applied, None, {"orientation_override": "none"}))
+    more = {"orientation_override": "none"} if z_is_up else {}
+    write(output / FINISHED, content(frames, applied, None, more))
     say(f"{len(frames)} images with the phone's poses")
     say(ready(output))
 

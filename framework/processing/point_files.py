@@ -6,15 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.data.ply import read_columns, read_header, vertices
+from nerfloom.geometry.local_origin import local_origin, rounding
 from nerfloom.processing.capture import Capture, check_points
 
 COLORS = ("red", "green", "blue")
 """Properties of coloured vertices."""
+TO_BYTES = {"f4": 255.0, "f8": 255.0, "u2": 255 / 65535}
+"""Type of a colour -> factor to the range from 0 to 255; 1 for others. Colours that are not whole are from 0 to 1."""
 GREY = 128
 """Colour of points without colour."""
 MAX_POINTS = 2_000_000
@@ -40,9 +45,8 @@ def with_points(capture: Capture, file: Path | None) -> Capture:
     if len(chosen) < element.count:
         say(f"{file}: {len(chosen):,} of {element.count:,} points are taken, evenly spaced in the file")
     points = np.stack(columns[:3], axis=1).astype(np.float64)
-    colors = np.stack(columns[3:], axis=1) if colored else np.full(points.shape, GREY)
-    if dict(element.columns).get("red", "u1").startswith("f"):
-        colors = colors * 255.0  # colours that are not whole numbers are from 0 to 1
+    kind = dict(element.columns)["red"] if colored else ""
+    colors = np.stack(columns[3:], axis=1) * TO_BYTES.get(kind, 1.0) if colored else np.full(points.shape, GREY)
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         raise DataError(f"{file} has no point that is finite; leave it out, or export it again")
@@ -51,4 +55,15 @@ def with_points(capture: Capture, file: Path | None) -> Capture:
     kept = np.nan_to_num(colors[finite].astype(np.float64)).clip(0, 255).round().astype(np.uint8)
     made = replace(capture, points=points[finite], colors=kept)
     check_points(made, file)
+    if dict(element.columns)["x"] == "f4" and element.order != "ascii":
+        _report_rounding(file, torch.from_numpy(points[finite]))
     return made
+
+
+def _report_rounding(file: Path, points: Tensor) -> None:
+    """Report if float32, in which a file has the positions of `points` (K, 3), is too coarse for them."""
+    if local_origin(points) is not None:
+        say(
+            f"{file}: so far from the origin, single precision has rounded its coordinates by up to "
+            f"{rounding(points):.2g}; export it in double precision, if the program can"
+        )

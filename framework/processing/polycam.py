@@ -57,7 +57,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
     if not posed:
         raise DataError(f"{export} has no usable image; lower --min-blur-score, or export again")
     chosen = {name: posed[name] for name in evenly_spaced(list(posed), max_images)}
-    write_folder(images, chosen, output, num_downscales, Z_UP, crop)
+    write_folder(images, chosen, output, num_downscales, Z_UP, z_is_up=True, crop=crop)
 
 
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:

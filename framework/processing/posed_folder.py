@@ -42,7 +42,8 @@ def write_capture(
     placed: PlacedImages,
     output: Path,
     num_downscales: int,
-    views: Views | None,
+    views: Views,
+    whole: bool,
 ) -> None:
     """Write the data folder of a capture, and report how many of its cameras are in it and why others are not.
 
@@ -54,7 +55,8 @@ def write_capture(
         placed: the image files of its cameras.
         output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
-        views: views that panoramas are cut into; None keeps them whole.
+        views: views that images of wide lenses are cut into.
+        whole: whether panoramas are kept as they are.
 
     Raises:
         DataError: if no image can be used, or panoramas cannot be kept because other lenses were used, too.
@@ -69,7 +71,7 @@ def write_capture(
     say(f"{capture.program}: {len(posed)} of {capture.total} cameras are placed{_listed(left_out)}")
     if misfits:
         say(f"{len(misfits)} images do not fit their cameras, the first: {misfits[0]}")
-    frames = _frames(posed, _models_to_cut({entry.lens.model for entry in posed}, views), views, output)
+    frames = _frames(posed, _models_to_cut({entry.lens.model for entry in posed}, whole), views, output)
     if capture.points is not None and capture.colors is not None:
         points = capture.points @ capture.frame[:, :3].T + capture.frame[:, 3]
         write_points(output / POINTS, points, capture.colors)
@@ -106,23 +108,22 @@ def _listed(left_out: Counter[str]) -> str:
     return f" (left out: {reasons(left_out)})" if left_out.total() else ""
 
 
-def _models_to_cut(models: set[str], views: Views | None) -> set[str]:
+def _models_to_cut(models: set[str], whole: bool) -> set[str]:
     """Return the models of lenses whose images are cut into views, so that one model remains."""
-    if views is None and PANORAMA in models and len(models) > 1:
+    if whole and PANORAMA in models and len(models) > 1:
         raise DataError("--panoramas whole: there are images of other lenses, too, and a data folder has one model")
     if len(models) == 1:
-        return set() if views is None else models & {PANORAMA}
+        return set() if whole else models & {PANORAMA}
     return models - {PERSPECTIVE}
 
 
-def _frames(posed: list[_Posed], models: set[str], views: Views | None, output: Path) -> list[Frame]:
+def _frames(posed: list[_Posed], models: set[str], views: Views, output: Path) -> list[Frame]:
     """Return the frames, after cutting the images of some models of lenses."""
-    whole = [entry for entry in posed if entry.lens.model not in models]
+    kept = [entry for entry in posed if entry.lens.model not in models]
     wide = [entry for entry in posed if entry.lens.model in models]
-    frames = [Frame(entry.image.name, entry.pose, entry.lens, source=entry.image.source) for entry in whole]
+    frames = [Frame(entry.image.name, entry.pose, entry.lens, source=entry.image.source) for entry in kept]
     if not wide:
         return frames
-    views = views or Views(8, 90.0)  # fisheye images beside perspective ones
     names = _view_names([entry.image.name for entry in posed], wide, views)
 
     def cut_one(index: int) -> list[Frame]:

@@ -60,8 +60,7 @@ def read_capture(file: Path) -> Capture:
     missing = [name for name in POSE if name not in columns]
     if missing:
         raise DataError(f"{file} has no column {missing[0]!r}; {EXPORT}")
-    following = rows[start + 1 :]
-    cameras = [_camera(dict(zip(columns, row, strict=False)), f"{file}: line {line}") for line, row in following]
+    cameras = [_camera(columns, row, f"{file}: line {line}") for line, row in rows[start + 1 :]]
     frame = near_origin(cameras) if cameras else np.eye(4)[:3]
     return Capture(PROGRAM, cameras, Counter(), z_is_up=True, frame=frame)
 
@@ -117,7 +116,13 @@ def _column(name: str) -> str:
     return NAMES.get(plain, plain)
 
 
-def _camera(row: dict[str, str], where: str) -> PosedCamera:
+def _camera(columns: list[str], fields: list[str], where: str) -> PosedCamera:
+    if any(field.strip() for field in fields[len(columns) :]):
+        raise DataError(
+            f"{where} has {len(fields)} fields, and its header {len(columns)}; numbers need decimal points, and names "
+            "with commas quotation marks"
+        )
+    row = dict(zip(columns, fields, strict=False))
     try:
         values = {name: bounded(row[name]) for name in POSE} | {name: bounded(row.get(name) or 0) for name in LENS}
     except UNUSABLE as error:

@@ -2,6 +2,9 @@
 
 A recording is a zip file with rgbd/N.jpg and metadata, which holds the same JSON. Its depth images are compressed by
 LZFSE, and are not read.
+
+Poses are in the axes of the images as they are stored, portrait or landscape. The world's frame is that of the first
+camera, whose inclination is not recorded (the app's author, github.com/marek-simonik/record3d, issue 27).
 """
 
 from __future__ import annotations
@@ -39,7 +42,10 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
     path = root / "metadata.json"
     metadata = read_object(path)
     poses = poses_of(metadata, path)
-    numbered = {int(name.stem): name for name in find_images(root / "rgb") if name.stem.isdecimal()}
+    images = find_images(root / "rgb")
+    numbered = {int(name.stem): name for name in images if name.stem.isdecimal()}
+    if len(numbered) < len(images):
+        say(f"{len(images) - len(numbered)} images in {root / 'rgb'} have no number of their own and are skipped")
     usable = [number for number in sorted(numbered) if number < len(poses)]
     if len(usable) < len(numbered):
         say(f"{len(numbered) - len(usable)} images have a number beyond the {len(poses)} poses and are skipped")
@@ -48,9 +54,9 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
     if len(usable) < len(poses):
         say(f"{len(poses) - len(usable)} of {len(poses)} poses have no image")
     lenses = lenses_of(metadata, len(poses), path)
-    poses = transformed(poses, Z_UP)  # both apps record in the frame of ARKit
+    poses = transformed(poses, Z_UP)  # y is up in the image of the first camera
     posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly_spaced(usable, max_images)}
-    write_folder(root / "rgb", posed, output, num_downscales, Z_UP)
+    write_folder(root / "rgb", posed, output, num_downscales, Z_UP, z_is_up=False)
 
 
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -99,6 +105,8 @@ def poses_of(metadata: dict[str, Any], path: Path) -> np.ndarray:
         lengths = np.linalg.norm(rows[:, :4], axis=1, keepdims=True)
     if not len(rows) or not np.isfinite(rows).all() or not (np.isfinite(lengths) & (lengths > 0)).all():
         raise DataError(f"{path} has no poses, or poses that are not finite or have no rotation")
+    if len(rows) > 1 and (rows == rows[0]).all():
+        raise DataError(f"{path}: all {len(rows)} poses are equal; Record3D records them with the rear camera only")
     rows[:, :4] /= lengths
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = rotations(rows[:, :4])

@@ -107,6 +107,8 @@ class ColmapFlags(ViewFlags):
             raise FlagError("--overwrite removes what --resume continues; leave out one of them")
         if self.camera_type == "equirectangular" and self.camera_model == "OPENCV_FISHEYE":
             raise FlagError("--camera-type equirectangular cuts perspective views; leave out --camera-model")
+        if self.camera_type == "equirectangular" and self.refine_intrinsics:
+            raise FlagError("--camera-type equirectangular: the lens of views is exact; leave out --refine-intrinsics")
         minimums = {
             "exhaustive_limit": 0, "num_neighbors": 1, "sequential_overlap": 1,
             "max_image_size": 64, "max_num_features": 64,
@@ -234,4 +236,4 @@ class BundlerFlags(ProgramFlags):
     bundle: Path
     """File of cameras and points, such as bundle.out."""
     image_list: Path | None = None
-    """List of the images, in the order of the cameras. Default: list.txt beside the bundle."""
+    """List of the images, in the order of the cameras. Default: list.txt beside the bundle or one folder up."""

@@ -332,7 +332,7 @@ def convert(read: Callable[[Path], Capture], images: str, folder: Path, scratch:
     placed = placed_images(folder / images, capture)
     require(capture.total >= len(placed.cameras), "more images than cameras")
     (scratch / "data").mkdir()
-    write_placed(folder / images, capture, placed, scratch / "data", 0, Views(4, 90.0))
+    write_placed(folder / images, capture, placed, scratch / "data", 0, Views(4, 90.0), whole=False)
     parse(Nerfstudio(), scratch / "data", scratch)
 
 
@@ -353,7 +353,8 @@ def read_bundler(folder: Path) -> Capture:
 
 
 OPENSFM = (
-    "projection_type", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots", "coordinates",
+    "projection_type", "width", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots",
+    "coordinates",
 )  # fmt: skip
 
 

@@ -368,7 +368,8 @@ MUTANTS = {
             "truth/test_processing.py::test_polycam"),
         Mutant("crop-size-only-once", "cropped", "(('w', 2 * A), ('h', 2 * A), ('cx', A), ('cy', A))",
             "(('w', A), ('h', A), ('cx', A), ('cy', A))",
-            "ns-process-data polycam refuses its own pictures", "truth/test_processing.py::test_polycam"),
+            "ns-process-data polycam writes another size than its pictures have",
+            "truth/test_processing.py::test_polycam"),
     ],
     "nerfloom.processing.pipeline": [
         Mutant("colmap-frame-twice", "process", "A @ transforms.Z_UP[:, :3].T", "A",

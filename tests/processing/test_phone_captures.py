@@ -1,4 +1,7 @@
-"""Phones' captures with something wrong in them: refused in one line that names the file, and nothing is written."""
+"""Phones' captures with something wrong in them: refused in one line that names the file, and nothing is written.
+
+What is only unusual is converted, and said.
+"""
 
 import json
 import math
@@ -9,9 +12,11 @@ from typing import Any
 import pytest
 
 from nerfloom.base.errors import DataError
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.processing import polycam, record3d
+from tests.dataparsers.captures import poses, worst_miss
 from tests.dataparsers.test_polycam import STAMPS, write_polycam
-from tests.dataparsers.test_record3d import write_record3d
+from tests.dataparsers.test_record3d import COUNT, write_record3d
 
 Content = dict[str, Any]
 
@@ -36,6 +41,7 @@ CAMERAS = {
     "no focal length": lambda c: c.update(fx=0.0),
     "endless width": lambda c: c.update(width=math.inf),
     "wide": lambda c: c.update(width=1e300),
+    "no width": lambda c: c.update(width=0.5),
     "blur is a word": lambda c: c.update(blur_score="sharp"),
     "blur is nothing": lambda c: c.update(blur_score=None),
 }
@@ -49,6 +55,8 @@ METADATA = {
     "nan matrix": lambda c: c["K"].__setitem__(6, math.nan),
     "no focal length": lambda c: c["K"].__setitem__(0, 0),
     "endless width": lambda c: c.update(w=math.inf),
+    "no height": lambda c: c.update(h=-3),
+    "the front camera": lambda c: c.update(poses=[[0, 0, 0, 1, 0, 0, 0]] * COUNT),
 }
 
 
@@ -57,7 +65,7 @@ def test_polycam(name: str, tmp_path: Path) -> None:
     folder = write_polycam(tmp_path / "room")
     file = folder / "keyframes" / "cameras" / f"{STAMPS[4]}.json"
     spoil(file, CAMERAS[name])
-    with pytest.raises(DataError, match="000.jpg" if name == "wide" else file.name):
+    with pytest.raises(DataError, match=file.name):
         polycam.convert(folder, tmp_path / "out", 0, 100, 25.0, 0)
     assert not (tmp_path / "out" / "transforms.json").exists()
 
@@ -69,3 +77,38 @@ def test_record3d(name: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"metadata\.json"):
         record3d.convert(folder, tmp_path / "out", 0, 100)
     assert not (tmp_path / "out").exists()
+
+
+def test_an_image_of_another_shape(tmp_path: Path) -> None:
+    folder = write_polycam(tmp_path / "room")
+    spoil(folder / "keyframes" / "cameras" / f"{STAMPS[4]}.json", lambda c: c.update(width=c["height"]))
+    with pytest.raises(DataError, match=rf"{STAMPS[4]}\.jpg: it has 40x30 pixels, but its camera is for 30x30"):
+        polycam.convert(folder, tmp_path / "out", 0, 100, 25.0, 0)
+
+
+def test_reduced_images_of_record3d(tmp_path: Path) -> None:
+    """They are half as large as the file says; where the first camera's up is, nobody knows."""
+    folder = write_record3d(tmp_path / "recording")
+    record3d.convert(folder, tmp_path / "out", 0, 100)
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert "orientation_override" not in content
+    scene = Nerfstudio(eval_interval=0).parse(tmp_path / "out", "train")
+    order = [int(path.stem) for path in scene.image_paths]
+    assert sorted(order) == list(range(COUNT))
+    worst = worst_miss(scene, poses(COUNT)[order])
+    print(f"rays miss known points by {worst:.1e} of their distance")
+    assert worst < 2e-6
+
+
+def test_images_that_are_not_taken_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    room, recording = write_polycam(tmp_path / "room"), write_record3d(tmp_path / "recording")
+    rgb = recording / "EXR_RGBD" / "rgb"
+    (rgb / "cover.jpg").write_bytes((rgb / "0.jpg").read_bytes())
+    (rgb / "03.jpg").write_bytes((rgb / "3.jpg").read_bytes())
+    polycam.convert(room, tmp_path / "a", 0, 4, 25.0, 0)
+    record3d.convert(recording, tmp_path / "b", 0, 5)
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"4 of {len(STAMPS)} images are taken" in said
+    assert f"5 of {COUNT} images are taken" in said
+    assert "2 images in" in said
+    assert len(json.loads((tmp_path / "b" / "transforms.json").read_text())["frames"]) == 5

@@ -323,6 +323,35 @@ def test_of_a_dense_cloud_some_points_are_taken(tmp_path: Path, monkeypatch: pyt
         point_files.with_points(capture, write_ply(tmp_path / "none.ply", points[:0]))
 
 
+@pytest.mark.parametrize(("kind", "factor"), [("uchar", 1), ("ushort", 257), ("float", 1 / 255)])
+def test_colours_of_any_type(kind: str, factor: float, tmp_path: Path) -> None:
+    capture = metashape.read_capture(write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras()))
+    points, file = in_view(0, count=3), tmp_path / "points.ply"
+    stored = " ".join(repr(value * factor) for value in (10, 0, 255))
+    text = write_ply(file, points).read_text().replace("property uchar", f"property {kind}").replace("10 20 30", stored)
+    file.write_text(text)
+    found = point_files.with_points(capture, file).colors
+    assert found is not None
+    assert found.tolist() == [[10, 0, 255]] * 3
+
+
+@pytest.mark.parametrize(("kind", "rounded"), [("f4", True), ("f8", False)])
+def test_points_that_single_precision_has_rounded(
+    kind: str, rounded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Geocentric coordinates have six digits before the point, of which float32 keeps half metres."""
+    component = f'<components><component id="0">{transform((ROTATION, PLACE, 1.0))}</component></components>'
+    xml = write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras('component_id="0"'), component)
+    points = np.concatenate([to_world(index, in_view(index), (ROTATION, PLACE, 1.0)) for index in range(COUNT)])
+    name = {"f4": "float", "f8": "double"}[kind]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [*(f"property {name} {axis}" for axis in "xyz"), "end_header\n"]
+    (tmp_path / "points.ply").write_bytes("\n".join(head).encode() + points.astype(f"<{kind}").tobytes())
+    point_files.with_points(metashape.read_capture(xml), tmp_path / "points.ply")
+    said = " ".join(capsys.readouterr().err.split())
+    assert ("rounded its coordinates by up to 0.25" in said) is rounded
+
+
 def test_coordinates_of_a_map_lose_nothing(tmp_path: Path) -> None:
     """Half a million metres east and five north: points keep fractions of a millimetre."""
     far = np.array([500_000.25, 5_000_000.5, 120.0])
@@ -361,6 +390,17 @@ def test_realitycapture(recent: bool, tmp_path: Path) -> None:
     np.testing.assert_allclose(scene.transform[:, :3].numpy(), np.eye(3), atol=1e-12)  # z is up, as the file says
 
 
+def test_photographs_that_were_not_aligned_are_counted(tmp_path: Path) -> None:
+    """The file has only the cameras that are placed."""
+    write_realitycapture(tmp_path)
+    file = tmp_path / "cameras.csv"
+    file.write_text("\n".join(file.read_text().splitlines()[:3]))
+    write_images(tmp_path / "photographs", ["sketches/plan.png"])
+    _, said = process("realitycapture", tmp_path / "photographs", tmp_path / "out", "--csv", file)
+    assert "2 of 2 cameras are placed" in said
+    assert f"3 other images are of no camera that is placed, the first: {NAMES[2]}" in said
+
+
 def test_heading_pitch_and_roll_have_their_meaning() -> None:
     assert np.allclose(realitycapture.rotation_of(0, 0, 0) @ [0, 0, -1], [0, 0, -1])  # down
     level = realitycapture.rotation_of(90, 90, 0)
@@ -374,6 +414,7 @@ CSV: dict[str, Callable[[list[str]], list[str]]] = {
     "a word": lambda lines: [lines[0], lines[1].replace("170.3", "north"), *lines[2:]],
     "nan": lambda lines: [lines[0], lines[1].replace("170.3", "nan"), *lines[2:]],
     "endless": lambda lines: [lines[0], lines[1].replace("170.3", "1e400"), *lines[2:]],
+    "decimal commas": lambda lines: [lines[0], *(line.replace(".0,", ",0,") for line in lines[1:])],
     "a short line": lambda lines: [*lines[:3], "DSC_0009.JPG,1,2", *lines[3:]],
     "no name": lambda lines: [lines[0], lines[1].replace("DSC_0000.JPG", ""), *lines[2:]],
     "a focal length of 0": lambda lines: [lines[0], lines[1].replace("24.5", "0.0"), *lines[2:]],
@@ -417,6 +458,15 @@ def test_opensfm(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [[0.5 * i, 1, -2] for i in range(4)])
 
 
+def test_an_image_that_was_turned_since_is_left_out(tmp_path: Path) -> None:
+    """The camera is for images of another shape, whose lens would fit none of its pixels."""
+    write_odm(tmp_path / "project")
+    Image.new("RGB", (HEIGHT, WIDTH)).save(tmp_path / "project" / "images" / NAMES[1])
+    content, said = process("odm", tmp_path / "project", tmp_path / "out")
+    assert [frame["source_path"] for frame in frames_of(content)] == [NAMES[0], *NAMES[2:]]
+    assert "1 with an image of another shape" in said
+
+
 def test_photographs_in_the_output_folder_are_not_removed(tmp_path: Path) -> None:
     write_odm(tmp_path / "project")
     (tmp_path / "out").mkdir()
@@ -440,6 +490,9 @@ JSON: dict[str, Callable[[Any], Any]] = {
     "a huge integer": lambda c: c[0]["shots"][NAMES[0]].update(rotation=[0, 10**400, 0]) or c,
     "no focal length": lambda c: [lens.pop("focal_x") for lens in c[0]["cameras"].values()] and c,
     "a focal length of 0": lambda c: [lens.update(focal_x=0) for lens in c[0]["cameras"].values()] and c,
+    "no width": lambda c: [lens.pop("width") for lens in c[0]["cameras"].values()] and c,
+    "a height of 0": lambda c: [lens.update(height=0) for lens in c[0]["cameras"].values()] and c,
+    "an endless width": lambda c: [lens.update(width=1e400) for lens in c[0]["cameras"].values()] and c,
     "a point without place": lambda c: c[0]["points"]["2"].pop("coordinates") and c,
 }
 
@@ -504,6 +557,28 @@ def test_a_broken_bundle_is_refused_in_a_line(name: str, tmp_path: Path) -> None
     with pytest.raises(DataError, match=r"bundle\.out") as error:
         bundler.read_capture(file, tmp_path / "list.txt")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("bundle", "listed"),
+    [
+        ("bundle/bundle.out", "list.txt"),
+        ("bundle.out", "list.txt"),
+        ("a.bundle.out", "a.list.txt"),
+        ("a.out", "a.list.txt"),
+    ],
+)
+def test_the_list_of_images_is_found(bundle: str, listed: str, tmp_path: Path) -> None:
+    """Where Bundler writes it, and where COLMAP does; with Windows' mark of UTF-8."""
+    write_bundler(tmp_path / "given")
+    (tmp_path / bundle).parent.mkdir(exist_ok=True)
+    (tmp_path / "given" / "bundle.out").rename(tmp_path / bundle)
+    with pytest.raises(DataError, match="--image-list"):
+        bundler.find_list(tmp_path / bundle)
+    (tmp_path / listed).write_text((tmp_path / "given" / "list.txt").read_text(), encoding="utf-8-sig")
+    found = bundler.find_list(tmp_path / bundle)
+    assert found.resolve() == (tmp_path / listed).resolve()
+    assert [camera.name for camera in bundler.read_capture(tmp_path / bundle, found).cameras] == NAMES
 
 
 def test_a_list_that_is_too_short(tmp_path: Path) -> None:

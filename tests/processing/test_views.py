@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from nerfloom.base.errors import ConfigError, DataError, FlagError
+from nerfloom.processing import colmap
 from nerfloom.processing.panoramas import camera_parameters, write_views
 from nerfloom.processing.sequence import is_sequence
 from nerfloom.processing.settings import ImagesFlags
@@ -17,7 +18,8 @@ from nerfloom.processing.transforms import Lens
 from nerfloom.processing.unfinished import VIEWS
 from nerfloom.processing.views import Views, cut, positions, turned, view_lens
 from tests.cli.helpers import called
-from tests.processing.programs import FRAME, camera, document, rotation_at, sensor, write_images
+from tests.processing import programs
+from tests.processing.programs import FRAME, NAMES, camera, document, rotation_at, sensor, write_images
 
 WIDE = 512
 PANORAMA = Lens(
@@ -139,6 +141,25 @@ def test_colmap_is_told_the_lens_of_views() -> None:
     np.testing.assert_allclose(values, [50, 50, 50, 50])
 
 
+@pytest.mark.parametrize(("kind", "refined"), [("equirectangular", False), ("perspective", True)])
+def test_colmap_keeps_a_lens_that_is_known(
+    kind: Any, refined: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    found: list[Any] = []
+
+    def incremental_mapping(*_: object, options: Any, **__: object) -> dict[int, Any]:
+        found.append(options)
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", incremental_mapping)
+    flags = ImagesFlags(data=tmp_path, output_dir=tmp_path / "out", camera_type=kind)
+    assert colmap.reconstruct(lambda _: None, tmp_path / "a.db", tmp_path, tmp_path / "sparse", flags) == []
+    assert found[0].ba_refine_focal_length is refined
+    assert found[0].ba_refine_extra_params is refined
+    assert not found[0].ba_refine_principal_point
+
+
 def test_what_is_no_panorama_is_refused(tmp_path: Path) -> None:
     write_images(tmp_path / "in", ["a.png"])
     with pytest.raises(DataError, match=r"a\.png has 64x48 pixels"):
@@ -151,6 +172,8 @@ def test_flags_that_contradict_each_other(tmp_path: Path) -> None:
         ImagesFlags(**flags, camera_model="OPENCV_FISHEYE").check()
     with pytest.raises(ConfigError, match="--masks-dir"):
         ImagesFlags(**flags, masks_dir=tmp_path).check()
+    with pytest.raises(FlagError, match="--refine-intrinsics"):
+        ImagesFlags(**flags, refine_intrinsics=True).check()
     for name, value in {"num_views": 0, "view_angle": 5.0}.items():
         with pytest.raises(FlagError, match=f"--{name.replace('_', '-')}"):
             ImagesFlags(**flags, **{name: value}).check()
@@ -183,3 +206,17 @@ def test_panoramas_beside_photographs_become_views(tmp_path: Path) -> None:
     done = called("ns-process-data", "metashape", *words, "--overwrite", "--panoramas", "whole")
     assert done.returncode != 0
     assert "--panoramas whole" in " ".join(done.stderr.split())
+
+
+def test_a_fisheye_beside_a_photograph_has_as_many_views_as_asked_for(tmp_path: Path) -> None:
+    """Also where panoramas, of which there are none, would stay whole."""
+    write_images(tmp_path / "photographs", NAMES[:2])
+    sensors = sensor(0, "fisheye", programs.FISHEYE) + sensor(1, "frame", FRAME)
+    cameras = camera(0, Path(NAMES[0]).stem) + camera(1, Path(NAMES[1]).stem, 1)
+    (tmp_path / "cameras.xml").write_text(document(sensors, cameras))
+    words = ("--data", tmp_path / "photographs", "--output-dir", tmp_path / "out", "--xml", tmp_path / "cameras.xml")
+    views = ("--panoramas", "whole", "--num-views", 1, "--view-angle", 60, "--num-downscales", 0)
+    done = called("ns-process-data", "metashape", *words, *views)
+    assert done.returncode == 0, done.stderr
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert {frame["file_path"] for frame in frames} == {"images/view_0_DSC_0000.jpg", "images/DSC_0001.jpg"}

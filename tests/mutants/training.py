@@ -32,6 +32,11 @@ MUTANTS = {
         Mutant("rays-of-given-poses", "RefinedModel.loss", "replace(batch, rays=A)", "batch",
             "poses are never refined", "truth/test_refined_poses.py::test_training_moves_rays_and_rendering_does_not"),
     ],
+    "nerfloom.methods.gaussian_splatting": [
+        Mutant("field-moves-cameras-alone", "GaussianSplatting.start", "self.poses.tangents.copy_(A)", "A",
+            "Gaussians start where a field's moved cameras see surfaces, and are learnt from the given cameras",
+            "splats/test_method.py::test_cameras_start_where_the_field_has_moved_them"),
+    ],
     "nerfloom.methods.instant_ngp": [
         Mutant("ngp-plan-of-longest", "plan", "A / FITTED_SECONDS", "FITTED_SECONDS / A",
             "short runs get tables for long ones",

@@ -66,7 +66,7 @@ class GaussianSplattingConfig(SplattingConfig):
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
-    """Initial learning rate of the poses."""
+    """Initial learning rate of the poses, before --rate-factor."""
     depth_loss_mult: Auto[float] = AUTO
     """Weight of the depth loss. Default: 0.1 with depth images, else 0."""
     field_depth_mult: Auto[float] = AUTO
@@ -135,7 +135,9 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
-            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
+            # A step shows one camera. Dense Adam would keep turning it for tens of steps, by 5 to 10 rates in all.
+            rate = config.rate_factor * config.camera_learning_rate
+            self.poses.optimised = Optimised("poses", rate, schedule="exponential", sparse=True)
 
     @torch.no_grad()
     def start(self, dataset: Dataset) -> None:

@@ -7,8 +7,8 @@ gradients, or are moved as in Kheradmand et al., "3D Gaussian Splatting as Marko
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -66,7 +66,7 @@ class GaussianSplattingConfig(SplattingConfig):
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
-    """Initial learning rate of the poses."""
+    """Initial learning rate of the poses, before --rate-factor."""
     depth_loss_mult: Auto[float] = AUTO
     """Weight of the depth loss. Default: 0.1 with depth images, else 0."""
     field_depth_mult: Auto[float] = AUTO
@@ -96,6 +96,23 @@ def decide(config: GaussianSplattingConfigT, scene: Scene) -> tuple[GaussianSpla
     return config, made + more
 
 
+def starting_field(config: GaussianSplattingConfig, scene: Scene) -> Method:
+    """Return the method of the field that Gaussians start from: nerfacto in unbounded scenes, else instant-ngp.
+
+    Nerfacto refines the poses in the same way as the Gaussians, or not at all. Instant-ngp cannot: its samples carry no
+    gradient to rays.
+
+    Args:
+        config: the decided settings of the Gaussians.
+        scene: facts about the data.
+    """
+    if not scene.unbounded:
+        return load_method("instant-ngp")
+    method = load_method("nerfacto")
+    settings: Any = method.config
+    return replace(method, config=replace(settings, camera_optimizer=config.camera_optimizer))
+
+
 class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
     """A model of Gaussians drawn as whole images.
 
@@ -118,7 +135,9 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
-            self.poses.optimised = Optimised("poses", config.camera_learning_rate, schedule="exponential")
+            # A step shows one camera. Dense Adam would keep turning it for tens of steps, by 5 to 10 rates in all.
+            rate = config.rate_factor * config.camera_learning_rate
+            self.poses.optimised = Optimised("poses", rate, schedule="exponential", sparse=True)
 
     @torch.no_grad()
     def start(self, dataset: Dataset) -> None:
@@ -133,13 +152,15 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         if kind == "field":
             with torch.enable_grad():
                 seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
-                field = load_method("nerfacto" if dataset.scene.unbounded else "instant-ngp")
+                field = starting_field(self.config, dataset.scene)
                 found = found_surfaces(field, dataset, self.config, self.config.field_steps, seconds, count)
             first = from_points(found.positions, found.colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             self.found_distances.set(found.images, found.pixels, found.distances)
             if not len(first):
                 say("warning: the field has no surfaces; Gaussians start anywhere in the box")
                 kind = "random"
+            elif self.poses is not None and found.motions is not None:
+                self.poses.tangents.copy_(found.motions)  # the surfaces are where the moved cameras see them
         if kind != "field":
             points = first_points(kind, dataset, count)
             first = from_points(points, seen_colors(points, dataset), self.config.degree)

@@ -14,7 +14,7 @@ from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.points import SurfacePoints, joined, surface_points
 from nerfloom.method import Method
-from nerfloom.renderable import refined_cameras
+from nerfloom.renderable import RefinesPoses, parts, refined_cameras
 from nerfloom.training.trainer import Trainer
 
 MAX_PASSES = 16
@@ -35,6 +35,9 @@ class FoundSurfaces:
     """(N,) int64 index of the pixel in that image, row by row."""
     distances: Tensor
     """(N,) distance from that image's camera, scene units."""
+    motions: Tensor | None
+    """(M, 6) motions of the training cameras (`PoseRefinement.tangents`) if the field refined their poses, else None.
+    Points and distances belong to the moved cameras."""
 
 
 def found_surfaces(
@@ -68,13 +71,20 @@ def found_surfaces(
         if report.seconds >= seconds:
             break
     model = trainer.model.eval()
+    refined = [part.poses.tangents.detach() for part in parts(model, RefinesPoses) if part.poses is not None]
     dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras, training=True))
-    parts: list[SurfacePoints] = []
-    while (left := count - sum(len(part.positions) for part in parts)) > 0 and len(parts) < MAX_PASSES:
+    passes: list[SurfacePoints] = []
+    while (left := count - sum(len(one.positions) for one in passes)) > 0 and len(passes) < MAX_PASSES:
         found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
-        parts.append(found[torch.arange(len(found.positions)) < left])
-    found, cameras = joined(iter(parts)), dataset.cameras.to("cpu")
+        passes.append(found[torch.arange(len(found.positions)) < left])
+    found, cameras = joined(iter(passes)), dataset.cameras.to("cpu")
     images = torch.searchsorted(cameras.offsets, found.pixels, right=True) - 1
     distances = (found.positions - cameras.camera_to_worlds[images, :, 3]).norm(dim=-1)
-    columns = (found.positions, found.colors, images, found.pixels - cameras.offsets[images], distances)
-    return FoundSurfaces(*(column.to(dataset.device) for column in columns))
+    return FoundSurfaces(
+        found.positions.to(dataset.device),
+        found.colors.to(dataset.device),
+        images.to(dataset.device),
+        (found.pixels - cameras.offsets[images]).to(dataset.device),
+        distances.to(dataset.device),
+        refined[0] if refined else None,
+    )

@@ -32,6 +32,16 @@ MUTANTS = {
         Mutant("rays-of-given-poses", "RefinedModel.loss", "replace(batch, rays=A)", "batch",
             "poses are never refined", "truth/test_refined_poses.py::test_training_moves_rays_and_rendering_does_not"),
     ],
+    "nerfloom.methods.gaussian_splatting": [
+        Mutant("field-moves-cameras-alone", "GaussianSplatting.start", "self.poses.tangents.copy_(A)", "A",
+            "Gaussians start where a field's moved cameras see surfaces, and are learnt from the given cameras",
+            "splats/test_method.py::test_cameras_start_where_the_field_has_moved_them"),
+        Mutant("poses-by-dense-adam", "GaussianSplatting.__init__",
+            "Optimised('poses', A, schedule='exponential', sparse=True)",
+            "Optimised('poses', A, schedule='exponential')",
+            "a camera goes on turning after its image, by ten times the learning rate",
+            "splats/test_what_images_differ_in.py::test_a_step_moves_the_camera_of_its_image_alone"),
+    ],
     "nerfloom.methods.instant_ngp": [
         Mutant("ngp-plan-of-longest", "plan", "A / FITTED_SECONDS", "FITTED_SECONDS / A",
             "short runs get tables for long ones",

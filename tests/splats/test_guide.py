@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.view import View
 from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.export.surfaces import found_surfaces
@@ -14,7 +16,7 @@ from nerfloom.registry import load_method
 from nerfloom.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
 from tests.splats.test_method import SCENE, ball, camera
 from tests.splats.test_what_images_differ_in import model_of
-from tests.training.helpers import tiny_trainer
+from tests.training.helpers import TINY, tiny_trainer
 
 
 def some() -> FoundDistances:
@@ -73,6 +75,32 @@ def test_what_a_field_finds_lies_on_the_rays_of_its_pixels(shared_tiny: Path, tm
     rays = cameras.pixel_rays(cameras.offsets[found.images] + found.pixels, 0.0, 1.0)
     places = rays.origins + found.distances[:, None] * rays.directions
     assert torch.allclose(places, found.positions, atol=1e-4)
+    assert found.motions is None
+
+
+def test_what_a_field_finds_lies_on_the_rays_of_the_cameras_that_it_has_moved(
+    shared_tiny: Path, tmp_path: Path
+) -> None:
+    """Not on the rays of the given ones: Gaussians that start there need the motions too."""
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, start="random", num_gaussians=100)
+    dataset, nerfacto = trainer.train_set, load_method("nerfacto")
+    settings: dict[str, Any] = {**TINY["nerfacto"], "camera_optimizer": "SE3", "camera_learning_rate": 0.1}
+    field = replace(nerfacto, config=replace(nerfacto.config, **settings))
+    found = found_surfaces(field, dataset, trainer.config, 20, 60.0, 200)
+    assert len(found.positions) > 0
+    assert found.motions is not None
+    refinement = PoseRefinement(len(dataset), "SE3")
+    refinement.tangents.data.copy_(found.motions)
+    given = dataset.cameras
+    moved = replace(given, camera_to_worlds=refinement.refined(given.camera_to_worlds, training=True))
+    apart = []
+    for cameras in (moved, given):
+        rays = cameras.pixel_rays(cameras.offsets[found.images] + found.pixels, 0.0, 1.0)
+        places = rays.origins + found.distances[:, None] * rays.directions
+        apart.append(float((places - found.positions).norm(dim=-1).max()))
+    print(f"points off the rays of moved cameras by {apart[0]:.1e}, of given ones by {apart[1]:.1e}")
+    assert apart[0] < 3e-4
+    assert apart[1] > 10 * apart[0]
 
 
 def test_gaussians_are_pulled_to_the_distances_of_a_field_until_it_fades() -> None:

@@ -13,13 +13,14 @@ from nerfloom import ConfigError, View
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.data.scene import Scene
+from nerfloom.export.surfaces import FoundSurfaces
 from nerfloom.methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.splats.drawing import draw_colors, draw_view, splat_camera
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.training.checkpoint import load_checkpoint
 from tests.cli.helpers import called
 from tests.dataparsers.captures import write_capture
-from tests.training.helpers import tiny_trainer
+from tests.training.helpers import said_otherwise, tiny_trainer
 
 SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32, image_pixels=400 * 400)
 
@@ -168,6 +169,39 @@ def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None
     print(psnr)
     assert psnr["field"] > psnr["random"] + 3
     assert torch.equal(bits[0], bits[1])
+
+
+@pytest.mark.parametrize(
+    ("group", "unbounded", "asked"),
+    [("SE3", True, ("nerfacto", "SE3")), ("off", True, ("nerfacto", "off")), ("SE3", False, ("instant-ngp", None))],
+)
+def test_cameras_start_where_the_field_has_moved_them(
+    group: str, unbounded: bool, asked: tuple[str, str | None], shared_tiny: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """The field refines poses as the Gaussians do. Its surfaces are where the moved cameras see them."""
+    methods: list[tuple[str, str | None]] = []
+    motions = 0.01 * torch.randn(10, 6, generator=torch.Generator().manual_seed(5))
+
+    def found(method: Any, *rest: Any) -> FoundSurfaces:
+        refined = getattr(method.config, "camera_optimizer", None)
+        methods.append((method.name, refined))
+        places, first = torch.rand(50, 3), torch.zeros(50, dtype=torch.long)
+        return FoundSurfaces(places, places, first, first, torch.ones(50), motions if refined == "SE3" else None)
+
+    monkeypatch.setattr("nerfloom.methods.gaussian_splatting.found_surfaces", found)
+    asked_for = {"start": "field", "camera_optimizer": group}
+    trainer = said_otherwise("gaussian-splatting", shared_tiny, tmp_path, {"unbounded": unbounded}, **asked_for)
+    trainer.prepare()
+    assert methods == [asked]
+    model = trainer.model
+    assert isinstance(model, GaussianSplatting)
+    if group == "off":
+        assert model.poses is None
+    else:
+        assert model.poses is not None
+        expected = motions if asked[1] == "SE3" else torch.zeros(10, 6)
+        assert torch.equal(model.poses.tangents.detach(), expected)
 
 
 def test_a_checkpoint_has_as_many_gaussians_as_it_has(shared_tiny: Path, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from nerfloom.evaluation.outputs import (
     shown_output,
     side_by_side,
 )
-from nerfloom.evaluation.video_suffixes import check_suffix
+from nerfloom.evaluation.video_suffixes import MAX_GIF_FPS, check_suffix
 from nerfloom.evaluation.videos import MAX_UINT16, write_distances, write_images, write_strip, write_video
 from nerfloom.rendering.outputs import Output
 from nerfloom.training.loaded import Loaded
@@ -89,6 +89,9 @@ def _views(name: str, settings: PathSettings, loaded: Loaded, output: Path) -> V
         raise ConfigError(f"--downscale-factor {settings.downscale_factor} leaves no pixel")
     if output.suffix and bool((sizes != sizes[:, :1]).any()):
         raise ConfigError(f"--output-path {output}: the images are of several sizes; name a folder")
+    if output.suffix.lower() == ".gif" and views.fps > MAX_GIF_FPS:
+        limit = f"a GIF has at most {MAX_GIF_FPS:g} frames per second, not {views.fps:g}"
+        raise ConfigError(f"--output-path {output}: {limit}; name a .webp or a .mp4, or give --fps")
     return views
 
 

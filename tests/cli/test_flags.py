@@ -82,7 +82,7 @@ def test_an_unknown_flag(name: str) -> None:
             "--reach is 'far'; it must be a number; ns-export pointcloud --help shows the flags",
         ),
         ("ns-bench", ["kernels", "avx2"], "unexpected argument 'avx2'; ns-bench kernels --help shows the flags"),
-        ("ns-train", ["--resume"], "--resume needs a path"),
+        ("ns-train", ["--resume"], "--resume needs a value"),
         (
             "ns-train",
             ["instant-ngp", "--max-seconds"],

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from nerfloom.base.arguments import arguments_of
 from nerfloom.base.errors import ConfigError, nearest
-from nerfloom.base.plain import from_plain, to_plain
+from nerfloom.base.plain import from_plain
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.opened import Opened
 from nerfloom.registry import load_dataparser, load_method, registered, summary
@@ -80,7 +81,8 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
         method: name of the method; `list_methods()` lists all.
         data: folder of the data set; None for the embedded scene.
         format: name of the data format; None to detect it.
-        settings: settings of the method by name, with underscores, as in `max_seconds=60`.
+        settings: settings of the method and of the data format by name, with underscores, as in
+            `max_seconds=60, downscale_factor=2`.
 
     Raises:
         ConfigError: if the method or a setting is unknown.
@@ -89,9 +91,12 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
     from nerfloom.cli.session import start
 
     folder, name = find_data(None if data is None else Path(data), format)
-    config = from_plain(load_method(method).config, {**to_plain(settings), "data": _text(folder)}, "train()")
+    parser = load_dataparser(name)()
+    of_format = settings.keys() & {field.name for field in fields(parser)}  # type: ignore[arg-type]
+    parser = from_plain(parser, {key: settings.pop(key) for key in of_format}, "train()")
+    config = from_plain(load_method(method).config, {**settings, "data": _text(folder)}, "train()")
     config = limited_as_given(config, settings)
-    run = Run(method, config, name, load_dataparser(name)(), run_folder(method, config))
+    run = Run(method, config, name, parser, run_folder(method, config))
     start(run)
     return load(run.folder, device=config.machine.device_type)
 

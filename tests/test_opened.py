@@ -53,6 +53,17 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
+def test_a_training_takes_settings_of_the_data_format(shared_tiny: Path, tmp_path: Path) -> None:
+    tiny: dict[str, Any] = {"num_levels": 4, "max_resolution": 64, "log2_table_size": 12, "grid_resolution": 16}
+    tiny |= {"num_steps": 64, "samples_per_batch": 4096, "vis": "none", "output_dir": tmp_path / "out"}
+    tiny |= {"max_num_iterations": 1, "max_eval_images": 0}
+    whole = iio.imread(shared_tiny / "test" / "r_0.png").shape[:2]
+    view = nerfloom.train("instant-ngp", shared_tiny, downscale_factor=2, **tiny).views("test")[0]
+    assert (view.height, view.width) == (whole[0] // 2, whole[1] // 2)
+    with pytest.raises(ConfigError, match="unknown key 'downscale'"):
+        nerfloom.train("instant-ngp", shared_tiny, downscale=2, **tiny)
+
+
 def test_a_path_is_rendered_as_by_the_command(run: Path, tmp_path: Path) -> None:
     words = ("--num-frames", 2, "--width", 16, "--rendered-output-names", "rgb", "depth", "--depth-format", "npy")
     done = called("ns-render", "orbit", run, *words, "--output-path", tmp_path / "command")

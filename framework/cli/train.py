@@ -211,7 +211,8 @@ def _are_pairs(flags: list[str]) -> bool:
 def _check_format(word: str, method: str) -> None:
     """Raise ConfigError if `word` is not a data format."""
     if word not in registered("dataparsers") and os.path.exists(word):
-        raise ConfigError(f"'{word}' is not a data format; pass data with a flag: ns-train {method} --data {word}")
+        command = f"ns-train {method} --data {shlex.quote(word)}"
+        raise ConfigError(f"'{word}' is not a data format; pass data with a flag: {command}")
     entry_of("dataparsers", word)
 
 

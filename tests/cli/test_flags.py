@@ -104,6 +104,11 @@ def test_what_is_said(name: str, words: list[str], line: str) -> None:
             "--num-frames is 0; it must be at least 1",
         ),
         (
+            "ns-render",
+            ["orbit", "x", "--output-path", "y.gif", "--num-frames", 100_001],
+            "--num-frames makes 100,001 frames; the limit is 100,000",
+        ),
+        (
             "ns-process-data",
             ["video", "--data", "x", "--output-dir", "y", "--num-frames-target", 1],
             "--num-frames-target is 1; it must be at least 3",

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import nerfloom
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cameras.scale import Scale
 from nerfloom.cli.process_data import main as process_data
 from nerfloom.geometry.regions import Box, Sphere
@@ -200,6 +200,19 @@ def test_the_namespace_holds_the_interface_alone() -> None:
         if not name.startswith("_") and name not in nerfloom.__all__:  # rooms of the package, once imported
             assert isinstance(value, types.ModuleType)
             assert value.__name__ == f"nerfloom.{name}"
+
+
+def test_a_file_stands_as_it_is_told_and_a_run_is_of_the_chosen_checkpoint(ball: Path, run: Path) -> None:
+    ends = nerfloom.load(ball, up="-y").placement.points(torch.tensor([[0.0, 0, 0], [0, -1, 0]]))
+    up = ends[1] - ends[0]
+    torch.testing.assert_close(up / up.norm(), torch.tensor([0.0, 0, 1], dtype=torch.float64))
+    wrong: Any = "up"
+    with pytest.raises(ConfigError, match="it must be one of x, y, z, -x, -y, -z"):
+        nerfloom.load(ball, up=wrong)
+    checkpoint = min((run / "nerfstudio_models").glob("*.ckpt"))
+    assert nerfloom.load(run, checkpoint=checkpoint).checkpoint == checkpoint
+    with pytest.raises(CheckpointError, match=r"none\.ckpt"):
+        nerfloom.load(run, checkpoint=str(run / "none.ckpt"))
 
 
 def test_a_camera_is_made_by_hand_and_rendered(ball: Path) -> None:

@@ -91,7 +91,7 @@ def _views(name: str, settings: PathSettings, loaded: Loaded, output: Path) -> V
         raise ConfigError(f"--output-path {output}: the images are of several sizes; name a folder")
     if output.suffix.lower() == ".gif" and views.fps > MAX_GIF_FPS:
         limit = f"a GIF has at most {MAX_GIF_FPS:g} frames per second, not {views.fps:g}"
-        raise ConfigError(f"--output-path {output}: {limit}; name a .webp or a .mp4, or give --fps")
+        raise ConfigError(f"--output-path {output}: {limit}; name a .webp or a .mp4, or give a smaller --fps")
     return views
 
 

@@ -66,9 +66,11 @@ def test_a_training_takes_settings_of_the_data_format(shared_tiny: Path, tmp_pat
 
 def test_a_path_is_rendered_as_by_the_command(run: Path, tmp_path: Path) -> None:
     words = ("--num-frames", 2, "--width", 16, "--rendered-output-names", "rgb", "depth", "--depth-format", "npy")
-    done = called("ns-render", "orbit", run, *words, "--output-path", tmp_path / "command")
+    more = ("--rays-per-pixel", 9, "--output-path", tmp_path / "command")
+    done = called("ns-render", "orbit", run, *words, *more)
     assert done.returncode == 0, done.stderr
     settings: dict[str, Any] = {"num_frames": 2, "width": 16, "rendered_output_names": ("rgb", "depth")}
+    settings["rays_per_pixel"] = 9
     nerfloom.load(run).render_path("orbit", tmp_path / "python", depth_format="npy", **settings)
     found = contents(tmp_path / "python")
     assert found == contents(tmp_path / "command")
@@ -146,6 +148,7 @@ def test_a_point_cloud_lies_on_the_ball(ball: Path, shared_tiny: Path, tmp_path:
         (lambda run, file: run.render_path("orbit", file, frames=3), "unknown key 'frames'"),
         (lambda run, file: run.render_path("orbit", file, width="wide"), "'width' is 'wide'"),
         (lambda run, file: run.render_path("orbit", file, fov=0.0), "--fov is 0"),
+        (lambda run, file: run.render_path("orbit", file, rays_per_pixel=4), "no effect with Gaussians"),
         (lambda run, file: run.export("mesh", file), "nothing is exported as 'mesh'"),
         (lambda run, file: run.export("web", file), "web is written to .html files"),
         (lambda run, file: run.export("web", file.with_suffix(".html"), url="cup"), "--url is 'cup'"),

@@ -31,6 +31,7 @@ from nerfloom.evaluation.outputs import (
 from nerfloom.evaluation.video_suffixes import MAX_GIF_FPS, check_suffix
 from nerfloom.evaluation.videos import MAX_UINT16, write_distances, write_images, write_strip, write_video
 from nerfloom.rendering.outputs import Output
+from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
 from nerfloom.video.settings import FileSettings, PathSettings, ViewSettings
 from nerfloom.video.views import VIEWS, Views, background_of
@@ -58,6 +59,8 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
     check_suffix(output)
     target = settings.target(output)
     model, is_folder = loaded.model, not target.suffix
+    if settings.rays_per_pixel is not None and isinstance(model, HasGaussians):
+        raise ConfigError("--rays-per-pixel has no effect with Gaussians: leave it out")
     bound = None if settings.max_error is None else parse_error(settings.max_error)
     outputs = chosen_outputs(model, settings.rendered_output_names)
     views, background = _views(name, settings, loaded, output), background_of(settings, loaded)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from nerfloom.base.arguments import arguments_of
-from nerfloom.base.errors import ConfigError, nearest
-from nerfloom.base.plain import from_plain, to_plain
+from nerfloom.base.errors import ConfigError, nearest, shown
+from nerfloom.base.plain import from_plain
 from nerfloom.base.step_limit import limited_as_given
 from nerfloom.opened import Opened
 from nerfloom.registry import load_dataparser, load_method, registered, summary
 from nerfloom.rendering.rendered import Picture
+from nerfloom.splats.placement import Axis
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.load import load as loaded
 from nerfloom.training.run import Run, run_folder
@@ -29,7 +31,13 @@ def list_methods() -> dict[str, str]:
     return {name: summary(entry) for name, entry in registered("methods").items()}
 
 
-def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Opened:
+def load(
+    path: str | Path,
+    data: str | Path | None = None,
+    device: Device = "auto",
+    up: Axis | None = None,
+    checkpoint: str | Path | None = None,
+) -> Opened:
     """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
 
     Args:
@@ -37,13 +45,18 @@ def load(path: str | Path, data: str | Path | None = None, device: Device = "aut
             file of Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree).
         data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
+        up: up axis of a file of Gaussians without data: x, y, z, -x, -y or -z; None for z.
+        checkpoint: checkpoint of the run; None for the newest readable one.
 
     Raises:
-        ConfigError: if config.yml is missing or invalid.
+        ConfigError: if config.yml is missing or invalid, or `up` or `checkpoint` does not suit what is loaded.
         CheckpointError: if the checkpoint is missing or does not fit the settings.
         DataError: if the file cannot be read.
     """
-    return Opened.of(loaded(config_file(Path(path)), device_type=device, data=None if data is None else Path(data)))
+    if up not in (None, *get_args(Axis)):
+        raise ConfigError(f"up is {shown(up)}; it must be one of {', '.join(get_args(Axis))}")
+    found = config_file(Path(path))
+    return Opened.of(loaded(found, _path(checkpoint), device, _path(data), up=up))
 
 
 def process(photographs: str | Path, output_dir: str | Path, kind: str = "images", **settings: Any) -> Path:
@@ -80,7 +93,8 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
         method: name of the method; `list_methods()` lists all.
         data: folder of the data set; None for the embedded scene.
         format: name of the data format; None to detect it.
-        settings: settings of the method by name, with underscores, as in `max_seconds=60`.
+        settings: settings of the method and of the data format by name, with underscores, as in
+            `max_seconds=60, downscale_factor=2`.
 
     Raises:
         ConfigError: if the method or a setting is unknown.
@@ -88,12 +102,19 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
     """
     from nerfloom.cli.session import start
 
-    folder, name = find_data(None if data is None else Path(data), format)
-    config = from_plain(load_method(method).config, {**to_plain(settings), "data": _text(folder)}, "train()")
+    folder, name = find_data(_path(data), format)
+    parser = load_dataparser(name)()
+    of_format = settings.keys() & {field.name for field in fields(parser)}  # type: ignore[arg-type]
+    parser = from_plain(parser, {key: settings.pop(key) for key in of_format}, "train()")
+    config = from_plain(load_method(method).config, {**settings, "data": _text(folder)}, "train()")
     config = limited_as_given(config, settings)
-    run = Run(method, config, name, load_dataparser(name)(), run_folder(method, config))
+    run = Run(method, config, name, parser, run_folder(method, config))
     start(run)
     return load(run.folder, device=config.machine.device_type)
+
+
+def _path(given: str | Path | None) -> Path | None:
+    return None if given is None else Path(given)
 
 
 def _text(path: Path | None) -> str | None:

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import nerfloom
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cameras.scale import Scale
 from nerfloom.cli.process_data import main as process_data
 from nerfloom.geometry.regions import Box, Sphere
@@ -53,11 +53,24 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
+def test_a_training_takes_settings_of_the_data_format(shared_tiny: Path, tmp_path: Path) -> None:
+    tiny: dict[str, Any] = {"num_levels": 4, "max_resolution": 64, "log2_table_size": 12, "grid_resolution": 16}
+    tiny |= {"num_steps": 64, "samples_per_batch": 4096, "vis": "none", "output_dir": tmp_path / "out"}
+    tiny |= {"max_num_iterations": 1, "max_eval_images": 0}
+    whole = iio.imread(shared_tiny / "test" / "r_0.png").shape[:2]
+    view = nerfloom.train("instant-ngp", shared_tiny, downscale_factor=2, **tiny).views("test")[0]
+    assert (view.height, view.width) == (whole[0] // 2, whole[1] // 2)
+    with pytest.raises(ConfigError, match="unknown key 'downscale'"):
+        nerfloom.train("instant-ngp", shared_tiny, downscale=2, **tiny)
+
+
 def test_a_path_is_rendered_as_by_the_command(run: Path, tmp_path: Path) -> None:
     words = ("--num-frames", 2, "--width", 16, "--rendered-output-names", "rgb", "depth", "--depth-format", "npy")
-    done = called("ns-render", "orbit", run, *words, "--output-path", tmp_path / "command")
+    more = ("--rays-per-pixel", 9, "--output-path", tmp_path / "command")
+    done = called("ns-render", "orbit", run, *words, *more)
     assert done.returncode == 0, done.stderr
     settings: dict[str, Any] = {"num_frames": 2, "width": 16, "rendered_output_names": ("rgb", "depth")}
+    settings["rays_per_pixel"] = 9
     nerfloom.load(run).render_path("orbit", tmp_path / "python", depth_format="npy", **settings)
     found = contents(tmp_path / "python")
     assert found == contents(tmp_path / "command")
@@ -135,6 +148,7 @@ def test_a_point_cloud_lies_on_the_ball(ball: Path, shared_tiny: Path, tmp_path:
         (lambda run, file: run.render_path("orbit", file, frames=3), "unknown key 'frames'"),
         (lambda run, file: run.render_path("orbit", file, width="wide"), "'width' is 'wide'"),
         (lambda run, file: run.render_path("orbit", file, fov=0.0), "--fov is 0"),
+        (lambda run, file: run.render_path("orbit", file, rays_per_pixel=4), "no effect with Gaussians"),
         (lambda run, file: run.export("mesh", file), "nothing is exported as 'mesh'"),
         (lambda run, file: run.export("web", file), "web is written to .html files"),
         (lambda run, file: run.export("web", file.with_suffix(".html"), url="cup"), "--url is 'cup'"),
@@ -189,6 +203,19 @@ def test_the_namespace_holds_the_interface_alone() -> None:
         if not name.startswith("_") and name not in nerfloom.__all__:  # rooms of the package, once imported
             assert isinstance(value, types.ModuleType)
             assert value.__name__ == f"nerfloom.{name}"
+
+
+def test_a_file_stands_as_it_is_told_and_a_run_is_of_the_chosen_checkpoint(ball: Path, run: Path) -> None:
+    ends = nerfloom.load(ball, up="-y").placement.points(torch.tensor([[0.0, 0, 0], [0, -1, 0]]))
+    up = ends[1] - ends[0]
+    torch.testing.assert_close(up / up.norm(), torch.tensor([0.0, 0, 1], dtype=torch.float64))
+    wrong: Any = "up"
+    with pytest.raises(ConfigError, match="it must be one of x, y, z, -x, -y, -z"):
+        nerfloom.load(ball, up=wrong)
+    checkpoint = min((run / "nerfstudio_models").glob("*.ckpt"))
+    assert nerfloom.load(run, checkpoint=checkpoint).checkpoint == checkpoint
+    with pytest.raises(CheckpointError, match=r"none\.ckpt"):
+        nerfloom.load(run, checkpoint=str(run / "none.ckpt"))
 
 
 def test_a_camera_is_made_by_hand_and_rendered(ball: Path) -> None:

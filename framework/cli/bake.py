@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,7 +61,7 @@ def _command(arguments: list[str]) -> None:
     say(f"{size:.2f} MB after {time.perf_counter() - start:.0f} s: {path}")
     if size > flags.max_megabytes:
         say(f"note: the file is larger than --max-megabytes {flags.max_megabytes:g}, because it compresses less")
-    say(f"compare it with its run: ns-eval {path} --data DIR")
+    say(f"compare it with its run: ns-eval {shlex.quote(str(path))} --data DIR")
 
 
 def _check(flags: BakeFlags) -> None:

@@ -107,6 +107,29 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
     return arguments[:index] + others, (word, parser)
 
 
+def take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
+    """Take a flag and its value out of the arguments of a command.
+
+    Args:
+        arguments: arguments of the command.
+        flag: the flag; its value is the next argument, or follows a "=".
+
+    Returns:
+        The value, None if the flag is not given, and the other arguments.
+
+    Raises:
+        FlagError: if the value is missing.
+    """
+    for index, argument in enumerate(arguments):
+        if argument == flag:
+            if index + 1 == len(arguments):
+                raise FlagError(f"{flag} needs a value")
+            return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
+        if argument.startswith(flag + "="):
+            return argument[len(flag) + 1 :], arguments[:index] + arguments[index + 1 :]
+    return None, arguments
+
+
 def make_room(path: Path) -> None:
     """Create the folder of the file `path`, and check that the file can be written, before any work.
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.cli.common import check_weights, run_command
+from nerfloom.base.errors import ConfigError
+from nerfloom.cli.common import check_weights, run_command, take
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.cli.job_flags import JobFlags
@@ -63,8 +63,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     from nerfloom.base.plain import from_plain, read_yaml
 
-    recipe, arguments = _recipe(arguments)
-    default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
+    recipe, arguments = take(arguments, "--load-config")
+    default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(Path(recipe)), recipe)
     flags = read_flags(CompareFlags, "ns-compare", arguments, default=default)
     if flags.data is not None:
         check_data(flags.data)
@@ -77,16 +77,6 @@ def _command(arguments: list[str]) -> None:
     say(f"report: {plan.folder / 'report.html'} (also report.md, results.json, results.csv)")
     if failed:
         raise ConfigError(f"{len(failed)} of {len(rows)} methods failed: {', '.join(failed)}; the report says why")
-
-
-def _recipe(arguments: list[str]) -> tuple[Path | None, list[str]]:
-    """Return the file after --load-config, if given, and the other arguments."""
-    if "--load-config" not in arguments:
-        return None, arguments
-    index = arguments.index("--load-config")
-    if index + 1 == len(arguments):
-        raise FlagError("--load-config needs a file, such as configs/compare-lego.yml")
-    return Path(arguments[index + 1]), arguments[:index] + arguments[index + 2 :]
 
 
 def plan_of(flags: CompareFlags) -> Plan:

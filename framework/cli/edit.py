@@ -127,7 +127,7 @@ def _command(arguments: list[str]) -> None:
 def _check(flags: EditFlags) -> None:
     from nerfloom.splats.files import SUFFIXES
 
-    if flags.output_path.suffix not in SUFFIXES:
+    if flags.output_path.suffix.lower() not in SUFFIXES:
         raise FlagError(f"--output-path is {flags.output_path}; Gaussians are written to {' or '.join(SUFFIXES)} files")
     if flags.max_megabytes is not None and not flags.max_megabytes > 0:
         raise FlagError(f"--max-megabytes must be positive, not {flags.max_megabytes}")

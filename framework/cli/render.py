@@ -44,8 +44,7 @@ def _render(name: str, flags: Any, named: DataFormat | None) -> None:
     make_room(target if target.suffix else target / "render.json")
     from nerfloom.video.render import render_path
 
-    loaded = flags.run.load(found, named, rays_per_pixel=flags.rays_per_pixel)
-    render_path(loaded, name, output, flags)
+    render_path(flags.run.load(found, named), name, output, flags)
 
 
 if __name__ == "__main__":

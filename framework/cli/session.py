@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -134,8 +135,7 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
         if processes().first:
             with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it after a process has ended
                 trainer.save()
-        where, command = f"step {trainer.state.step:,}", f"ns-train --resume {trainer.folder}"
-        raise LostProcessError(f"{where}: {error}; continue with: {command}") from error
+        raise LostProcessError(f"step {trainer.state.step:,}: {error}; {_continue_with(trainer.folder)}") from error
 
 
 def _finish(run: Run, trainer: Trainer) -> None:
@@ -164,8 +164,9 @@ def _finish(run: Run, trainer: Trainer) -> None:
     write_summary(run.folder / SUMMARY, trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")
     if outcome.stopped_by is not None:
-        raise Stopped(outcome.stopped_by, f"continue with: ns-train --resume {run.folder}")
-    with _noted_stop(lambda: f"stopped while evaluating; the trained run is saved: ns-eval {run.folder}"):
+        raise Stopped(outcome.stopped_by, _continue_with(run.folder))
+    command = f"ns-eval {shlex.quote(str(run.folder))}"
+    with _noted_stop(lambda: f"stopped while evaluating; the trained run is saved: {command}"):
         _evaluate(run, trainer, outcome)
     for line in after_training(trainer.model.scene, run.folder):
         say(line)
@@ -231,4 +232,9 @@ def _saved_note(run: Run) -> str:
     saved = list_checkpoints(run.folder / FOLDER)
     if not saved:
         return "stopped at once: nothing was saved"
-    return f"stopped at once: the last checkpoint is {saved[-1].name}; continue with: ns-train --resume {run.folder}"
+    return f"stopped at once: the last checkpoint is {saved[-1].name}; {_continue_with(run.folder)}"
+
+
+def _continue_with(folder: Path) -> str:
+    """Return the end of a message with the command that continues the run in `folder`."""
+    return f"continue with: ns-train --resume {shlex.quote(str(folder))}"

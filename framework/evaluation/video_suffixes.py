@@ -9,6 +9,8 @@ from nerfloom.base.extras import install_command
 
 VIDEO, ANIMATIONS = ".mp4", (".gif", ".webp", ".png")
 """Suffixes of files with several pictures."""
+MAX_GIF_FPS = 50.0
+"""Maximum number of frames per second of a GIF. Browsers show a frame of less than 0.02 s for 0.1 s."""
 
 
 def default_video(stem: str) -> Path:

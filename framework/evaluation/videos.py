@@ -19,6 +19,8 @@ QUALITY = 18
 """Constant rate factor of H.264; 18 is considered visually lossless."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
+GIF_UNIT = 10
+"""Unit of the durations in a GIF, milliseconds."""
 MAX_UINT16 = 65_535
 """Largest value of a 16-bit PNG."""
 
@@ -86,11 +88,25 @@ def _even(picture: np.ndarray) -> np.ndarray:
 
 
 def _write_animation(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    images = (Image.fromarray(picture) for picture in pictures)
-    first = next(images)
-    # Pillow iterates over the images of a PNG twice, so they must be in memory.
-    others = list(images) if path.suffix.lower() == ".png" else images
-    first.save(path, save_all=True, append_images=others, duration=1000 / fps, loop=0)
+    unit = GIF_UNIT if path.suffix.lower() == ".gif" else 1
+    durations: list[int] = []
+
+    def images() -> Iterator[Image.Image]:
+        for number, picture in enumerate(pictures):
+            # A frame ends at the whole unit nearest to its end, so that the animation has its length.
+            durations.append(unit * (_units(number + 1, fps, unit) - _units(number, fps, unit)))
+            yield Image.fromarray(picture)
+
+    given = images()
+    first = next(given)
+    # Pillow iterates over the images of a PNG twice, so they must be in memory. It reads a duration after its image.
+    others = list(given) if path.suffix.lower() == ".png" else given
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def _units(frames: int, fps: float, unit: int) -> int:
+    """Return the duration of a number of frames in whole units of `unit` milliseconds."""
+    return round(1000 * frames / fps / unit)
 
 
 def write_strip(path: Path, pictures: Iterable[np.ndarray]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from nerfloom.base.console import say
@@ -43,7 +44,8 @@ def export_cameras(loaded: Loaded, path: Path, settings: CameraSettings) -> None
     file = path.parent / "nerfstudio" / "transforms.json"
     write_transforms(file, posed, settings.relative_paths)
     counts = ", ".join(f"{len(members)} {split}" for split, members in posed.splits.items())
-    say(f"{len(posed.files)} cameras ({counts}): {file}; train on it: ns-train METHOD --data {file.parent}")
+    folder = shlex.quote(str(file.parent))
+    say(f"{len(posed.files)} cameras ({counts}): {file}; train on it: ns-train METHOD --data {folder}")
     model = path.parent / "colmap" / "sparse" / "0"
     try:
         write_model(model, posed)

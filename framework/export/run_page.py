@@ -265,7 +265,8 @@ def closeness(
             target = composite(dataset.image(index).float() / 255, background)
             kept = dataset.kept_of(index)
             photographs.append((measure(shown, target, kept).psnr, measure(rgb, target, kept).psnr))
-    views = f"{len(chosen)} {'views around it' if dataset is None else 'of the held-out views'}"
+    kind = "views around it" if dataset is None else f"{'training' if dataset.training else 'held-out'} views"
+    views = f"{len(chosen)} {kind}"
     if not photographs:
         return Closeness(views, fmean(own), None, None)
     page, method = zip(*photographs, strict=True)

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import urljoin
+from urllib.parse import quote, urljoin
 
 import torch
 from torch import Tensor
@@ -237,7 +237,8 @@ def preview_tags(facts: PageFacts) -> str:
     if facts.url:
         tags["og:url"] = facts.url
     if facts.picture:
-        tags |= {"og:image": urljoin(facts.url, facts.picture), "og:image:width": str(width)}
+        address = urljoin(facts.url, quote(facts.picture, errors="surrogateescape"))
+        tags |= {"og:image": address, "og:image:width": str(width)}
         tags |= {"og:image:height": str(height), "og:image:alt": facts.title}
     lines = [f'<meta property="{name}" content="{html.escape(value)}">' for name, value in tags.items()]
     card = "summary_large_image" if facts.picture else "summary"

@@ -19,6 +19,7 @@ import dataclasses
 import json
 import math
 import os
+import shlex
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -137,8 +138,8 @@ def create_folder(run: Run) -> None:
     """
     if run.config_path.exists():
         raise ConfigError(
-            f"{run.folder} already holds a run; continue it with 'ns-train --resume {run.folder}', "
-            "or choose another --timestamp"
+            f"{run.folder} already holds a run; choose another --timestamp, or continue it: "
+            f"ns-train --resume {shlex.quote(str(run.folder))}"
         )
     paths = {name: getattr(run.config, name) for name in ("data", "lpips_weights", "teacher")}
     # Resolved, they are valid from any working folder.

@@ -28,9 +28,10 @@ from nerfloom.evaluation.outputs import (
     shown_output,
     side_by_side,
 )
-from nerfloom.evaluation.video_suffixes import check_suffix
+from nerfloom.evaluation.video_suffixes import MAX_GIF_FPS, check_suffix
 from nerfloom.evaluation.videos import MAX_UINT16, write_distances, write_images, write_strip, write_video
 from nerfloom.rendering.outputs import Output
+from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
 from nerfloom.video.settings import FileSettings, PathSettings, ViewSettings
 from nerfloom.video.views import VIEWS, Views, background_of
@@ -58,6 +59,8 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
     check_suffix(output)
     target = settings.target(output)
     model, is_folder = loaded.model, not target.suffix
+    if settings.rays_per_pixel is not None and isinstance(model, HasGaussians):
+        raise ConfigError("--rays-per-pixel has no effect with Gaussians: leave it out")
     bound = None if settings.max_error is None else parse_error(settings.max_error)
     outputs = chosen_outputs(model, settings.rendered_output_names)
     views, background = _views(name, settings, loaded, output), background_of(settings, loaded)
@@ -89,6 +92,9 @@ def _views(name: str, settings: PathSettings, loaded: Loaded, output: Path) -> V
         raise ConfigError(f"--downscale-factor {settings.downscale_factor} leaves no pixel")
     if output.suffix and bool((sizes != sizes[:, :1]).any()):
         raise ConfigError(f"--output-path {output}: the images are of several sizes; name a folder")
+    if output.suffix.lower() == ".gif" and views.fps > MAX_GIF_FPS:
+        limit = f"a GIF has at most {MAX_GIF_FPS:g} frames per second, not {views.fps:g}"
+        raise ConfigError(f"--output-path {output}: {limit}; name a .webp or a .mp4, or give a smaller --fps")
     return views
 
 

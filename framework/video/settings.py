@@ -154,7 +154,8 @@ class FramesSettings(LensSettings):
         if self.num_frames is not None and self.num_frames < 1:
             raise FlagError(f"--num-frames is {self.num_frames}; it must be at least 1")
         if self.count > MAX_FRAMES:
-            raise FlagError(f"--seconds and --fps make {self.count:,} frames; the limit is {MAX_FRAMES:,}")
+            flags = "--seconds and --fps make" if self.num_frames is None else "--num-frames makes"
+            raise FlagError(f"{flags} {self.count:,} frames; the limit is {MAX_FRAMES:,}")
 
     @property
     def count(self) -> int:

@@ -82,7 +82,7 @@ def test_an_unknown_flag(name: str) -> None:
             "--reach is 'far'; it must be a number; ns-export pointcloud --help shows the flags",
         ),
         ("ns-bench", ["kernels", "avx2"], "unexpected argument 'avx2'; ns-bench kernels --help shows the flags"),
-        ("ns-train", ["--resume"], "--resume needs a path"),
+        ("ns-train", ["--resume"], "--resume needs a value"),
         (
             "ns-train",
             ["instant-ngp", "--max-seconds"],
@@ -102,6 +102,11 @@ def test_what_is_said(name: str, words: list[str], line: str) -> None:
             "ns-render",
             ["orbit", "x", "--output-path", "y.gif", "--num-frames", 0],
             "--num-frames is 0; it must be at least 1",
+        ),
+        (
+            "ns-render",
+            ["orbit", "x", "--output-path", "y.gif", "--num-frames", 100_001],
+            "--num-frames makes 100,001 frames; the limit is 100,000",
         ),
         (
             "ns-process-data",

@@ -332,6 +332,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     avi = refused(render_command.main, "orbit", nowhere, "--output-path", tmp_path / "a.avi", status=2)
     assert avi.endswith("the extension must be .mp4, .gif, .webp, .png, or none for a folder of images")
     assert "no such output" in said("orbit", ball_run, names, "normals", "--num-frames", 1, status=1)
+    assert "at most 50 frames per second" in said("orbit", ball_run, "--fps", 60, "--num-frames", 1, status=1)
     assert not list(tmp_path.iterdir())
     path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
     assert said(*path, status=1).endswith("none: No such file or directory")

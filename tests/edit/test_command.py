@@ -34,7 +34,7 @@ def edited(*words: object) -> str:
     return " ".join(done.stderr.split())
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+@pytest.mark.parametrize("suffix", [".ply", ".SPZ"])
 def test_a_file_is_cropped_in_its_frame_and_keeps_how_it_is_drawn(suffix: str, file: Path, tmp_path: Path) -> None:
     output = tmp_path / "new" / f"out{suffix}"
     said = edited(file, "--output-path", output, "--crop-box", "-1,-1,-1,1,1,1", "--crop-sphere", "0,0,0,1.2")

@@ -43,6 +43,21 @@ def test_an_animation_has_all_its_frames_and_their_duration(tmp_path: Path, endi
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
+@pytest.mark.parametrize("fps", [24, 30, 48])
+@pytest.mark.parametrize(("ending", "unit"), [(".gif", 10), (".webp", 1), (".png", 1)])
+def test_an_animation_is_as_long_as_its_frames(tmp_path: Path, ending: str, unit: int, fps: int) -> None:
+    """Durations in a file are whole numbers of a unit, milliseconds; twelve frames take a whole number of units."""
+    write_video(tmp_path / f"a{ending}", iter(greys(*range(0, 240, 20))), fps=fps)
+    durations = []
+    with Image.open(tmp_path / f"a{ending}") as read:
+        for index in range(12):
+            read.seek(index)
+            read.load()
+            durations.append(float(read.info["duration"]))
+    assert sum(durations) == pytest.approx(12 * 1000 / fps)
+    assert all(abs(duration - 1000 / fps) < unit for duration in durations)
+
+
 def test_a_video_of_an_odd_size_shows_what_was_given(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     rows, columns = np.mgrid[:45, :63]

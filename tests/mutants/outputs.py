@@ -156,9 +156,12 @@ MUTANTS = {
             "evaluation/test_tour.py::test_three_points_are_visited_in_the_best_order"),
     ],
     "nerfloom.evaluation.videos": [
-        Mutant("animation-speed", "_write_animation", "1000 / A", "1000 * A",
+        Mutant("animation-speed", "_units", "A / B / C", "A * B / C",
             "animations stand still",
             "evaluation/test_videos.py::test_an_animation_has_all_its_frames_and_their_duration"),
+        Mutant("animation-of-milliseconds", "_write_animation", "GIF_UNIT if A else 1", "1",
+            "a GIF of 30 frames per second is a tenth too fast, as its durations are cut to hundredths of a second",
+            "evaluation/test_videos.py::test_an_animation_is_as_long_as_its_frames"),
     ],
     "nerfloom.export.colmap_text": [
         Mutant("colmap-text-axes", "write_model", "[1.0, -1.0, -1.0]", "[1.0, 1.0, 1.0]",

@@ -100,6 +100,12 @@ def test_commands_open_it(file: Path) -> None:
     frames = np.stack([iio.imread(path) for path in sorted(folder.glob("*.png"))]).astype(float)
     assert (frames[:, 0, 0] == 255).all()
     assert frames.min() < 60
+    small, smooth = ("--num-frames", 3, "--downscale-factor", 8, "--rays-per-pixel", 16), file.parent / "smooth"
+    done = called("ns-render", "orbit", file, *small, "--output-path", smooth)
+    assert done.returncode == 0, done.stderr
+    means = np.stack([iio.imread(path) for path in sorted(smooth.glob("*.png"))]).astype(float)
+    assert not np.array_equal(means, frames)  # edges are means of sixteen rays; all else is the same
+    assert abs(means.mean() - frames.mean()) < 2
     done = called("ns-render", "orbit", file, "--up=z", "--output-path", file.parent)
     assert "an octree knows which way is up" in done.stderr
 

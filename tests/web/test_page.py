@@ -134,6 +134,9 @@ def test_link_previews_are_told_title_and_picture() -> None:
         assert (found["og:url"], found["og:image"]) == (url, "https://example.org/cup/scene.jpg")
         assert (int(found["og:image:width"]), int(found["og:image:height"])) == PICTURE
         assert found["twitter:card"] == "summary_large_image"
+    named = replace(facts, picture="my cup #2.jpg", url="https://example.org/")
+    found = Elements(page(b"", named)).meta
+    assert found["og:image"] == "https://example.org/my%20cup%20%232.jpg"  # a # would end the path (RFC 3986, 3.3)
 
 
 def test_a_page_starts_from_the_view_that_is_named() -> None:
@@ -265,6 +268,7 @@ def test_splats_go_to_the_page_as_they_are(
     torch.testing.assert_close(found.means, trained.means, atol=1e-3, rtol=0)
     said = capsys.readouterr().err
     assert f"{len(trained):,} Gaussians" in said
+    assert "held-out views: PSNR" in said
     close = float(said.split("PSNR ")[1].split(" dB")[0])
     print(f"PSNR of the page against the method's own pictures: {close} dB")
     assert close > 40

@@ -129,6 +129,15 @@ def test_what_cannot_be_edited(file: Path, tmp_path: Path, refused: Refused) -> 
     assert "no such file" in refused(edit_command.main, tmp_path / "none.ply", *output).lower()
 
 
+def test_floaters_are_looked_for_before_a_crop_takes_the_surfaces_behind() -> None:
+    flags = edit_command.EditFlags(
+        load_config=Path("a.ply"), output_path=Path("b.ply"),
+        crop_sphere="0,0,0,1", min_opacity=0.1, drop_floaters=True, drop_isolated=True,
+    )  # fmt: skip
+    names = ["drop_floaters", "crop_sphere", "drop_faint", "drop_isolated"]
+    assert [step.name for step in flags.steps()] == names
+
+
 @pytest.mark.medium
 def test_a_run_is_edited_and_what_it_costs_is_said(shared_tiny: Path, tmp_path: Path) -> None:
     """PSNR on held-out photographs is that of ns-eval, before and after."""

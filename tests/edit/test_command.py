@@ -164,6 +164,7 @@ def test_exports_take_the_same_regions(file: Path, tmp_path: Path) -> None:
     low, high = torch.tensor([-1.0, -2, -3]), torch.tensor([3.0, 2, 1])
     inside = ((given >= low) & (given <= high)).all(-1) & (given.norm(dim=-1) <= 1.3)
     torch.testing.assert_close(found, given[inside], atol=1e-6, rtol=0)
+    assert f"{int(inside.sum())} of 300 Gaussians are in the region" in " ".join(done.stderr.split())
     done = called("ns-export", "gaussian-splat", file, "--output-dir", tmp_path, "--crop-sphere", "99,0,0,1")
     assert done.returncode == 1
     assert "nothing is in the region" in done.stderr

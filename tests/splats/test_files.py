@@ -362,6 +362,9 @@ def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
     assert "rounds positions to 0.25" in first
     assert "5 of the Gaussians get the nearest" in second
     assert bool(gaussians_in(tmp_path / "a.spz").log_scales[:5].eq(-10).all())
+    gaussians.log_scales[:9, 0] = torch.tensor([*(5 * [-4.0]), 5.96, 5.98, 7.0, -4.0])  # the most is 255 / 16 - 10
+    (_, large) = write_gaussians(tmp_path / "a.spz", gaussians)
+    assert "to 379: 2 of the Gaussians" in large
 
 
 def test_opacities_of_0_and_1_stay_finite(tmp_path: Path) -> None:

@@ -52,6 +52,8 @@ class EditFlags(RegionFlags, OpenFlags):
     """New lengths per old length, about the origin."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
+    spz_version: Literal[2, 3, 4] = 2
+    """Version of spz files, as in ns-export gaussian-splat."""
     save_recipe: Path | None = None
     """YAML file to write all steps to, for --recipe."""
     max_images: int = 20
@@ -117,7 +119,7 @@ def _command(arguments: list[str]) -> None:
     loaded = load(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
     edited = take_steps(Edited.of(loaded, flags.time), steps, HeldOut.of(loaded, flags.max_images))
     say(f"{len(edited):,} Gaussians are written")
-    for sentence in edited.write(flags.output_path, flags.max_megabytes):
+    for sentence in edited.write(flags.output_path, flags.max_megabytes, flags.spz_version):
         say(sentence)
     if flags.save_recipe is not None:
         write_recipe(flags.save_recipe, steps)

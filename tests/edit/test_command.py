@@ -1,6 +1,8 @@
 """The command ns-edit, and the regions of ns-export: files that are known before and after."""
 
+import gzip
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +61,13 @@ def test_flags_are_saved_as_a_recipe_that_repeats(file: Path, tmp_path: Path) ->
     found = read_gaussians(first).gaussians
     assert len(found) == 150
     assert found.degree == 1
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_spz_of_a_version(version: int, file: Path, tmp_path: Path) -> None:
+    output = tmp_path / "a.spz"
+    edited(file, "--output-path", output, "--min-opacity", 0.02, "--spz-version", version)
+    assert struct.unpack_from("<4sII", gzip.decompress(output.read_bytes())) == (b"NGSP", version, 300)
 
 
 def test_a_direction_becomes_up(file: Path, tmp_path: Path) -> None:

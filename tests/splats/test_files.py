@@ -403,6 +403,7 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     assert "31 fractional" in refused_in_a_line(file, packed(2, 1, 0, one, fraction=31))
     assert "4,294,967,295 Gaussians" in refused_in_a_line(file, packed(2, 2**32 - 1, 0, one))
     assert "truncated" in refused_in_a_line(file, packed(2, 10_000_000, 3, one))  # 640 MB are not asked for
+    assert "truncated: 10,000,001 Gaussians" in refused_in_a_line(file, packed(2, 10_000_001, 0, one))
     assert "truncated" in refused_in_a_line(file, packed(2, 2, 0, one))
     assert "holds no Gaussians" in refused_in_a_line(file, packed(2, 0, 0, b""))
     assert "too much behind its 1 Gaussians" in refused_in_a_line(file, packed(2, 1, 0, one + bytes(20_000_000)))

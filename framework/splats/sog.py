@@ -14,8 +14,8 @@ has the number of Gaussians, numbers that decode the images, and the images' nam
                         red, green and blue in a codebook of 256
 
 Images are WebP without loss (other formats without loss are allowed: PNG is read too). Axes are those of PLY files.
-`model` of meta.json says whether the Gaussians were trained with antialiasing. The settings of `nerfloom.splats.look`
-are in `extras`, which the format leaves to applications.
+`antialias` of meta.json says whether the Gaussians were trained with antialiasing; newer programs read `model` instead.
+The settings of `nerfloom.splats.look` are in `extras`, which the format leaves to applications.
 """
 
 from __future__ import annotations

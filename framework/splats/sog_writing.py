@@ -50,6 +50,7 @@ def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
         raise ConfigError(f"a SOG file holds 1 to {MAX_SIDE**2:,} Gaussians, not {len(gaussians):,}: write a PLY file")
     given = gaussians[torch.from_numpy(morton_order(gaussians.means.double().numpy()))]
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "Nerfloom"}, "count": len(given)}
+    meta["antialias"] = look.antialiased
     if look.antialiased:
         meta["model"] = "antialiased"
     images: dict[str, bytes] = {}

@@ -181,6 +181,7 @@ def test_images_have_the_layout_of_the_specification(tmp_path: Path) -> None:
             if name != "meta.json"
         }
     assert (meta["version"], meta["count"], meta["model"]) == (2, 100, "antialiased")
+    assert meta["antialias"] is True
     assert meta["means"]["files"] == ["means_l.webp", "means_u.webp"]
     assert [len(meta[key]["codebook"]) for key in ("scales", "sh0", "shN")] == [256] * 3
     assert (meta["shN"]["count"], meta["shN"]["bands"]) == (100, 2)

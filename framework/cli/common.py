@@ -74,9 +74,17 @@ def with_run(arguments: list[str], several: Collection[str] = ()) -> list[str]:
 
 def _is_word(argument: str) -> bool:
     """Return whether an argument is neither a flag nor a path; a number such as 0.5 is neither, nor is 0.5,-2."""
-    if all(part.removeprefix("-").replace(".", "", 1).isdecimal() for part in argument.split(",")):
+    if all(map(_is_number, argument.split(","))):
         return not Path(argument).exists()
     return not argument.startswith("-") and not set("/\\.") & set(argument) and not Path(argument).exists()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[str, DataParser] | None]:

@@ -23,8 +23,9 @@ AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": 
 class EditFlags(RegionFlags, OpenFlags):
     """Edit the Gaussians of a run or of a file, and write them to another file.
 
-    The steps of --recipe are taken first, then those of the flags below, in the order of this list. Positions are in
-    the frame and unit of exports. Where photographs are known, a line says what each step costs on held-out ones."""
+    The steps of --recipe are taken first, then --drop-floaters, then those of the other flags, in the order of this
+    list. Positions are in the frame and unit of exports. Where photographs are known, a line says what each step costs
+    on held-out ones."""
 
     output_path: Path
     """File to write, .ply, .spz, .sog or .glb."""
@@ -35,7 +36,8 @@ class EditFlags(RegionFlags, OpenFlags):
     max_size: float | None = None
     """Remove Gaussians with a larger standard deviation along their longest axis, in the unit of exports."""
     drop_isolated: bool = False
-    """Remove Gaussians far from others: five times the median distance to their 8 nearest neighbours."""
+    """Remove Gaussians farther from their 8 nearest neighbours than five times the median, and than five times their
+    size."""
     drop_floaters: bool = False
     """Remove faint Gaussians that training images see in front of surfaces."""
     reduce_to: int | None = None
@@ -50,6 +52,8 @@ class EditFlags(RegionFlags, OpenFlags):
     """New lengths per old length, about the origin."""
     max_megabytes: float | None = None
     """Maximum file size, MB (1e6 bytes). Harmonics are reduced first, Gaussians last. Default: no limit."""
+    spz_version: Literal[2, 3, 4] = 2
+    """Version of spz files, as in ns-export gaussian-splat."""
     save_recipe: Path | None = None
     """YAML file to write all steps to, for --recipe."""
     max_images: int = 20
@@ -69,13 +73,14 @@ class EditFlags(RegionFlags, OpenFlags):
         self.regions()  # a file that holds none is refused before any work
         box, sphere = self.box(), self.sphere()
         given: list[tuple[str, str, dict[str, Any] | None]] = [
+            # Floaters are in front of surfaces, which a crop may remove.
+            ("drop-floaters", "drop_floaters", {} if self.drop_floaters else None),
             ("crop-box", "crop_box", None if box is None else asdict(box)),
             ("crop-sphere", "crop_sphere", None if sphere is None else asdict(sphere)),
             ("region", "crop_region", None if self.region is None else {"file": str(self.region)}),
             ("min-opacity", "drop_faint", _only("min_opacity", self.min_opacity)),
             ("max-size", "drop_large", _only("max_size", self.max_size)),
             ("drop-isolated", "drop_isolated", {} if self.drop_isolated else None),
-            ("drop-floaters", "drop_floaters", {} if self.drop_floaters else None),
             ("reduce-to", "reduce_to", _only("count", self.reduce_to)),
             ("degree", "set_degree", _only("degree", self.degree)),
             ("up", "set_up", None if self.up is None else {"up": AXES[self.up]}),
@@ -114,7 +119,7 @@ def _command(arguments: list[str]) -> None:
     loaded = load(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
     edited = take_steps(Edited.of(loaded, flags.time), steps, HeldOut.of(loaded, flags.max_images))
     say(f"{len(edited):,} Gaussians are written")
-    for sentence in edited.write(flags.output_path, flags.max_megabytes):
+    for sentence in edited.write(flags.output_path, flags.max_megabytes, flags.spz_version):
         say(sentence)
     if flags.save_recipe is not None:
         write_recipe(flags.save_recipe, steps)

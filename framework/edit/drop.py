@@ -43,16 +43,17 @@ def drop_needles(edited: Edited, max_ratio: float = 20.0) -> Edited:
 
 
 def drop_isolated(edited: Edited, neighbours: int = 8, max_ratio: float = 5.0) -> Edited:
-    """Remove Gaussians far from others.
+    """Remove Gaussians far from others, in relation to their size: those of a far background are sparse, but large.
 
     Args:
         neighbours: number of nearest neighbours.
-        max_ratio: maximum mean distance to them, relative to the median of all Gaussians.
+        max_ratio: maximum mean distance to them, relative to the median of all Gaussians or to the standard deviation
+            along the longest axis, whichever is larger.
     """
-    means = edited.gaussians.means
+    means, sizes = edited.gaussians.means, edited.gaussians.log_scales.exp().amax(-1)
     centred = (means - means.median(0).values).float()  # neighbours need no more precision
     distances = neighbour_distance(centred, neighbours, OUTSIDE)
-    return edited.kept(distances <= max_ratio * distances.median())
+    return edited.kept(distances <= max_ratio * torch.maximum(sizes, distances.median()))
 
 
 def drop_floaters(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_views: int = 3) -> Edited:

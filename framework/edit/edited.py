@@ -17,6 +17,7 @@ from nerfloom.export.run_page import moment_of
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.placed_files import in_input, write_placed
+from nerfloom.splats.spz_container import SpzVersion
 from nerfloom.splats.transform import transformed, transformed_in_float64
 from nerfloom.training.loaded import Loaded
 
@@ -33,7 +34,7 @@ class Edited:
     look: Look = OURS
     """The settings of drawing."""
     scale: Scale = field(default_factory=Scale)
-    """The unit of their coordinates."""
+    """The unit of their coordinates. Its name is empty after lengths have changed, until `scale` names it."""
     placement: Placement = field(default_factory=lambda: Placement.of(None, 1.0))
     """Placement of their frame in the scene of `loaded`."""
     loaded: Loaded | None = None
@@ -78,7 +79,7 @@ class Edited:
     def moved(self, similarity: Similarity) -> Edited:
         """Return the Gaussians in a frame that they are moved to, with their axes and harmonics.
 
-        The unit is no longer known if lengths change.
+        The name of the unit is no longer known if lengths change.
 
         Args:
             similarity: from the old frame to the new one.
@@ -90,7 +91,7 @@ class Edited:
             self,
             gaussians=transformed_in_float64(self.gaussians, rotation, scale, shift),
             placement=self.placement.after(applied, scale),
-            scale=self.scale if scale == 1 else Scale(),
+            scale=self.scale if scale == 1 else replace(self.scale, factor=scale * self.scale.factor, unit=""),
             up=None if self.up is None else rotation @ self.up,
         )
 
@@ -104,7 +105,7 @@ class Edited:
         placed = transformed(self.gaussians, *self.placement.similarity())
         return placed.map(lambda values: values.to(device))
 
-    def write(self, file: str | Path, max_megabytes: float | None = None) -> list[str]:
+    def write(self, file: str | Path, max_megabytes: float | None = None, spz_version: SpzVersion = 2) -> list[str]:
         """Write the Gaussians in the format of the file's suffix, about a local origin if they are far from theirs.
 
         In a .glb file, everything is turned so that `upwards` is +y.
@@ -112,6 +113,7 @@ class Edited:
         Args:
             file: path of the file, with a suffix of `nerfloom.splats.files.SUFFIXES`.
             max_megabytes: maximum size of the file in millions of bytes; None for any.
+            spz_version: version of an SPZ file.
 
         Returns:
             Sentences about what was lost, and about the local origin.
@@ -122,7 +124,8 @@ class Edited:
         """
         turned = torch.eye(4, dtype=torch.float64)[:3]
         turned[:, :3] = rotation_between(self.upwards, UP)
-        return write_placed(Path(file), self.gaussians, self.look, self.scale, Placement(turned, 1.0), max_megabytes)
+        placement = Placement(turned, 1.0)
+        return write_placed(Path(file), self.gaussians, self.look, self.scale, placement, max_megabytes, spz_version)
 
     def photographed(self, step: str) -> Loaded:
         """Return the run or file whose photographs show the Gaussians.

@@ -10,7 +10,7 @@ import torch
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import rotation_between
-from nerfloom.cameras.scale import Scale, checked
+from nerfloom.cameras.scale import checked
 from nerfloom.edit.edited import UP, Edited
 from nerfloom.edit.floor import find_floor
 from nerfloom.edit.similarity import Similarity, about, axis_rotation, direction, vector
@@ -56,10 +56,7 @@ def scale(edited: Edited, factor: float, center: Vector = ORIGIN, unit: str = ""
         ConfigError: if the unit is no short name.
     """
     moved = edited.moved(about(vector(center), scale=factor))
-    if not unit:
-        return moved
-    before = edited.scale
-    return replace(moved, scale=checked(Scale(factor * before.factor, unit, before.relative_error), "scale"))
+    return replace(moved, scale=checked(replace(moved.scale, unit=unit), "scale")) if unit else moved
 
 
 def set_up(edited: Edited, up: Vector) -> Edited:

@@ -23,7 +23,7 @@ def take_steps(edited: Edited, steps: Sequence[Step], held_out: HeldOut | None =
         ConfigError: if a step cannot be taken, or leaves no Gaussians.
         DataError: if a file of a step cannot be read.
     """
-    psnr = held_out.psnr(edited) if held_out is not None and steps else None
+    psnr: float | None = None
     for number, step in enumerate(steps, 1):
         before, edited = edited, step(edited)
         if not len(edited):
@@ -31,8 +31,9 @@ def take_steps(edited: Edited, steps: Sequence[Step], held_out: HeldOut | None =
                 f"step {number} ({step.name}) leaves none of {len(before):,} Gaussians; change its settings"
             )
         said = f"{number} {step.name}: {_change(before, edited)}"
-        if held_out is not None and psnr is not None and looks_different(before, edited):
-            was, psnr = psnr, held_out.psnr(edited)
+        if held_out is not None and looks_different(before, edited):
+            was = held_out.psnr(before) if psnr is None else psnr
+            psnr = held_out.psnr(edited)
             said += f"; PSNR {was:.2f} to {psnr:.2f} dB ({psnr - was:+.2f}) on {len(held_out.views)} held-out images"
         say(said)
     return edited

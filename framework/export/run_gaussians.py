@@ -67,7 +67,9 @@ def _write(
     look, placement = model.look(), loaded.placement
     placed = in_input(good, placement)
     if regions:
-        placed = placed[inside_all(placed.means, regions)]
+        inside = inside_all(placed.means, regions)
+        say(f"{int(inside.sum()):,} of {len(placed):,} Gaussians are in the region that is kept")
+        placed = placed[inside]
     limit, version = settings.max_megabytes, settings.spz_version
     for sentence in write_placed(path, placed, look, loaded.scale, placement, limit, version):
         say(sentence)

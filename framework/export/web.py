@@ -179,11 +179,10 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
     check_size(max_megabytes)
     empty = page(b"", facts)
     most = (1e6 * max_megabytes - len(empty.encode())) // 4 * 3
-    payload, changes = encoded(gaussians, BITS, facts.look), ""
+    payload, lost, changes = encoded(gaussians, BITS, facts.look), out_of_range(gaussians), ""
     if len(payload) > most:
-        payload, changes = fitted_spz(gaussians, most, facts.look)
+        payload, lost, changes = fitted_spz(gaussians, most, facts.look)
         changes = changes or "harmonics in 5 and 4 bits instead of 8"
-    lost = out_of_range(gaussians)
     return page(payload, facts), [f"{max_megabytes:g} MB hold {changes}", *lost] if changes else lost
 
 

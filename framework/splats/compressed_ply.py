@@ -61,12 +61,12 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
             f"{file} is a compressed PLY file with {0 if chunk is None else chunk.count} chunks of"
             f" {CHUNK} for {vertex.count:,} Gaussians, or is not a binary file; export it again"
         )
-    rows = np.arange(vertex.count) // CHUNK
-    position, rotation, scale, color = (word.astype("<u4") for word in _columns(file, vertex, _WORDS))
-    low, high, low_scale, high_scale = (np.stack(_columns(file, chunk, names), -1)[rows] for names in _BOUNDS)
+    position, rotation, scale, color = (word.astype("<u4") for word in _columns(file, vertex, _WORDS, "u4"))
+    rows = np.arange(len(position)) // CHUNK  # the header's count is not believed before the words are read
+    low, high, low_scale, high_scale = (np.stack(_columns(file, chunk, names, "f4"), -1)[rows] for names in _BOUNDS)
     shade = np.stack([color >> shift & 255 for shift in (24, 16, 8)], -1) / 255
     if set(_COLORS[0]) <= set(chunk.names):
-        darkest, brightest = (np.stack(_columns(file, chunk, names), -1)[rows] for names in _COLORS)
+        darkest, brightest = (np.stack(_columns(file, chunk, names, "f4"), -1)[rows] for names in _COLORS)
         shade = _between(darkest, brightest, shade)
     opacity = (color & 255).astype(np.float64).clip(0.25, 254.75) / 255  # 0 and 1 have no logit
     return Gaussians(
@@ -79,9 +79,11 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
     )
 
 
-def _columns(file: Path, element: PlyElement, names: Sequence[str]) -> list[np.ndarray]:
-    if missing := [name for name in names if name not in element.names]:
-        raise DataError(f"{file} is a compressed PLY file without {', '.join(missing)}: export it again")
+def _columns(file: Path, element: PlyElement, names: Sequence[str], kind: str) -> list[np.ndarray]:
+    """Return columns of one numpy type."""
+    kinds = dict(element.columns)
+    if missing := [name for name in names if kinds.get(name) != kind]:
+        raise DataError(f"{file} is a compressed PLY file without {', '.join(missing)} of its type: export it again")
     return read_columns(file, element, names)
 
 
@@ -111,7 +113,8 @@ def _harmonics(file: Path, header: PlyHeader, count: int) -> Tensor:
             f"{file} is a compressed PLY file with {width} bytes of harmonics for {element.count:,} of {count:,}"
             " Gaussians; there must be 9, 24 or 45 for each: export it again"
         )
-    stored = np.stack(_columns(file, element, [f"f_rest_{index}" for index in range(width)]), -1).astype(np.float64)
+    bytes_ = _columns(file, element, [f"f_rest_{index}" for index in range(width)], "u1")
+    stored = np.stack(bytes_, -1).astype(np.float64)
     shares = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
     return _float(8 * (shares - 0.5)).reshape(count, 3, width // 3)
 

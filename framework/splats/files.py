@@ -17,7 +17,7 @@ from nerfloom.splats.ply import read_ply, write_ply
 from nerfloom.splats.sog import META, read_sog
 from nerfloom.splats.sog_writing import encoded_sog, write_sog
 from nerfloom.splats.splat import read_splat
-from nerfloom.splats.spz import encoded, out_of_range, read_spz
+from nerfloom.splats.spz import read_spz
 from nerfloom.splats.spz_container import MAGIC, SpzVersion
 
 
@@ -64,12 +64,9 @@ def _write_ply(file: Path, order: Order) -> Written:
 
 
 def _write_spz(file: Path, order: Order) -> Written:
-    if order.most_bytes is None:
-        content, changes = encoded(order.gaussians, look=order.look, version=order.spz_version), ""
-    else:
-        content, changes = fitted_spz(order.gaussians, order.most_bytes, order.look, order.spz_version)
+    content, lost, changes = fitted_spz(order.gaussians, order.most_bytes, order.look, order.spz_version)
     write_atomically(file, lambda stream: stream.write(content))
-    return changes, out_of_range(order.gaussians)
+    return changes, lost
 
 
 def _write_sog(file: Path, order: Order) -> Written:

@@ -17,7 +17,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.ply import ply_size
-from nerfloom.splats.spz import BITS, encoded, rounded_harmonics
+from nerfloom.splats.spz import BITS, encoded, out_of_range, rounded_harmonics
 from nerfloom.splats.spz_container import SpzVersion
 
 COARSER_BITS = (4, 3)
@@ -54,19 +54,24 @@ def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
 
 
 def fitted_spz(
-    gaussians: Gaussians, most_bytes: float, look: Look = OURS, version: SpzVersion = 2
-) -> tuple[bytes, str]:
-    """Return an SPZ file of limited size, and a description of what was removed.
+    gaussians: Gaussians, most_bytes: float | None, look: Look = OURS, version: SpzVersion = 2
+) -> tuple[bytes, list[str], str]:
+    """Return an SPZ file of limited size, as `fitted` does for other formats.
 
     Args:
         gaussians: N Gaussians on the CPU.
-        most_bytes: maximum size of the file.
+        most_bytes: maximum size of the file; None for any.
         look: the settings of drawing.
         version: version of the format.
+
+    Returns:
+        The content, sentences about losses, and a description of what was removed.
 
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.
     """
+    if most_bytes is None:
+        return encoded(gaussians, BITS, look, version), out_of_range(gaussians), ""
     sample = gaussians[:: -(-len(gaussians) // MAX_SAMPLE) or 1]
     choices = [(degree, bits) for degree in range(1, gaussians.degree + 1) for bits in (BITS, COARSER_BITS)]
     choices = [(0, BITS), *choices]
@@ -74,11 +79,11 @@ def fitted_spz(
         size = len(encoded(with_degree(sample, degree), bits, version=version)) * len(gaussians) / max(len(sample), 1)
         if size > DOUBT * most_bytes:
             continue
-        content = encoded(with_degree(gaussians, degree), bits, look, version)
+        kept = with_degree(gaussians, degree)
+        content = encoded(kept, bits, look, version)
         if len(content) <= most_bytes:
-            return content, _changes(gaussians, degree, bits, len(gaussians))
-    content, _, changes = _fewer(gaussians, most_bytes, lambda kept: (encoded(kept, BITS, look, version), []))
-    return content, changes
+            return content, out_of_range(kept), _changes(gaussians, degree, bits, len(gaussians))
+    return _fewer(gaussians, most_bytes, lambda kept: (encoded(kept, BITS, look, version), out_of_range(kept)))
 
 
 def fitted(gaussians: Gaussians, most_bytes: float | None, encode: Encode) -> tuple[bytes, list[str], str]:

@@ -14,8 +14,8 @@ has the number of Gaussians, numbers that decode the images, and the images' nam
                         red, green and blue in a codebook of 256
 
 Images are WebP without loss (other formats without loss are allowed: PNG is read too). Axes are those of PLY files.
-`model` of meta.json says whether the Gaussians were trained with antialiasing. The settings of `nerfloom.splats.look`
-are in `extras`, which the format leaves to applications.
+`antialias` of meta.json says whether the Gaussians were trained with antialiasing; newer programs read `model` instead.
+The settings of `nerfloom.splats.look` are in `extras`, which the format leaves to applications.
 """
 
 from __future__ import annotations
@@ -187,7 +187,16 @@ def _numbers(file: Path, part: dict[str, Any], key: str, number: int) -> np.ndar
 
 
 def _codes(file: Path, meta: dict[str, Any], key: str) -> np.ndarray:
-    return _numbers(file, meta[key], "codebook", CODES)
+    """Return a codebook (CODES,) float64, whose first number early programs left out: it is null in their files.
+
+    PlayCanvas's engine (src/scene/gsplat/gsplat-sog-data.js) puts it a step before the second, and so do we.
+    """
+    values = meta[key].get("codebook")
+    if not isinstance(values, list) or values[:1] != [None]:
+        return _numbers(file, meta[key], "codebook", CODES)
+    others = _numbers(file, {"codebook": values[1:]}, "codebook", CODES - 1)
+    with np.errstate(over="ignore"):  # what is not finite is removed later
+        return np.concatenate([others[:1] + (others[0] - others[-1]) / (CODES - 1), others])
 
 
 def _pixels(file: Path, content: bytes, count: int, width: int | None = None) -> np.ndarray:

@@ -30,7 +30,7 @@ MANY = 1024
 
 
 def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[str]]:
-    """Return the content of a SOG file, and a sentence about the error of its harmonics.
+    """Return the content of a SOG file, and sentences about the errors of its harmonics and positions.
 
     The file has the Gaussians in the order of a Morton curve, since neighbours compress well beside each other. The
     largest errors are: of log(1 + |x|) of a position, its range / 131070; of an opacity, 1/510; of a rotation, 1.2
@@ -50,6 +50,7 @@ def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
         raise ConfigError(f"a SOG file holds 1 to {MAX_SIDE**2:,} Gaussians, not {len(gaussians):,}: write a PLY file")
     given = gaussians[torch.from_numpy(morton_order(gaussians.means.double().numpy()))]
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "Nerfloom"}, "count": len(given)}
+    meta["antialias"] = look.antialiased
     if look.antialiased:
         meta["model"] = "antialiased"
     images: dict[str, bytes] = {}
@@ -64,6 +65,8 @@ def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
     steps = np.rint(65535 * (logs - low) / np.where(high > low, high - low, 1)).astype(np.int64)
     files = image("means_l", steps & 255) + image("means_u", steps >> 8)
     meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
+    read = low + steps / 65535 * (high - low)
+    moved = float(np.abs(np.sign(read) * np.expm1(np.abs(read)) - given.means.double().numpy()).max())
     codes, indices = _coded(given.log_scales)
     meta["scales"] = {"codebook": codes, "files": image("scales", indices)}
     place, others = split(given.rotations.double().numpy())
@@ -80,6 +83,7 @@ def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
         files += image("shN_labels", np.stack([labels & 255, labels >> 8, 0 * labels], -1))
         meta["shN"] = {"count": count, "bands": given.degree, **part, "files": files}
         notes = [f"SOG has {count:,} sets of harmonics for {len(given):,} Gaussians: their RMS error is {error:.2g}"]
+    notes.append(f"SOG rounds positions by up to {moved:.2g}; a typical Gaussian has the size {given.typical_size:.2g}")
     meta["extras"] = {COMMENTS: comments(look)}
     return _zipped({**images, META: json.dumps(meta, allow_nan=False).encode()}), notes
 

@@ -58,6 +58,10 @@ SIGNS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 FLAT = 3.0
 """Logarithm of the ratio of the largest to the smallest size that is not reported as clipped; smaller sizes are
 invisible."""
+MAX_LOG_SCALE = 255 / 16 - 10
+"""Maximum logarithm of a scale."""
+MAX_COLOR, MAX_HARMONIC = 0.5 / 0.15, 1.0
+"""Maximum magnitudes of coefficients of degree 0, and of higher degrees; the latter lacks one step at the upper end."""
 ANTIALIASED = 1
 """Bit of the header's flags."""
 
@@ -139,10 +143,17 @@ def out_of_range(gaussians: Gaussians) -> list[str]:
         )
     largest = gaussians.log_scales.amax(-1, keepdim=True)
     seen = (gaussians.log_scales < -10) & (largest < -10 + FLAT)
-    outside = (seen | (largest > 6)).any(-1)
+    outside = (seen | (largest > MAX_LOG_SCALE + 1 / 32)).any(-1)
     if count := int(outside.sum()):
-        sizes = f"{math.exp(-10):.2g} to {math.exp(6):.0f}"
+        sizes = f"{math.exp(-10):.2g} to {math.exp(MAX_LOG_SCALE):.0f}"
         lost.append(f"SPZ holds sizes from {sizes}: {count:,} of the Gaussians get the nearest of these")
+    strong = (gaussians.colors.abs() > MAX_COLOR).any(-1)
+    strong |= (gaussians.harmonics.abs() > MAX_HARMONIC).flatten(1).any(-1)
+    if count := int(strong.sum()):
+        lost.append(
+            f"SPZ holds coefficients of degree 0 up to {MAX_COLOR:.2g}, and others up to {MAX_HARMONIC:g}: {count:,} of"
+            " the Gaussians get the nearest of these"
+        )
     return lost
 
 

@@ -43,7 +43,9 @@ SIZES = struct.Struct("<QQ")
 RECORD = struct.Struct("<II")
 """The start of an extension: type and length."""
 MAX_GAUSSIANS = 10_000_000
-"""Maximum number of Gaussians before version 4, as in Niantic's library."""
+"""Maximum number of Gaussians that are written before version 4: older releases of Niantic's library read no more."""
+MAX_COUNT = 2**31 - 1
+"""Maximum number of Gaussians that are read, as in Niantic's library."""
 MAX_RATIO = 1032
 """Maximum ratio of sizes before and after compression: that of gzip. Arrays of Gaussians stay far below it."""
 MAX_SURPLUS = 1 << 24
@@ -240,11 +242,10 @@ def _unpacked(file: Path, frame: bytes, size: int) -> bytes:
 
 def _check(file: Path, version: int, count: int, degree: int, fraction: int, size: int) -> None:
     """Refuse a header whose numbers are out of range, or that has more Gaussians than the file can hold."""
-    most = MAX_GAUSSIANS if version < 4 else 2**31 - 1
-    if degree > 4 or fraction > 30 or count > most:
+    if degree > 4 or fraction > 30 or count > MAX_COUNT:
         raise DataError(
             f"{file} is damaged: its header states {count:,} Gaussians of degree {degree} with {fraction} fractional"
-            f" bits, and the format has up to {most:,}, 4 and 30; export it again"
+            f" bits, and the format has up to {MAX_COUNT:,}, 4 and 30; export it again"
         )
     if count * sum(widths(version, degree)) > MAX_RATIO * size:
         raise DataError(f"{file} is truncated: {count:,} Gaussians have more than its {size:,} bytes")

@@ -90,6 +90,12 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
     assert "no occupied cell in the box" in refused(main, "marching-cubes", *given, *box)
 
 
+@pytest.mark.parametrize("corner", [("0", "0", "0"), ("-1", "0.5", "1.5e2"), ("1", "-2", "-3")])
+def test_a_run_may_follow_the_corner_of_a_box(corner: tuple[str, ...], tmp_path: Path, refused: Refused) -> None:
+    said = refused(main, "tsdf", "--bounding-box-min", *corner, tmp_path / "none", "--output-dir", tmp_path)
+    assert str(tmp_path / "none") in said
+
+
 def test_the_grid_and_all_cameras_are_written(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(monkeypatch, "occupancy", "--load-config", ball, "--output-dir", tmp_path)
     points = read_points(tmp_path / "occupancy.ply")

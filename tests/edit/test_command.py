@@ -1,6 +1,8 @@
 """The command ns-edit, and the regions of ns-export: files that are known before and after."""
 
+import gzip
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +61,13 @@ def test_flags_are_saved_as_a_recipe_that_repeats(file: Path, tmp_path: Path) ->
     found = read_gaussians(first).gaussians
     assert len(found) == 150
     assert found.degree == 1
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_spz_of_a_version(version: int, file: Path, tmp_path: Path) -> None:
+    output = tmp_path / "a.spz"
+    edited(file, "--output-path", output, "--min-opacity", 0.02, "--spz-version", version)
+    assert struct.unpack_from("<4sII", gzip.decompress(output.read_bytes())) == (b"NGSP", version, 300)
 
 
 def test_a_direction_becomes_up(file: Path, tmp_path: Path) -> None:
@@ -129,6 +138,15 @@ def test_what_cannot_be_edited(file: Path, tmp_path: Path, refused: Refused) -> 
     assert "no such file" in refused(edit_command.main, tmp_path / "none.ply", *output).lower()
 
 
+def test_floaters_are_looked_for_before_a_crop_takes_the_surfaces_behind() -> None:
+    flags = edit_command.EditFlags(
+        load_config=Path("a.ply"), output_path=Path("b.ply"),
+        crop_sphere="0,0,0,1", min_opacity=0.1, drop_floaters=True, drop_isolated=True,
+    )  # fmt: skip
+    names = ["drop_floaters", "crop_sphere", "drop_faint", "drop_isolated"]
+    assert [step.name for step in flags.steps()] == names
+
+
 @pytest.mark.medium
 def test_a_run_is_edited_and_what_it_costs_is_said(shared_tiny: Path, tmp_path: Path) -> None:
     """PSNR on held-out photographs is that of ns-eval, before and after."""
@@ -155,6 +173,7 @@ def test_exports_take_the_same_regions(file: Path, tmp_path: Path) -> None:
     low, high = torch.tensor([-1.0, -2, -3]), torch.tensor([3.0, 2, 1])
     inside = ((given >= low) & (given <= high)).all(-1) & (given.norm(dim=-1) <= 1.3)
     torch.testing.assert_close(found, given[inside], atol=1e-6, rtol=0)
+    assert f"{int(inside.sum())} of 300 Gaussians are in the region" in " ".join(done.stderr.split())
     done = called("ns-export", "gaussian-splat", file, "--output-dir", tmp_path, "--crop-sphere", "99,0,0,1")
     assert done.returncode == 1
     assert "nothing is in the region" in done.stderr

@@ -52,6 +52,21 @@ def test_isolated_ones_are_dropped_however_far_they_are(far: float) -> None:
     assert torch.equal(kept.gaussians.means, crowd + shift)
 
 
+def test_a_far_background_is_not_isolated() -> None:
+    """Large Gaussians on a sphere around a crowd stay where they overlap; small ones at its distances do not."""
+    random = torch.Generator().manual_seed(0)
+    crowd = torch.rand(600, 3, generator=random, dtype=torch.float64)
+    index = torch.arange(400, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * index / 400, index * math.pi * (3 - math.sqrt(5))
+    around = (1 - z.square()).sqrt()
+    sphere = 100 * torch.stack([around * angle.cos(), around * angle.sin(), z], -1)
+    alone = torch.tensor([[3.0, 3, 0], [0, -50.0, 0]], dtype=torch.float64)
+    given = at(torch.cat([crowd, sphere, alone]))
+    given.log_scales[600:1000, :2] = math.log(20.0)  # the distance of the nearest is about 18
+    kept = edit.drop_isolated(Edited(given)).gaussians.means
+    assert torch.equal(kept, torch.cat([crowd, sphere]))
+
+
 def alpha(opacity: float, size: float, distance: float) -> np.ndarray:
     """Alpha (33, 33) of a round Gaussian on the axis of `camera()`, whose focal length is 40."""
     rows, columns = np.mgrid[:33, :33] + 0.5

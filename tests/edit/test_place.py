@@ -64,7 +64,8 @@ def test_a_scale_names_the_unit_or_forgets_it() -> None:
     metres = dataclasses.replace(scattered(5), scale=Scale(0.5, "m"))
     assert edit.move(metres, (1.0, 0.0, 0.0)).scale == Scale(0.5, "m")
     assert edit.rotate(metres, (1.0, 0.0, 0.0), 30.0).scale == Scale(0.5, "m")
-    assert edit.scale(metres, 100.0).scale == Scale()
+    assert not edit.scale(metres, 100.0).scale.is_known
+    assert edit.scale(edit.scale(metres, 10.0), 10.0, unit="cm").scale == Scale(50.0, "cm")
     assert edit.scale(metres, 100.0, unit="cm").scale == Scale(50.0, "cm")
     rough = dataclasses.replace(metres, scale=Scale(0.5, "m", 0.02))
     assert edit.scale(rough, 100.0, unit="cm").scale == Scale(50.0, "cm", 0.02)

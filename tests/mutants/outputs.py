@@ -59,6 +59,9 @@ MUTANTS = {
         Mutant("floaters-however-opaque", "drop_floaters", "A & (seen.opacity_in_front <= max_opacity)", "A",
             "what is seen before other things is dropped, even if it is opaque",
             "edit/test_drop.py::test_floaters_of_a_capture_are_dropped"),
+        Mutant("background-isolated", "drop_isolated", "torch.maximum(sizes, A)", "A",
+            "the background of a capture, which is sparse, is dropped",
+            "edit/test_drop.py::test_a_far_background_is_not_isolated"),
     ],
     "nerfloom.edit.edited": [
         Mutant("edited-out-of-the-photographs", "Edited.moved", "self.placement.after(A, B)", "self.placement",

@@ -287,7 +287,12 @@ def test_largest_of_a_damaged_rotation_is_finite(tmp_path: Path) -> None:
 @pytest.mark.parametrize("degree", range(4))
 def test_spz_is_as_exact_as_its_bits(tmp_path: Path, degree: int) -> None:
     gaussians = some(3000, degree)
-    assert write_gaussians(tmp_path / "a.spz", gaussians) == []
+    gaussians.colors[7, 1] = -4
+    said = write_gaussians(tmp_path / "a.spz", gaussians)
+    rows = zip(gaussians.colors.tolist(), gaussians.harmonics.flatten(1).tolist(), strict=True)
+    beyond = sum(max(map(abs, color)) > 1 / 0.3 or max(map(abs, rest), default=0) > 1 for color, rest in rows)
+    assert len(said) == 1
+    assert f" up to 1: {beyond:,} of the Gaussians" in said[0]
     read = gaussians_in(tmp_path / "a.spz")
     assert float((read.means - gaussians.means).abs().max()) <= 0.5 / 4096 + 1e-6
     assert float((read.logits.sigmoid() - gaussians.logits.sigmoid()).abs().max()) <= 0.5 / 255 + 1e-6
@@ -348,6 +353,8 @@ def test_positions_use_as_many_bits_as_they_need() -> None:
 
 def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
     gaussians = some(100)
+    gaussians.colors.clamp_(-3, 3)
+    gaussians.harmonics.clamp_(-1, 1)
     gaussians.means[0, 0] = 2.0**20
     gaussians.log_scales[:5] = -12
     gaussians.log_scales[5:9] = torch.tensor([-3.0, -3.0, -12.0])  # flat: how thin is not seen
@@ -355,6 +362,9 @@ def test_what_is_out_of_range_is_said(tmp_path: Path) -> None:
     assert "rounds positions to 0.25" in first
     assert "5 of the Gaussians get the nearest" in second
     assert bool(gaussians_in(tmp_path / "a.spz").log_scales[:5].eq(-10).all())
+    gaussians.log_scales[:9, 0] = torch.tensor([*(5 * [-4.0]), 5.96, 5.98, 7.0, -4.0])  # the most is 255 / 16 - 10
+    (_, large) = write_gaussians(tmp_path / "a.spz", gaussians)
+    assert "to 379: 2 of the Gaussians" in large
 
 
 def test_opacities_of_0_and_1_stay_finite(tmp_path: Path) -> None:
@@ -393,6 +403,7 @@ def test_damaged_spz_is_refused(tmp_path: Path) -> None:
     assert "31 fractional" in refused_in_a_line(file, packed(2, 1, 0, one, fraction=31))
     assert "4,294,967,295 Gaussians" in refused_in_a_line(file, packed(2, 2**32 - 1, 0, one))
     assert "truncated" in refused_in_a_line(file, packed(2, 10_000_000, 3, one))  # 640 MB are not asked for
+    assert "truncated: 10,000,001 Gaussians" in refused_in_a_line(file, packed(2, 10_000_001, 0, one))
     assert "truncated" in refused_in_a_line(file, packed(2, 2, 0, one))
     assert "holds no Gaussians" in refused_in_a_line(file, packed(2, 0, 0, b""))
     assert "too much behind its 1 Gaussians" in refused_in_a_line(file, packed(2, 1, 0, one + bytes(20_000_000)))
@@ -476,6 +487,8 @@ def test_what_is_no_similarity_is_refused() -> None:
 @pytest.mark.parametrize("suffix", ["ply", "spz"])
 def test_max_megabytes_holds_and_no_more_is_given_up_than_needed(tmp_path: Path, suffix: str) -> None:
     gaussians, file = some(4000), tmp_path / f"a.{suffix}"
+    gaussians.colors.clamp_(-3, 3)  # what SPZ holds
+    gaussians.harmonics.clamp_(-1, 1)
     assert write_gaussians(file, gaussians, 100.0) == []
     whole = file.stat().st_size
     assert write_gaussians(file, gaussians, whole / 1e6) == []  # it just fits
@@ -513,9 +526,9 @@ def test_coarser_bits_are_taken_where_they_cost_less_than_a_degree() -> None:
     gaussians = some(3000)
     gaussians.harmonics[:, :, 8:] *= 4
     assert colour_error(gaussians, 3, (4, 3)) < colour_error(gaussians, 2, (5, 4))
-    assert fitted_spz(gaussians, len(encoded(gaussians)) - 1)[1] == "4 and 3 bits of harmonics instead of 5 and 4"
+    assert fitted_spz(gaussians, len(encoded(gaussians)) - 1)[2] == "4 and 3 bits of harmonics instead of 5 and 4"
     gaussians.harmonics[:, :, 8:] /= 100
-    assert fitted_spz(gaussians, len(encoded(gaussians)) - 1)[1].startswith("harmonics up to degree 2 of 3")
+    assert fitted_spz(gaussians, len(encoded(gaussians)) - 1)[2].startswith("harmonics up to degree 2 of 3")
 
 
 def test_limits_that_hold_nothing_are_refused(tmp_path: Path) -> None:

@@ -102,6 +102,10 @@ def test_damaged_compressed_ply_is_refused(tmp_path: Path) -> None:
         "without min_x": (b"float min_x", b"float win_x"),
         "bytes of harmonics for 300 of 300": (b"property uchar f_rest_8\n", b""),
         "without f_rest_3": (b"f_rest_3", b"f_rest_x"),
+        "without packed_color": (b"uint packed_color", b"float packed_color"),
+        "without max_z": (b"float max_z", b"uint max_z"),
+        "without f_rest_5": (b"uchar f_rest_5", b"char f_rest_5"),
+        "truncated": (b"element chunk 2\n", b"element chunk 999999999999999\n"),
     }
     for words, (old, new) in damages.items():
         assert whole.count(old) == 1
@@ -112,6 +116,11 @@ def test_damaged_compressed_ply_is_refused(tmp_path: Path) -> None:
         file.write_bytes(whole[:size])
         with pytest.raises(DataError, match="truncated"):
             read_gaussians(file)
+    # A file of 300 Gaussians that states 10^17 does not ask for memory for them.
+    many = whole.replace(b"element chunk 2\n", b"element chunk 999999999999999\n")
+    file.write_bytes(many.replace(b"element vertex 300\n", b"element vertex 100000000000000000\n"))
+    with pytest.raises(DataError, match="truncated"):
+        read_gaussians(file)
 
 
 def ply(

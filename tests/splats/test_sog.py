@@ -95,6 +95,18 @@ def test_what_is_in_a_file_by_hand(tmp_path: Path, how: str) -> None:
     torch.testing.assert_close(g.harmonics[1], (codes - 3 - 128) / 64)
 
 
+def test_a_codebook_without_its_first_number(tmp_path: Path) -> None:
+    """As early programs wrote it: the number is a step before the second, as in PlayCanvas's engine."""
+    meta, images = by_hand()
+    whole = read_gaussians(write(tmp_path / "a.sog", meta, images)).gaussians
+    codes = meta["scales"]["codebook"]
+    codes[0] = None
+    read = read_gaussians(write(tmp_path / "b.sog", meta, images)).gaussians
+    torch.testing.assert_close(read.log_scales[0], whole.log_scales[0], rtol=0, atol=0)
+    first = codes[1] - (codes[255] - codes[1]) / 255  # the second Gaussian's indices are 0
+    torch.testing.assert_close(read.log_scales[1], torch.full((3,), first))
+
+
 def matched(read: Gaussians, given: Gaussians) -> Gaussians:
     """The given Gaussians in the order of those that were read: each is the nearest."""
     nearest = torch.cdist(read.means.double(), given.means.double()).argmin(1)
@@ -118,6 +130,9 @@ def test_sog_is_as_exact_as_stated(tmp_path: Path, count: int, degree: int) -> N
     off = (logs(read.means) - logs(expected.means)).abs()
     print(f"log positions are off by up to {float(off.max()):.2g}")
     assert bool((off <= spread / 131070 + 2e-7).all())
+    stated = float(said[-1].partition(" by up to ")[2].partition(";")[0])
+    assert stated == pytest.approx(float((read.means - expected.means).double().abs().max()), rel=0.06, abs=3e-6)
+    assert f"has the size {given.typical_size:.2g}" in said[-1]
     for name in ("log_scales", "colors"):
         one, other = getattr(read, name), getattr(expected, name)
         print(f"{name} are off by up to {float((one - other).abs().max()):.2g}")
@@ -125,7 +140,7 @@ def test_sog_is_as_exact_as_stated(tmp_path: Path, count: int, degree: int) -> N
     assert float((read.logits.sigmoid() - expected.logits.sigmoid()).abs().max()) <= 0.5 / 255 + 1e-6
     assert float(angles(read, expected).max()) < 1.2
     if not degree:
-        assert said == []
+        assert len(said) == 1
         return
     error = (read.harmonics - expected.harmonics).double()
     rms = float(error.square().mean().sqrt())
@@ -166,6 +181,7 @@ def test_images_have_the_layout_of_the_specification(tmp_path: Path) -> None:
             if name != "meta.json"
         }
     assert (meta["version"], meta["count"], meta["model"]) == (2, 100, "antialiased")
+    assert meta["antialias"] is True
     assert meta["means"]["files"] == ["means_l.webp", "means_u.webp"]
     assert [len(meta[key]["codebook"]) for key in ("scales", "sh0", "shN")] == [256] * 3
     assert (meta["shN"]["count"], meta["shN"]["bands"]) == (100, 2)

@@ -11,8 +11,10 @@ from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Points, Rays, Rendered, Samples, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue
+from nerfloom.data.dataset import Dataset
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.base import DensityFunction, Field
@@ -20,6 +22,7 @@ from nerfloom.fields.distance import Distance, GridDistance, NetworkDistance
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.surface import Sharpness, SurfaceField
+from nerfloom.geometry.floor import find_floor
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.math import safe_normalize
@@ -55,6 +58,8 @@ SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
 """Samples per training step with an occupancy grid."""
 COLOR_LAYERS = 4
 """Hidden layers of the papers' colour network."""
+LEAST_ON_FLOOR = 0.05
+"""Minimum share of a reconstruction's points in the sphere that lie on a floor."""
 LONGEST, EVERY = 4.0, 16
 """Maximum length of a training step, in steps of `num_steps`, and the number of training steps between its changes."""
 
@@ -306,6 +311,24 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
                 scale = min(max(width / sampler.step_size, 1.0), LONGEST)
                 self._step_scale.change(self.step_scale, round(scale * 64) / 64)
             sampler.stride = self._step_scale.of(self.step_scale)
+
+    def start(self, dataset: Dataset) -> None:
+        """Let the first ball stand on the floor, if a reconstruction's points in the sphere show one.
+
+        A floor often has no texture. Nothing then pulls a surface to it, and the background would explain it.
+
+        Args:
+            dataset: the training images.
+        """
+        distance = self.surface.distance
+        if self.sphere is None or dataset.points is None or not isinstance(distance, GridDistance):
+            return
+        sphere, up = self.sphere.to(dataset.points), dataset.points.new_tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        near = dataset.points[(dataset.points - sphere[:3]).norm(dim=-1) < sphere[3]]
+        floor = find_floor(near, up, above=dataset.cameras.camera_to_worlds[:, :, 3])
+        if floor is not None and floor.share >= LEAST_ON_FLOOR:
+            distance.stand_on(floor.normal.to(sphere), floor.center.to(sphere))
+            say(f"the first ball stands on a floor, where {floor.share:.0%} of {len(near):,} points lie")
 
     @property
     def surface(self) -> SurfaceField:

@@ -291,6 +291,29 @@ def test_distances_of_captures_are_known_inside_the_sphere(shared_tiny: Path, tm
     torch.testing.assert_close((high - low) / 2, sphere[3].expand(3))
 
 
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_floor_of_a_capture_belongs_to_the_first_shape(seen: bool, shared_tiny: Path, tmp_path: Path) -> None:
+    """Points of a reconstruction lie on a plane below the cameras, or nowhere in particular."""
+    trainer = said_otherwise(
+        "neus", shared_tiny, tmp_path, {"unbounded": True, "has_alpha": False}, max_num_iterations=3
+    )
+    sphere = foreground_sphere(trainer.model.config, trainer.train_set.scene)
+    height = min(float(trainer.train_set.cameras.camera_to_worlds[:, 2, 3].min()), float(sphere[2])) - sphere[3] / 2
+    points = sphere[:3] + sphere[3] * (torch.rand(2000, 3) - 0.5)
+    if seen:
+        points[:400, 2] = height
+        points[400:, 2] += height + 0.6 * sphere[3] - sphere[2]  # all above
+    trainer.model.start(dataclasses.replace(trainer.train_set, points=points))
+    below = torch.cat([sphere[:2], torch.as_tensor(height)[None] - 0.1 * sphere[3]])
+    aside = below + torch.tensor([0.7, 0.0, 0.0]) * sphere[3]
+    shape = trainer.model.field.shape(torch.stack([below, aside]))
+    if seen:
+        torch.testing.assert_close(shape.distances, -0.1 * sphere[3].expand(2), atol=0.02 * float(sphere[3]), rtol=0)
+        torch.testing.assert_close(shape.gradients[:, 2], torch.ones(2), atol=0.1, rtol=0)
+    else:
+        assert bool((shape.distances > 0).all())
+
+
 def test_the_inverse_width_stays_between_bounds() -> None:
     """At first it cannot leave its first value; halfway to the end of the bound it may be some 7 times as large."""
     trainer = trainer_of("neus", sharpen_until=0.8)

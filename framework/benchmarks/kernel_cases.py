@@ -34,7 +34,7 @@ from nerfloom.kernels.splats.blend import blend
 from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists, tile_lists_reference
 from nerfloom.kernels.surfaces.distance import distance_network
-from nerfloom.kernels.surfaces.samples import Ball, Intervals, surface_samples, unit_normals
+from nerfloom.kernels.surfaces.samples import FirstShape, Intervals, surface_samples, unit_normals
 
 Inputs = dict[str, Tensor]
 KINDS = ("random", "extreme", "empty")
@@ -209,15 +209,16 @@ def _at_points() -> Iterator[Family]:
 
 
 def _surfaces(directions: Tensor) -> Iterator[Family]:
-    """Samples of a signed distance around a ball, and their normals."""
+    """Samples of a signed distance around a ball on a floor, and their normals."""
 
-    def ball(like: Tensor) -> Ball:
-        return Ball(like.new_tensor([0.1, -0.2, 0.3]), like.new_tensor([0.5, 0.4, 0.6]), 1.0, 0.9, 1e-3)
+    def shape(like: Tensor) -> FirstShape:
+        centre, scale = like.new_tensor([0.1, -0.2, 0.3]), like.new_tensor([0.5, 0.4, 0.6])
+        return FirstShape(centre, scale, 1.0, 0.9, 1e-3, like.new_tensor([0.6, 0.0, 0.8, -0.5]))
 
     def both(
         network: Tensor, sharpness: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> Sequence[Tensor]:
-        given = network, sharpness, positions, ball(network)
+        given = network, sharpness, positions, shape(network)
         return *surface_samples(*given, Intervals(directions, lengths, 0.4)), surface_samples(*given)[0]
 
     count = len(directions)

@@ -12,9 +12,9 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import rotation_between
 from nerfloom.cameras.scale import checked
 from nerfloom.edit.edited import UP, Edited
-from nerfloom.edit.floor import find_floor
 from nerfloom.edit.similarity import Similarity, about, axis_rotation, direction, vector
 from nerfloom.geometry.alignment import align
+from nerfloom.geometry.floor import find_floor
 from nerfloom.geometry.regions import Vector
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
@@ -124,6 +124,11 @@ def align_floor(
     opaque = gaussians.means[torch.sigmoid(gaussians.logits) >= min_opacity]
     upwards = edited.upwards if up is None else direction(up, "up")
     floor = find_floor(opaque, upwards, max_tilt, tolerance, seed)
+    if floor is None:
+        raise ConfigError(
+            f"no floor is found: no plane through three of {len(opaque):,} opaque Gaussians has few below; say what is "
+            "up (set_up, --up), give max_tilt, or lower min_opacity"
+        )
     rotation = rotation_between(floor.normal, UP)
     tilt = math.degrees(2 * math.asin(min(float((floor.normal - UP).norm()) / 2, 1.0)))
     say(f"align_floor: {floor.share:.0%} of the opaque Gaussians are on the floor, which was tilted by {tilt:.2f}°")

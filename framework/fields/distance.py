@@ -1,4 +1,4 @@
-"""Learnt signed distances: a ball plus a small network on a hash grid, and the network of IDR, NeuS and VolSDF."""
+"""Learnt signed distances: a shape plus a small network on a hash grid, and the network of IDR, NeuS and VolSDF."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from nerfloom.kernels.encodings.frequency import frequency_encoding_reference
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP
 from nerfloom.kernels.surfaces.distance import distance_network, following_positions
-from nerfloom.kernels.surfaces.samples import Ball, Intervals, ball_distance, stopped_samples, surface_samples
+from nerfloom.kernels.surfaces.samples import (
+    NO_FLOOR,
+    FirstShape,
+    Intervals,
+    first_distance,
+    stopped_samples,
+    surface_samples,
+)
 from nerfloom.kernels.table_memory import require
 
 ROUNDING = 1e-3
@@ -84,7 +91,7 @@ class Distance(nn.Module, ABC):
 
 
 class GridDistance(Distance):
-    """The distance of a ball plus the output of a small network on a hash grid, in units of the box.
+    """The distance of a ball or a floor plus the output of a small network on a hash grid, in units of the box.
 
     Args:
         box: (2, 3) corners of the box, scene units.
@@ -96,6 +103,7 @@ class GridDistance(Distance):
 
     scale: Tensor
     shift: Tensor
+    floor: Tensor
     runs_on_kernels = True
 
     def __init__(
@@ -105,6 +113,7 @@ class GridDistance(Distance):
         edges = box[1] - box[0]
         self.register_buffer("scale", 1 / edges, persistent=False)
         self.register_buffer("shift", -box[0] / edges, persistent=False)
+        self.register_buffer("floor", torch.tensor(NO_FLOOR))
         if grid.deferred is not None:  # gradients of this table are those of features and of their derivatives
             grid.deferred = TableGradient(LOOK_UP, grid.layout)
         self.grid, self.radius = grid, radius * self.size
@@ -116,9 +125,18 @@ class GridDistance(Distance):
             self.second[0].mul_(FIRST_WEIGHTS)
 
     @property
-    def ball(self) -> Ball:
+    def first_shape(self) -> FirstShape:
         """The distance that the network's output is added to."""
-        return Ball(self.centre, self.scale, self.size, self.radius, ROUNDING * self.radius)
+        return FirstShape(self.centre, self.scale, self.size, self.radius, ROUNDING * self.radius, self.floor)
+
+    def stand_on(self, normal: Tensor, point: Tensor) -> None:
+        """Add a floor to the first shape.
+
+        Args:
+            normal: (3,) unit vector, upwards.
+            point: (3,) scene coordinates of a point on the floor.
+        """
+        self.floor.copy_(torch.cat([normal, (normal * point).sum()[None]]))
 
     def network(self, positions: Tensor) -> Tensor:
         """Return the network's outputs, and the gradient of the first by the position in the box (`distance_network`).
@@ -143,12 +161,12 @@ class GridDistance(Distance):
 
     def forward(self, positions: Tensor) -> Shape:
         network = self.network(positions)
-        return Shape(*ball_distance(network, positions, self.ball), network[:, 1:-3])
+        return Shape(*first_distance(network, positions, self.first_shape), network[:, 1:-3])
 
     def samples(
         self, positions: Tensor, sharpness: Tensor, intervals: Intervals | None = None
     ) -> tuple[Tensor, Tensor]:
-        return surface_samples(self.network(positions), sharpness, positions, self.ball, intervals)
+        return surface_samples(self.network(positions), sharpness, positions, self.first_shape, intervals)
 
 
 class NetworkDistance(Distance):

@@ -53,7 +53,7 @@ from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
 from nerfloom.kernels.splats.project import PROJECT, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TILES, tile_lists
 from nerfloom.kernels.surfaces.distance import DISTANCE_NETWORK
-from nerfloom.kernels.surfaces.samples import SURFACE_SAMPLES, UNIT_NORMALS, Ball, Intervals
+from nerfloom.kernels.surfaces.samples import SURFACE_SAMPLES, UNIT_NORMALS, FirstShape, Intervals
 from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
 from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
 from nerfloom.kernels.traced.trace import TRACE, GridDensity
@@ -171,7 +171,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
         rand(50, 8),
         rand(1)[0] + 3,
         torch.rand(50, 3),
-        Ball(rand(3), rand(3), 0.5, 0.3, 1e-3),
+        FirstShape(rand(3), rand(3), 0.5, 0.3, 1e-3, rand(4)),
         Intervals(torch.nn.functional.normalize(torch.randn(50, 3), dim=-1), rand(50), 0.4),
     ),
     UNIT_NORMALS: lambda: (rand(50, 7),),

@@ -51,7 +51,7 @@ from nerfloom.kernels.splats.project import RECORD, Record, SplatCamera, project
 from nerfloom.kernels.splats.tiles import tile_lists
 from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference
 from nerfloom.kernels.surfaces.samples import (
-    Ball,
+    FirstShape,
     Intervals,
     surface_samples,
     surface_samples_reference,
@@ -166,11 +166,12 @@ def density_network(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
     return run
 
 
-def around_a_ball(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
-    ball = Ball(torch.tensor([0.5, 0.4, 0.6]), torch.tensor([1.0, 0.8, 0.9]), 0.5, 0.3, 1e-3)
+def around_a_shape(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
+    floor = torch.tensor([0.0, 0.6, 0.8, 0.4])
+    shape = FirstShape(torch.tensor([0.5, 0.4, 0.6]), torch.tensor([1.0, 0.8, 0.9]), 0.5, 0.3, 1e-3, floor)
 
     def run(network: Tensor, sharpness: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor) -> Tensor:
-        stopping, features = form(network, sharpness, positions, ball, Intervals(directions, lengths))
+        stopping, features = form(network, sharpness, positions, shape, Intervals(directions, lengths))
         return torch.cat([stopping[:, None], features], -1)
 
     return run
@@ -231,8 +232,8 @@ OPERATIONS = {
         ("distance_network_forward", "distance_network_backward", "hash_grid_tangent_backward_table"),
     ),
     "surface samples": Operation(
-        around_a_ball(surface_samples),
-        around_a_ball(surface_samples_reference),
+        around_a_shape(surface_samples),
+        around_a_shape(surface_samples_reference),
         lambda: {
             "network": rand(20, 8),
             "sharpness": rand(1)[0] + 3,

@@ -1,12 +1,14 @@
-"""Samples of a ball plus a network: compiled against the reference in float64, the reference against differences."""
+"""Samples of a shape plus a network: compiled against the reference in float64, the reference against differences."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from nerfloom.kernels.surfaces.samples import (
-    Ball,
+    NO_FLOOR,
+    FirstShape,
     Intervals,
+    first_distance,
     surface_samples,
     surface_samples_reference,
     unit_normals,
@@ -22,8 +24,8 @@ HEADINGS = {"head-on": -1.0, "grazing": -1e-3, "along": 0.0, "leaving": 0.7, "an
 
 def given(
     slope: float, cosine: float | None = None, count: int = 403
-) -> tuple[Tensor, Tensor, Tensor, Ball, Intervals]:
-    """Samples around a ball whose radius is some widths of the surface, so that all opacities occur."""
+) -> tuple[Tensor, Tensor, Tensor, FirstShape, Intervals]:
+    """Samples around a ball on a floor; the radius is some widths of the surface, so that all opacities occur."""
     torch.manual_seed(0)
     outward = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
     across = torch.nn.functional.normalize(torch.linalg.cross(outward, torch.randn(count, 3)), dim=-1)
@@ -34,16 +36,17 @@ def given(
     positions = centre + outward * size * (1 + torch.randn(count, 1) / 4)
     network = torch.randn(count, OUTPUTS + 3) / 10
     lengths = size * torch.rand(count)
-    ball = Ball(centre, scale, size, size, 1e-3 * size)
-    return network, torch.tensor(slope), positions, ball, Intervals(directions, lengths)
+    floor = torch.tensor([0.0, 0.6, 0.8, -0.5 * size])
+    shape = FirstShape(centre, scale, size, size, 1e-3 * size, floor)
+    return network, torch.tensor(slope), positions, shape, Intervals(directions, lengths)
 
 
 def double(values: tuple) -> tuple:
-    network, slope, positions, ball, intervals = values
-    ball = ball._replace(centre=ball.centre.double(), scale=ball.scale.double())
+    network, slope, positions, shape, intervals = values
+    shape = shape._replace(centre=shape.centre.double(), scale=shape.scale.double(), floor=shape.floor.double())
     if intervals is not None:
         intervals = intervals._replace(directions=intervals.directions.double(), lengths=intervals.lengths.double())
-    return network.double(), slope.double(), positions.double(), ball, intervals
+    return network.double(), slope.double(), positions.double(), shape, intervals
 
 
 def results(run: object, values: tuple) -> tuple[Tensor, ...]:
@@ -84,9 +87,9 @@ def test_densities_equal_the_reference(slope: float) -> None:
 @needs_kernels
 def test_opacities_far_from_any_surface_are_finite() -> None:
     """Widths of a millionth of the scene: the opacity is 0 or 1, and nothing overflows."""
-    network, _, positions, ball, intervals = given(1.0)
+    network, _, positions, shape, intervals = given(1.0)
     for slope in (1e3, 1e6, 1e9):
-        found = results(surface_samples, (network, torch.tensor(slope), positions, ball, intervals))
+        found = results(surface_samples, (network, torch.tensor(slope), positions, shape, intervals))
         assert all(bool(each.isfinite().all()) for each in found)
         assert bool(((found[0] >= 0) & (found[0] <= 1)).all())
 
@@ -94,25 +97,41 @@ def test_opacities_far_from_any_surface_are_finite() -> None:
 @needs_kernels
 def test_what_is_not_asked_for_has_no_gradient() -> None:
     """Rows without a gradient are exactly 0: the network's backward pass leaves them out. And no rows at all."""
-    network, slope, positions, ball, intervals = given(30.0)
+    network, slope, positions, shape, intervals = given(30.0)
     leaf = network.clone().requires_grad_()
-    stopping, features = surface_samples(leaf, slope, positions, ball, intervals)
+    stopping, features = surface_samples(leaf, slope, positions, shape, intervals)
     (found,) = torch.autograd.grad(stopping[:7].sum() + features[:7].sum(), leaf)
     assert bool(found[:7].any(-1).all())
     assert not found[7:].any()
-    (alone,) = torch.autograd.grad(surface_samples(leaf, slope, positions, ball, intervals)[1].sum(), leaf)
+    (alone,) = torch.autograd.grad(surface_samples(leaf, slope, positions, shape, intervals)[1].sum(), leaf)
     assert not alone[:, 0].any()
     none = Intervals(intervals.directions[:0], intervals.lengths[:0])
-    stopping, features = surface_samples(leaf[:0], slope, positions[:0], ball, none)
+    stopping, features = surface_samples(leaf[:0], slope, positions[:0], shape, none)
     assert stopping.shape == (0,)
     assert features.shape == (0, OUTPUTS + 5)
 
 
 def test_the_reference_has_the_gradient_of_its_values() -> None:
-    network, slope, positions, ball, intervals = double(given(30.0, count=6))
+    network, slope, positions, shape, intervals = double(given(30.0, count=6))
     leaves = [each.clone().requires_grad_() for each in (network, slope, positions)]
     for along in (None, intervals, intervals._replace(annealing=0.3)):
-        assert torch.autograd.gradcheck(lambda *of: surface_samples_reference(*of, ball, along), leaves)  # noqa: B023
+        assert torch.autograd.gradcheck(lambda *of: surface_samples_reference(*of, shape, along), leaves)  # noqa: B023
+
+
+def test_the_first_shape_is_the_union_of_a_ball_and_a_half_space() -> None:
+    """Without a network: the smaller of the two distances, and its gradient; a ball alone without a floor."""
+    _, _, positions, shape, _ = double(given(1.0))
+    network = torch.zeros(len(positions), OUTPUTS + 3, dtype=torch.float64)
+    away = positions - shape.centre
+    ball = (away.square().sum(-1) + shape.rounding**2).sqrt() - shape.radius
+    height = 0.6 * positions[:, 1] + 0.8 * positions[:, 2] + 10
+    distances, gradients = first_distance(network, positions, shape)
+    torch.testing.assert_close(distances, torch.minimum(ball, height))
+    on_floor = height < ball
+    assert 0.05 < float(on_floor.double().mean()) < 0.95
+    torch.testing.assert_close(gradients[on_floor], shape.floor[:3].expand(int(on_floor.sum()), 3))
+    alone = shape._replace(floor=torch.tensor(NO_FLOOR, dtype=torch.float64))
+    torch.testing.assert_close(first_distance(network, positions, alone)[0], ball)
 
 
 @needs_kernels

@@ -68,7 +68,7 @@ MUTANTS = {
             "after a move, photographs show other Gaussians in a polygon than those that it was drawn around",
             "edit/test_place.py::test_what_has_been_moved_stays_where_it_was_in_the_scene"),
     ],
-    "nerfloom.edit.floor": [
+    "nerfloom.geometry.floor": [
         Mutant("wall-as-floor", "_best", "A & (normals @ up >= min_cosine)", "A",
             "a wall that is larger than the floor is taken for it",
             "edit/test_place.py::test_a_tilted_floor_becomes_the_plane_z_is_0"),

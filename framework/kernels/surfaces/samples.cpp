@@ -1,4 +1,5 @@
-// Samples of a signed distance that is a ball plus a network's output: opacity or density, and features for the colour.
+// Samples of a signed distance that is a first shape plus a network's output: opacity or density, and features for the
+// colour.
 // See samples.py for the reference and the equations.
 #include "runtime/common.h"
 
@@ -10,9 +11,11 @@ namespace {
 constexpr int64_t CHUNK = 512;
 constexpr int PLACED = 6;  // features before the network's: gradient and position
 
-struct Ball {
+// A ball, and a floor: its normal and its height along the normal.
+struct FirstShape {
     const float *centre, *scale;
     float size, radius, rounding;
+    const float* floor;
 };
 
 // Distance and gradient at LANES samples, and the derivatives of what stops light by both.
@@ -21,18 +24,21 @@ struct Lanes {
 
     // Rows [0, count) of the inputs, `stride` = outputs + 3 columns of the network's; zeros behind.
     void read(const float* network, int64_t stride, const float* positions, const float* directions,
-              const float* lengths, int count, const Ball& ball) {
+              const float* lengths, int count, const FirstShape& first) {
         std::memset(this, 0, sizeof *this);
         for (int i = 0; i < count; i++, network += stride, positions += 3) {
-            float offset[3], squares = ball.rounding * ball.rounding;
+            float offset[3], squares = first.rounding * first.rounding, height = -first.floor[3];
             for (int axis = 0; axis < 3; axis++) {
-                offset[axis] = positions[axis] - ball.centre[axis];
+                offset[axis] = positions[axis] - first.centre[axis];
                 squares += offset[axis] * offset[axis];
+                height += first.floor[axis] * positions[axis];
             }
             const float far = std::sqrt(squares);
-            distance[i] = far - ball.radius + ball.size * network[0];
+            const bool lower = height < far - first.radius;
+            distance[i] = (lower ? height : far - first.radius) + first.size * network[0];
             for (int axis = 0; axis < 3; axis++)
-                gradient[axis][i] = offset[axis] / far + ball.size * ball.scale[axis] * network[stride - 3 + axis];
+                gradient[axis][i] = (lower ? first.floor[axis] : offset[axis] / far) +
+                                    first.size * first.scale[axis] * network[stride - 3 + axis];
             if (!directions) continue;
             for (int axis = 0; axis < 3; axis++) direction[axis][i] = directions[i * 3 + axis];
             length[i] = lengths[i];
@@ -79,17 +85,17 @@ inline Stopping density(Floats distance, float sharpness) {
 EXPORT int surface_samples(const float* network, int64_t count, int outputs, const float* positions,
                            const float* directions, const float* lengths, const float* sharpness, float annealing,
                            const float* centre, const float* scale, float size, float radius, float rounding,
-                           float* stopping, float* features, int threads) {
+                           const float* floor, float* stopping, float* features, int threads) {
     return guarded([&] {
         const int64_t stride = outputs + 3, width = PLACED + outputs - 1;
-        const Ball ball{centre, scale, size, radius, rounding};
+        const FirstShape first{centre, scale, size, radius, rounding, floor};
         for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
             Lanes lanes;
             for (int64_t n = begin; n < end; n += LANES) {
                 const int rows = int(std::min<int64_t>(LANES, end - n));
                 const float *from = network + n * stride, *places = positions + n * 3;
                 lanes.read(from, stride, places, directions ? directions + n * 3 : nullptr,
-                           lengths ? lengths + n : nullptr, rows, ball);
+                           lengths ? lengths + n : nullptr, rows, first);
                 const Floats distance = load(lanes.distance);
                 const Floats value = directions ? opacity(distance, lanes.cosine(), load(lanes.length), *sharpness, annealing).value
                                                 : density(distance, *sharpness).value;
@@ -111,11 +117,11 @@ EXPORT int surface_samples(const float* network, int64_t count, int outputs, con
 EXPORT int surface_samples_backward(const float* network, int64_t count, int outputs, const float* positions,
                                     const float* directions, const float* lengths, const float* sharpness,
                                     float annealing, const float* centre, const float* scale, float size, float radius,
-                                    float rounding, const float* of_stopping, const float* of_features,
-                                    float* of_network, float* of_sharpness, int threads) {
+                                    float rounding, const float* floor, const float* of_stopping,
+                                    const float* of_features, float* of_network, float* of_sharpness, int threads) {
     return guarded([&] {
         const int64_t stride = outputs + 3, width = PLACED + outputs - 1, chunks = (count + CHUNK - 1) / CHUNK;
-        const Ball ball{centre, scale, size, radius, rounding};
+        const FirstShape first{centre, scale, size, radius, rounding, floor};
         std::vector<double> sums(chunks);  // in order, so that their sum has the same bits on any number of threads
         for_chunks(threads, chunks, [&](int64_t chunk, int) {
             const int64_t end = std::min(count, (chunk + 1) * CHUNK);
@@ -126,7 +132,7 @@ EXPORT int surface_samples_backward(const float* network, int64_t count, int out
                 alignas(64) float grads[LANES] = {}, by_distance[LANES], by_cosine[LANES], by_sharpness[LANES];
                 if (of_stopping) std::memcpy(grads, of_stopping + n, sizeof(float) * rows);
                 lanes.read(network + n * stride, stride, positions + n * 3, directions ? directions + n * 3 : nullptr,
-                           lengths ? lengths + n : nullptr, rows, ball);
+                           lengths ? lengths + n : nullptr, rows, first);
                 const Floats distance = load(lanes.distance), grad = load(grads);
                 const Stopping by = directions
                     ? opacity(distance, lanes.cosine(), load(lanes.length), *sharpness, annealing)

@@ -1,9 +1,11 @@
-"""Samples of a signed distance, a ball plus a network's output: their opacity or density, and inputs of their colour.
+"""Samples of a signed distance, a first shape plus a network's output: opacity or density, and inputs of their colour.
 
 With the outputs y and the gradient dy_0 / du of a network in the unit box (`distance.py`), u = (x - low) scale:
 
-    f(x) = |x - c| - r + b y_0
-    n(x) = (x - c) / |x - c| + b scale dy_0 / du
+    f(x) = g(x) + b y_0
+    n(x) = dg / dx + b scale dy_0 / du
+
+The first shape g is the distance to a ball, |x - c| - r, or to a floor, m.x - h, whichever is smaller.
 
 An interval along a ray stops light by NeuS's opacity, a point by VolSDF's density (`opacity.py`).
 """
@@ -22,13 +24,15 @@ from nerfloom.kernels.surfaces.opacity import laplace_density, surface_opacity
 from nerfloom.kernels.triton_backend import later
 
 PLACED = 6
-"""Number of features before the network's: gradient of the distance, and position in units of the ball."""
+"""Number of features before the network's: gradient of the distance, and position in units of the box."""
+NO_FLOOR = 0.0, 0.0, 0.0, -1e30
+"""A floor that is farther from any position than any ball."""
 SHORTEST = 1e-12
 """Length below which a gradient has no direction."""
 
 
-class Ball(NamedTuple):
-    """The distance that a network's output is added to."""
+class FirstShape(NamedTuple):
+    """The distance that a network's output is added to: of a ball, and of a floor if there is one."""
 
     centre: Tensor
     """(3,) scene coordinates."""
@@ -37,10 +41,12 @@ class Ball(NamedTuple):
     size: float
     """Unit of the network's output, scene units."""
     radius: float
-    """Radius, scene units."""
+    """Radius of the ball, scene units."""
     rounding: float
     """Radius around the centre within which the distance is smoothed, scene units, because it has no gradient at the
     centre."""
+    floor: Tensor
+    """(4,) unit normal m of the floor, upwards, and height h of the floor along it; `NO_FLOOR` for none."""
 
 
 class Intervals(NamedTuple):
@@ -54,22 +60,25 @@ class Intervals(NamedTuple):
     """Fraction of the slope's annealing that is done (`surface_opacity`)."""
 
 
-def ball_distance(network: Tensor, positions: Tensor, ball: Ball) -> tuple[Tensor, Tensor]:
+def first_distance(network: Tensor, positions: Tensor, first: FirstShape) -> tuple[Tensor, Tensor]:
     """Return the distances (N,) and their gradients (N, 3), for any device and float type.
 
     Args:
         network: (N, D + 3) outputs of a network, and the gradient of the first by the position in the unit box.
         positions: (N, 3) scene coordinates.
-        ball: the distance that the first output is added to.
+        first: the distance that the network's first output is added to.
     """
-    offsets = positions - ball.centre
-    lengths = (offsets.square().sum(-1) + ball.rounding**2).sqrt()
-    distances = lengths - ball.radius + ball.size * network[:, 0]
-    return distances, offsets / lengths[:, None] + ball.size * ball.scale * network[:, -3:]
+    offsets = positions - first.centre
+    lengths = (offsets.square().sum(-1) + first.rounding**2).sqrt()
+    normal, heights = first.floor[:3], positions @ first.floor[:3] - first.floor[3]
+    lower = heights < lengths - first.radius
+    distances = torch.where(lower, heights, lengths - first.radius) + first.size * network[:, 0]
+    gradients = torch.where(lower[:, None], normal, offsets / lengths[:, None])
+    return distances, gradients + first.size * first.scale * network[:, -3:]
 
 
 def surface_samples(
-    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+    network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return what stops light at samples, and the inputs of their colour.
 
@@ -79,26 +88,26 @@ def surface_samples(
         network: (N, D + 3) outputs of a network, and the gradient of the first by the position in the unit box.
         sharpness: () inverse width of the surface, 1/length.
         positions: (N, 3) scene coordinates of the samples.
-        ball: the distance that the first output is added to.
+        first: the distance that the network's first output is added to.
         intervals: the intervals around the samples; None for points.
 
     Returns:
         (N,) opacity of the intervals (NeuS, equation 13), or density at the points (VolSDF, equation 2), 1/length; and
-        features (N, 6 + D - 1): gradient of the distance, position relative to the ball, and the further outputs.
+        features (N, 6 + D - 1): gradient of the distance, position relative to the box, and the further outputs.
     """
     along = (None, None) if intervals is None else intervals[:2]
-    return SURFACE_SAMPLES((network, sharpness, positions, *along), network, sharpness, positions, ball, intervals)
+    return SURFACE_SAMPLES((network, sharpness, positions, *along), network, sharpness, positions, first, intervals)
 
 
 def surface_samples_reference(
-    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+    network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
     """Compute `surface_samples` in PyTorch, for any device and float type, with derivatives of any order.
 
-    `network`, `sharpness`, `positions`, `ball`, `intervals` and the result are as there.
+    `network`, `sharpness`, `positions`, `first`, `intervals` and the result are as there.
     """
-    placed = (positions - ball.centre) / ball.size
-    return stopped_samples(*ball_distance(network, positions, ball), network[:, 1:-3], placed, sharpness, intervals)
+    placed = (positions - first.centre) / first.size
+    return stopped_samples(*first_distance(network, positions, first), network[:, 1:-3], placed, sharpness, intervals)
 
 
 def stopped_samples(
@@ -141,8 +150,8 @@ def unit_normals_reference(features: Tensor) -> Tensor:
 
 SURFACE_SAMPLES = Operation("surface_samples", surface_samples_reference)
 UNIT_NORMALS = Operation("unit_normals", unit_normals_reference)
-_samples = native.Function("surface_samples", "pqippppfppfffppi")
-_samples_backward = native.Function("surface_samples_backward", "pqippppfppfffppppi")
+_samples = native.Function("surface_samples", "pqippppfppfffpppi")
+_samples_backward = native.Function("surface_samples_backward", "pqippppfppfffpppppi")
 _unit = native.Function("unit_normals", "pqifpi")
 _unit_backward = native.Function("unit_normals_backward", "pqifppi")
 SURFACE_SAMPLES.implementation(TRITON, differentiable=2)(later("surfaces.samples_triton", "surface_samples"))
@@ -151,11 +160,11 @@ UNIT_NORMALS.implementation(TRITON)(later("surfaces.samples_triton", "unit_norma
 
 @SURFACE_SAMPLES.implementation(CPP, differentiable=2)
 def _compiled(
-    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+    network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
     directions, lengths, annealing = intervals or (None, None, 1.0)
     rows = (None if each is None else each.contiguous() for each in (positions, directions, lengths))
-    return _Samples.apply(network.contiguous(), sharpness, ball, annealing, *rows)
+    return _Samples.apply(network.contiguous(), sharpness, first, annealing, *rows)
 
 
 class _Samples(torch.autograd.Function):
@@ -164,17 +173,17 @@ class _Samples(torch.autograd.Function):
         ctx: Any,
         network: Tensor,
         sharpness: Tensor,
-        ball: Ball,
+        first: FirstShape,
         annealing: float,
         positions: Tensor,
         directions: Tensor | None,
         lengths: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(network, sharpness, positions, directions, lengths)
-        ctx.ball, ctx.annealing = ball, annealing
+        ctx.first, ctx.annealing = first, annealing
         count, width = network.shape
         stopping, features = network.new_empty(count), network.new_empty(count, PLACED + width - 4)
-        arguments = _arguments(network, sharpness, ball, annealing, positions, directions, lengths)
+        arguments = _arguments(network, sharpness, first, annealing, positions, directions, lengths)
         _samples(*arguments, stopping.data_ptr(), features.data_ptr(), native.threads())
         ctx.set_materialize_grads(False)
         return stopping, features
@@ -187,7 +196,7 @@ class _Samples(torch.autograd.Function):
         of_network, of_sharpness, count = torch.empty_like(network), torch.zeros_like(sharpness), len(network)
         shapes = (count,), (count, PLACED + network.shape[1] - 4)
         _samples_backward(
-            *_arguments(network, sharpness, ctx.ball, ctx.annealing, *rows),
+            *_arguments(network, sharpness, ctx.first, ctx.annealing, *rows),
             None if of_stopping is None else native.pointer(of_stopping, "the gradient", shapes[0]),
             None if of_features is None else native.pointer(of_features, "the features' gradient", shapes[1]),
             of_network.data_ptr(), of_sharpness.data_ptr(), native.threads(),
@@ -198,7 +207,7 @@ class _Samples(torch.autograd.Function):
 def _arguments(
     network: Tensor,
     sharpness: Tensor,
-    ball: Ball,
+    first: FirstShape,
     annealing: float,
     positions: Tensor,
     directions: Tensor | None,
@@ -212,8 +221,8 @@ def _arguments(
         None if directions is None else native.pointer(directions, "directions", (count, 3)),
         None if lengths is None else native.pointer(lengths, "lengths", (count,)),
         native.pointer(sharpness, "the sharpness", ()), annealing,
-        native.pointer(ball.centre, "the centre", (3,)), native.pointer(ball.scale, "the scale", (3,)),
-        ball.size, ball.radius, ball.rounding,
+        native.pointer(first.centre, "the centre", (3,)), native.pointer(first.scale, "the scale", (3,)),
+        first.size, first.radius, first.rounding, native.pointer(first.floor, "the floor", (4,)),
     )  # fmt: skip
 
 

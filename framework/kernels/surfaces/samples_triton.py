@@ -1,4 +1,4 @@
-"""Samples of a ball plus a network, in Triton. `samples.py` has the reference."""
+"""Samples of a first shape plus a network, in Triton. `samples.py` has the reference."""
 
 # mypy: allow-untyped-defs, allow-untyped-decorators, allow-incomplete-defs
 # Triton gives the kernels' arguments their types.
@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nerfloom.kernels.surfaces.samples import PLACED, SHORTEST, Ball, Intervals
+from nerfloom.kernels.surfaces.samples import PLACED, SHORTEST, FirstShape, Intervals
 from nerfloom.kernels.triton_launch import blocks, launch, on_device, opacity_of
 
 BLOCK = 128
@@ -25,10 +25,19 @@ def _offset(positions, centre, n, here, axis: tl.constexpr):
 
 
 @triton.jit
-def _along(network, n, here, stride, axis: tl.constexpr, offset, far, scale, size):
+def _height(positions, floor, n, here):
+    """Return the distance to the floor."""
+    height = tl.load(positions + n * 3, mask=here, other=0.0) * tl.load(floor)
+    height += tl.load(positions + n * 3 + 1, mask=here, other=0.0) * tl.load(floor + 1)
+    height += tl.load(positions + n * 3 + 2, mask=here, other=0.0) * tl.load(floor + 2)
+    return height - tl.load(floor + 3)
+
+
+@triton.jit
+def _along(network, n, here, stride, axis: tl.constexpr, offset, far, scale, size, floor, lower):
     """Return the distance's derivative along an axis."""
     slope = tl.load(network + n * stride + stride - 3 + axis, mask=here, other=0.0)
-    return offset / far + size * tl.load(scale + axis) * slope
+    return tl.where(lower, tl.load(floor + axis), offset / far) + size * tl.load(scale + axis) * slope
 
 
 @triton.jit
@@ -50,8 +59,8 @@ def _half(cosine, length, annealing):
 
 @triton.jit(do_not_specialize=["count"])
 def _forward(
-    network, positions, directions, lengths, sharpness, annealing, centre, scale, size, radius, rounding, stopping,
-    features, count, D: tl.constexpr, INTERVALS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
+    network, positions, directions, lengths, sharpness, annealing, centre, scale, size, radius, rounding, floor,
+    stopping, features, count, D: tl.constexpr, INTERVALS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = n < count
@@ -60,10 +69,12 @@ def _forward(
     y = _offset(positions, centre, n, here, 1)
     z = _offset(positions, centre, n, here, 2)
     far = tl.sqrt(x * x + y * y + z * z + rounding * rounding)
-    distance = far - radius + size * tl.load(network + n * (D + 3), mask=here, other=0.0)
-    along_x = _along(network, n, here, D + 3, 0, x, far, scale, size)
-    along_y = _along(network, n, here, D + 3, 1, y, far, scale, size)
-    along_z = _along(network, n, here, D + 3, 2, z, far, scale, size)
+    height = _height(positions, floor, n, here)
+    lower = height < far - radius
+    distance = tl.where(lower, height, far - radius) + size * tl.load(network + n * (D + 3), mask=here, other=0.0)
+    along_x = _along(network, n, here, D + 3, 0, x, far, scale, size, floor, lower)
+    along_y = _along(network, n, here, D + 3, 1, y, far, scale, size, floor, lower)
+    along_z = _along(network, n, here, D + 3, 2, z, far, scale, size, floor, lower)
     if INTERVALS:
         cosine = along_x * tl.load(directions + n * 3, mask=here, other=0.0)
         cosine += along_y * tl.load(directions + n * 3 + 1, mask=here, other=0.0)
@@ -90,9 +101,9 @@ def _forward(
 
 @triton.jit(do_not_specialize=["count"])
 def _backward(
-    network, positions, directions, lengths, sharpness, annealing, centre, scale, size, radius, rounding, of_stopping,
-    of_features, of_network, of_sharpness, count, D: tl.constexpr, INTERVALS: tl.constexpr, WIDTH: tl.constexpr,
-    BLOCK: tl.constexpr,
+    network, positions, directions, lengths, sharpness, annealing, centre, scale, size, radius, rounding, floor,
+    of_stopping, of_features, of_network, of_sharpness, count, D: tl.constexpr, INTERVALS: tl.constexpr,
+    WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = n < count
@@ -101,7 +112,9 @@ def _backward(
     y = _offset(positions, centre, n, here, 1)
     z = _offset(positions, centre, n, here, 2)
     far = tl.sqrt(x * x + y * y + z * z + rounding * rounding)
-    distance = far - radius + size * tl.load(network + n * (D + 3), mask=here, other=0.0)
+    height = _height(positions, floor, n, here)
+    lower = height < far - radius
+    distance = tl.where(lower, height, far - radius) + size * tl.load(network + n * (D + 3), mask=here, other=0.0)
     grad = tl.load(of_stopping + n, mask=here, other=0.0)
     by_x = tl.load(of_features + n * (5 + D), mask=here, other=0.0)
     by_y = tl.load(of_features + n * (5 + D) + 1, mask=here, other=0.0)
@@ -111,9 +124,9 @@ def _backward(
         to_y = tl.load(directions + n * 3 + 1, mask=here, other=0.0)
         to_z = tl.load(directions + n * 3 + 2, mask=here, other=0.0)
         length = tl.load(lengths + n, mask=here, other=0.0)
-        cosine = _along(network, n, here, D + 3, 0, x, far, scale, size) * to_x
-        cosine += _along(network, n, here, D + 3, 1, y, far, scale, size) * to_y
-        cosine += _along(network, n, here, D + 3, 2, z, far, scale, size) * to_z
+        cosine = _along(network, n, here, D + 3, 0, x, far, scale, size, floor, lower) * to_x
+        cosine += _along(network, n, here, D + 3, 1, y, far, scale, size, floor, lower) * to_y
+        cosine += _along(network, n, here, D + 3, 2, z, far, scale, size, floor, lower) * to_z
         half = _half(cosine, length, annealing)
         inside, outside = _logistic(s * (distance - half))
         fall = 2 * s * half
@@ -145,15 +158,15 @@ def _backward(
 class _Samples(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, network: Tensor, sharpness: Tensor, ball: Ball, annealing: Tensor, *rows: Tensor
+        ctx: Any, network: Tensor, sharpness: Tensor, first: FirstShape, annealing: Tensor, *rows: Tensor
     ) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(network, sharpness, annealing, *rows)
-        ctx.ball = ball
+        ctx.first = first
         count, outputs = len(network), network.shape[1] - 3
         stopping, features = network.new_empty(count), network.new_empty(count, PLACED + outputs - 1)
         launch(
-            _forward, (blocks(count, BLOCK),), network, *_inputs(rows, sharpness, annealing, ball), stopping, features,
-            count, **_constants(outputs, rows),
+            _forward, (blocks(count, BLOCK),), network, *_inputs(rows, sharpness, annealing, first), stopping,
+            features, count, **_constants(outputs, rows),
         )  # fmt: skip
         return stopping, features
 
@@ -163,17 +176,17 @@ class _Samples(torch.autograd.Function):
         network, sharpness, annealing, *rows = ctx.saved_tensors
         of_network, of_sharpness, count = torch.empty_like(network), torch.zeros_like(sharpness), len(network)
         launch(
-            _backward, (blocks(count, BLOCK),), network, *_inputs(rows, sharpness, annealing, ctx.ball),
+            _backward, (blocks(count, BLOCK),), network, *_inputs(rows, sharpness, annealing, ctx.first),
             of_stopping.contiguous(), of_features.contiguous(), of_network, of_sharpness, count,
             **_constants(network.shape[1] - 3, rows),
         )  # fmt: skip
         return of_network, of_sharpness, *[None] * (2 + len(rows))
 
 
-def _inputs(rows: Any, sharpness: Tensor, annealing: Tensor, ball: Ball) -> tuple[Any, ...]:
+def _inputs(rows: Any, sharpness: Tensor, annealing: Tensor, first: FirstShape) -> tuple[Any, ...]:
     """Return the arguments of both kernels after the network; positions replace missing arguments."""
     positions, directions, lengths = rows if len(rows) == 3 else (rows[0],) * 3
-    return positions, directions, lengths, sharpness, annealing, *ball
+    return positions, directions, lengths, sharpness, annealing, *first
 
 
 def _constants(outputs: int, rows: Any) -> dict[str, Any]:
@@ -182,17 +195,17 @@ def _constants(outputs: int, rows: Any) -> dict[str, Any]:
 
 
 def surface_samples(
-    network: Tensor, sharpness: Tensor, positions: Tensor, ball: Ball, intervals: Intervals | None = None
+    network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
     """Compute `nerfloom.kernels.surfaces.samples.surface_samples`.
 
-    `network`, `sharpness`, `positions`, `ball` and `intervals` are as there.
+    `network`, `sharpness`, `positions`, `first` and `intervals` are as there.
     """
     rows, annealing = [positions.contiguous()], 1.0
     if intervals is not None:
         rows += [intervals.directions.contiguous(), intervals.lengths.contiguous()]
         annealing = intervals.annealing
-    return _Samples.apply(network.contiguous(), sharpness, ball, on_device(annealing, network), *rows)
+    return _Samples.apply(network.contiguous(), sharpness, first, on_device(annealing, network), *rows)
 
 
 @triton.jit

@@ -32,7 +32,7 @@ from nerfloom.kernels.splats import blend_triton, project_triton, tiles_triton
 from nerfloom.kernels.splats.project import SplatCamera, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists_reference
 from nerfloom.kernels.surfaces import distance_triton, samples_triton
-from nerfloom.kernels.surfaces.samples import Ball, Intervals
+from nerfloom.kernels.surfaces.samples import FirstShape, Intervals
 from tests.kernels.test_march import occupancy, random_rays
 
 
@@ -83,12 +83,13 @@ def compile_all() -> None:
                 torch.rand(9, 3), learned(grid.num_entries, features), *weights, grid, None
             )
         )
-    ball, along = Ball(torch.rand(3), torch.rand(3), 1.0, 0.9, 1e-3), Intervals(torch.rand(9, 3), torch.rand(9), 0.4)
+    shape = FirstShape(torch.rand(3), torch.rand(3), 1.0, 0.9, 1e-3, torch.rand(4))
+    along = Intervals(torch.rand(9, 3), torch.rand(9), 0.4)
     for intervals in (None, along):
         slope = torch.tensor(9.0, requires_grad=True)
         back(torch.cat(
             [each.reshape(-1) for each in samples_triton.surface_samples(
-                learned(9, 8), slope, torch.rand(9, 3), ball, intervals)]
+                learned(9, 8), slope, torch.rand(9, 3), shape, intervals)]
         ))  # fmt: skip
     back(samples_triton.unit_normals(learned(9, 7)))
     layout = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))

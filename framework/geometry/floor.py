@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nerfloom.base.errors import ConfigError
 from nerfloom.base.evenly_spaced import evenly_spaced
 
 TRIALS = 5_000
@@ -41,9 +40,14 @@ class Plane(NamedTuple):
 
 
 def find_floor(
-    points: Tensor, up: Tensor, max_tilt: float = 45.0, tolerance: float | None = None, seed: int = 0
-) -> Plane:
-    """Find the floor among points. The same arguments give the same plane.
+    points: Tensor,
+    up: Tensor,
+    max_tilt: float = 45.0,
+    tolerance: float | None = None,
+    seed: int = 0,
+    above: Tensor | None = None,
+) -> Plane | None:
+    """Find the floor among points; None if there is none. The same arguments give the same plane.
 
     Args:
         points: (N, 3) positions on surfaces.
@@ -51,18 +55,20 @@ def find_floor(
         max_tilt: maximum angle between `up` and the floor's normal, degrees.
         tolerance: maximum distance of the floor's points from it; None for 1 % of the points' spread.
         seed: seed of the random planes.
-
-    Raises:
-        ConfigError: if there is no such plane.
+        above: (M, 3) positions above the floor, such as those of cameras; None for none.
     """
     if len(points) < 3:
-        raise ConfigError(f"a floor cannot be found among {len(points)} opaque Gaussians; lower min_opacity")
+        return None
     middle = points.double().median(0).values
     centred = points.double() - middle
     spread = float(centred.norm(dim=-1).median())
     limit = TOLERANCE * spread if tolerance is None else tolerance
     some = centred[evenly_spaced(len(centred), MAX_POINTS)]
-    normal, center = _best(some, up, math.cos(math.radians(max_tilt)), limit, seed)
+    over = centred[:0] if above is None else above.to(centred) - middle
+    found = _best(some, over, up, math.cos(math.radians(max_tilt)), limit, seed)
+    if found is None:
+        return None
+    normal, center = found
     near = centred
     for _ in range(ROUNDS):
         near = centred[((centred - center) @ normal).abs() <= limit]
@@ -74,8 +80,10 @@ def find_floor(
     return Plane(normal, center + middle, len(near) / len(points))
 
 
-def _best(points: Tensor, up: Tensor, min_cosine: float, tolerance: float, seed: int) -> tuple[Tensor, Tensor]:
-    """Return the normal of the best plane through three of the points (N, 3), and a point on it."""
+def _best(
+    points: Tensor, above: Tensor, up: Tensor, min_cosine: float, tolerance: float, seed: int
+) -> tuple[Tensor, Tensor] | None:
+    """Return the normal of the best plane through three of the points (N, 3), and a point on it; None without one."""
     generator = torch.Generator().manual_seed(seed)
     first, second, third = points[torch.randint(len(points), (TRIALS, 3), generator=generator)].unbind(1)
     normals = torch.linalg.cross(second - first, third - first)
@@ -87,13 +95,13 @@ def _best(points: Tensor, up: Tensor, min_cosine: float, tolerance: float, seed:
     counts = [torch.zeros(0, dtype=torch.int64)]
     for start in range(0, len(normals), TRIALS_AT_ONCE):
         part = slice(start, start + TRIALS_AT_ONCE)
-        heights = points @ normals[part].T - (first[part] * normals[part]).sum(-1)
+        offsets = (first[part] * normals[part]).sum(-1)
+        heights = points @ normals[part].T - offsets
         below = (heights < -tolerance).double().mean(0)
-        counts.append((heights.abs() <= tolerance).sum(0).masked_fill(below > MAX_BELOW, 0))
+        wrong = (below > MAX_BELOW) | (above @ normals[part].T < offsets).any(0)
+        counts.append((heights.abs() <= tolerance).sum(0).masked_fill(wrong, 0))
     found = torch.cat(counts)
     if not len(found) or int(found.max()) < 3:
-        raise ConfigError(
-            "no floor is found: no plane has points on it and few below; say what is up (set_up, --up) or give max_tilt"
-        )
+        return None
     best = int(found.argmax())
     return normals[best], first[best]

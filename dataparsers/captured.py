@@ -89,6 +89,7 @@ def captured_scene(
         downscale_factor=reduction,
         mask_paths=images.masks,
         points=sparse.points,
+        observations=None if sparse.observations is None else sparse.observations.of_images(chosen),
         sightings=None if sparse.sightings is None else sparse.sightings.of_images(chosen),
         unbounded=True,
         poses=flags.poses,

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfloom.base.console import say
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.tracks import DOUBTS, MAX_DEVIATION, Sightings, Tracks
+from nerfloom.data.tracks import DOUBTS, MAX_DEVIATION, Observations, Sightings, Tracks
 from nerfloom.dataparsers.posed_images import PosedImages
 
 
@@ -25,6 +25,8 @@ class SparsePoints:
     """(S, 3) the points with trusted distances, or all points if there are none; None without points."""
     sightings: Sightings | None
     """Which images see which points at a known distance; None without tracks."""
+    observations: Observations | None = None
+    """Which of the M images see which of `points`; None without tracks of these points."""
 
 
 def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, known: Tensor | None) -> SparsePoints:
@@ -40,7 +42,7 @@ def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, k
         cameras: M cameras in the scene's frame.
         known: the training images, if a method may learn from these alone; None for all images, without a report.
     """
-    points, sound, sightings, notes = None, None, None, []
+    points, sound, sightings, observations, notes = None, None, None, None, []
     if images.tracks is not None and len(images.tracks.points):
         every = images.tracks.at(placement.points(images.tracks.points).float())
         held_out = torch.zeros(len(cameras), dtype=torch.bool) if known is None else _others(known, len(cameras))
@@ -48,6 +50,7 @@ def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, k
         centers = cameras.camera_to_worlds[:, :, 3]
         sightings = tracks.sightings(centers) if bool(tracks.confirmed().any()) else None
         points, sound = every.points[chosen], every.points[chosen & (every.doubts == 0)]
+        observations = Observations(tracks.images, tracks.seen).of_points(chosen)
         lost = {"out of range": len(images.tracks.points) - len(every.points)}
         lost["known to held-out images alone"] = int((~chosen).sum())
         notes = [
@@ -57,13 +60,14 @@ def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, k
     if images.points is not None:
         points = placement.points(images.points.double()).float()
         points = sound = points[points.isfinite().all(-1)]
+        observations = None  # those are of the tracks' points
         lost = {"out of range": len(images.points) - len(points)}
         notes = [_note(len(points), len(images.points), "of a file are used", lost), *notes[1:]]
     if known is not None and notes:
         say(f"sparse points: {', '.join(notes)}")
     if points is None or not len(points):
         return SparsePoints(None, None, sightings)
-    return SparsePoints(points, points if sound is None or not len(sound) else sound, sightings)
+    return SparsePoints(points, points if sound is None or not len(sound) else sound, sightings, observations)
 
 
 def _others(known: Tensor, count: int) -> Tensor:

@@ -144,7 +144,9 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
     def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
         super().after_every_step(step, progress, finite)
         if self.scene.moving:
+            # A Gaussian that no image can show any more has no gradient, and its opacity at rest keeps it alive.
             self.columns["log_durations"].values.data.clamp_(min=math.log(self.config.min_duration))
+            self.columns["moments"].values.data.clamp_(0, 1)
 
 
 def still(gaussians: Gaussians, duration: float) -> dict[str, Tensor]:

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from nerfloom.data.tracks import DOUBTS, MAX_DEVIATION, Tracks, distance_deviations, doubts_about
+from nerfloom.data.tracks import DOUBTS, MAX_DEVIATION, Observations, Tracks, distance_deviations, doubts_about
+from tests.images import parsed
 
 SOUND = torch.zeros(1, dtype=torch.int64)
 """No doubt about the only point."""
@@ -94,6 +96,24 @@ def test_images_are_numbered_anew_in_the_order_given() -> None:
     less = tracks.without(torch.tensor([True, False, False, False, False]))
     assert less.images.tolist() == [1, 2, 2, 4]
     assert less.confirmed().tolist() == [False, False, True]
+
+
+def test_images_keep_the_points_that_they_see(tmp_path: Path) -> None:
+    """Of five images, image i sees points i and i + 1, and the last one sees none. Point 9 has no track."""
+    sees = [(image, point) for image in range(4) for point in (image, image + 1)]
+    points = torch.arange(10.0)[:, None].expand(10, 3)
+    observations = Observations(*torch.tensor(sees).unbind(-1)).of_points(torch.ones(10, dtype=torch.bool))
+    several = parsed([tmp_path / str(image) for image in range(5)], [(4, 4)] * 5)
+    scene = replace(several, points=points[[*range(5), 9]], observations=observations)
+    some = scene[torch.tensor([3, 0])]
+    assert some.points is not None
+    assert some.points[:, 0].tolist() == [0, 1, 3, 4, 9]
+    one = some[torch.tensor([0])]  # which was image 3
+    assert one.points is not None
+    assert one.points[:, 0].tolist() == [3, 4, 9]
+    assert replace(scene, observations=None)[torch.tensor([0])].points is scene.points
+    without = replace(scene, points=points[:5])[torch.tensor([4])]
+    assert without.points is None  # not an empty set, at which nothing could start
 
 
 def test_points_that_leave_the_range_of_numbers_go_with_their_sightings() -> None:

@@ -7,8 +7,11 @@ works with every method, and with exposure and white balance exactly; it cannot 
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from heapq import heappop, heappush
+from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -89,15 +92,30 @@ def matching_order(cameras: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
     Args:
         cameras: indices of the images of each block.
     """
-    sets = [set(each) for each in cameras]
-    shared = [[len(one & other) if one is not other else 0 for other in sets] for one in sets]
-    pairs, done = list[tuple[int, int]](), list[int]()
-    left = sorted(range(len(sets)), key=lambda number: (-sum(shared[number]), number))
-    while left:
-        block = left[0]
-        if found := max(((shared[b][r], -b, -r) for b in left for r in done if shared[b][r]), default=None):
-            block = -found[1]
-            pairs.append((block, -found[2]))
-        left.remove(block)
-        done.append(block)
+    shared = _shared_images(cameras)
+    pairs, done = list[tuple[int, int]](), set[int]()
+    for first in sorted(range(len(cameras)), key=lambda number: (-shared[number].total(), number)):
+        waiting = [(0, first, first)]  # a heap: the negative number of shared images, a block, and one that is done
+        while waiting:
+            _, block, reference = heappop(waiting)
+            if block in done:
+                continue
+            done.add(block)
+            if block != reference:
+                pairs.append((block, reference))
+            for other, count in shared[block].items():
+                heappush(waiting, (-count, other, block))
     return pairs
+
+
+def _shared_images(cameras: Sequence[Sequence[int]]) -> list[Counter[int]]:
+    """Return, for each block, the other blocks that share images with it, and the number of these images."""
+    owners = defaultdict[int, list[int]](list)
+    for number, images in enumerate(cameras):
+        for image in set(images):
+            owners[image].append(number)
+    shared = [Counter[int]() for _ in cameras]
+    for blocks in owners.values():  # few blocks share an image, however many there are
+        for one, other in permutations(blocks, 2):
+            shared[one][other] += 1
+    return shared

@@ -13,7 +13,7 @@ from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import PoseSource
-from nerfloom.data.tracks import Sightings
+from nerfloom.data.tracks import Observations, Sightings
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ class ParsedScene:
     """M mask files, white for pixels to train on and black for others; None for an image without mask."""
     points: Tensor | None = None
     """(K, 3) sparse points on surfaces, scene coordinates."""
+    observations: Observations | None = None
+    """Which images see which of `points`, at known distances or not; None if unknown."""
     sightings: Sightings | None = None
     """Which images see which sparse points; None if unknown."""
     unbounded: bool = False
@@ -73,8 +75,16 @@ class ParsedScene:
         return Placement.of(self.transform, self.scale)
 
     def __getitem__(self, index: Tensor) -> ParsedScene:
-        """Return the images selected by an index tensor."""
+        """Return the images selected by an index tensor.
+
+        Points that only other images see are left out. A point that no image is known to see stays.
+        """
         chosen = index.tolist()
+        points, observations = self.points, self.observations
+        if points is not None and observations is not None:
+            own = observations.of_images(index)
+            kept = own.observed(len(points)) | ~observations.observed(len(points))
+            points, observations = points[kept] if bool(kept.any()) else None, own.of_points(kept)
         return replace(
             self,
             image_paths=tuple(self.image_paths[i] for i in chosen),
@@ -83,6 +93,8 @@ class ParsedScene:
             mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
             depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
             normal_paths=None if self.normal_paths is None else tuple(self.normal_paths[i] for i in chosen),
+            points=points,
+            observations=observations,
             sightings=None if self.sightings is None else self.sightings.of_images(index),
             scene_indices=None if self.scene_indices is None else self.scene_indices[index],
             source_images=None if self.source_images is None else self.source_images[index],

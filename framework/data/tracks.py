@@ -49,6 +49,38 @@ class Sightings:
 
 
 @dataclass(frozen=True)
+class Observations:
+    """O observations: which of M images see which of K sparse points, at known distances or not."""
+
+    images: Tensor
+    """(O,) int64 image of each observation."""
+    points: Tensor
+    """(O,) int64 point of each observation."""
+
+    def of_images(self, chosen: Tensor) -> Observations:
+        """Return the observations in some images, which are renumbered.
+
+        Args:
+            chosen: (S,) int64 images.
+        """
+        kept, images = _renumbered(self.images, chosen)
+        return Observations(images, self.points[kept])
+
+    def of_points(self, chosen: Tensor) -> Observations:
+        """Return the observations of some points, which are renumbered.
+
+        Args:
+            chosen: (K,) bool, the points.
+        """
+        kept = chosen[self.points]
+        return Observations(self.images[kept], (chosen.cumsum(0) - 1)[self.points[kept]])
+
+    def observed(self, count: int) -> Tensor:
+        """Return whether an image sees each of `count` points, (count,) bool."""
+        return torch.bincount(self.points, minlength=count) > 0
+
+
+@dataclass(frozen=True)
 class Tracks:
     """K sparse points, and O sightings of them in M images."""
 

@@ -1,5 +1,7 @@
 """Colours of blocks: affine functions are found again, and change pictures and Gaussians as they say."""
 
+from random import Random
+
 import torch
 
 from nerfloom.blocks.block import IDENTITY
@@ -82,3 +84,31 @@ def test_blocks_are_matched_from_the_middle_outwards() -> None:
     assert matching_order([(0, 1, 2), (1, 2, 3), (9, 8), (3, 8)]) == [(0, 1), (3, 1), (2, 3)]
     assert matching_order([(0, 1), (2, 3)]) == []
     assert matching_order([(0, 1)]) == []
+
+
+def test_each_next_pair_shares_as_many_images_as_any_can() -> None:
+    random = Random(0)
+    blocks = [set(random.sample(range(60), 8)) for _ in range(30)] + [{100, 101}, {101, 102}]
+
+    def most(done: set[int]) -> int:
+        return max(len(blocks[one] & blocks[other]) for one in done for other in set(range(32)) - done)
+
+    pairs = matching_order([sorted(block) for block in blocks])
+    done = {pairs[0][1]}
+    for block, reference in pairs:
+        if reference not in done:
+            assert most(done) == 0
+            done.add(reference)
+        assert block not in done
+        assert len(blocks[block] & blocks[reference]) == most(done) > 0
+        done.add(block)
+    assert done == set(range(32))
+
+
+def test_thousands_of_blocks_along_a_road_are_matched_one_after_the_other() -> None:
+    """Time that grows with the cube of their number would never end."""
+    count = 5_000
+    assert matching_order([(number, number + 1) for number in range(count)]) == [
+        (0, 1),
+        *((number, number - 1) for number in range(2, count)),
+    ]

@@ -13,6 +13,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import NEAR, estimate_near
 from nerfloom.data.dataset import load_dataset
+from nerfloom.data.training_images import chosen_images
 from nerfloom.dataparsers.colmap import Colmap
 from nerfloom.dataparsers.colmap_model import read_model
 from nerfloom.dataparsers.llff import Llff
@@ -186,6 +187,18 @@ def test_tracks_give_pixels_their_distances(tmp_path: Path, capture: Capture, ca
                 assert len(place) == 1
                 checked += abs(float(known.distances[place[0]]) / distance - 1) < 1e-3
     assert checked > 0.9 * len(known)  # but where two points share a pixel
+
+
+def test_few_images_start_at_the_points_that_they_see(tmp_path: Path, capture: Capture) -> None:
+    """As the blocks of a large scene do. Without tracks nobody knows who sees what, so all points stay."""
+    write_images(tmp_path / "images", capture.names)
+    for folder, seen_by, tracks in (("a", (1, 3, 4), 3), ("b", None, 0)):
+        write_colmap(tmp_path / folder, capture, seen_by=seen_by, tracks=tracks)
+        scene = Colmap(colmap_path=folder, eval_interval=0).parse(tmp_path, "train")
+        seeing, others = (chosen_images(scene, None, images).points for images in ((0, 4), (0, 2, 9)))
+        assert seeing is not None
+        assert torch.equal(seeing, scene.points)  # type: ignore[arg-type]
+        assert (others is None) == (folder == "a")
 
 
 def test_what_held_out_images_know_is_not_learned_from(tmp_path: Path, capture: Capture) -> None:

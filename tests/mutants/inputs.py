@@ -122,6 +122,9 @@ MUTANTS = {
         Mutant("held-out-points-start", "Tracks.known_without", "A == B", "A <= B",
             "Gaussians start at points that held-out images alone know",
             "test_tracks.py::test_what_is_known_without_held_out_images"),
+        Mutant("points-of-other-blocks", "Observations.observed", "A > 0", "A >= 0",
+            "the Gaussians of a block start all over a town",
+            "test_tracks.py::test_images_keep_the_points_that_they_see"),
     ],
     "nerfloom.data.motion_bound": [
         Mutant("travel-of-the-slower", "MotionBound.of", "torch.maximum", "torch.minimum",

@@ -324,6 +324,10 @@ MUTANTS = {
             "plug_and_play/test_skipping.py::test_functions_of_time_see_the_time_of_their_ray"),
     ],
     "nerfloom.methods.moving_gaussians": [
+        Mutant("moments-without-range", "MovingGaussians.after_every_step",
+            "self.columns['moments'].values.data.clamp_(0, 1)", "pass",
+            "Gaussians that no image can show any more are kept and copied",
+            "splats/test_moving_gaussians.py::test_moments_stay_within_the_time_of_the_images"),
         Mutant("gaussians-fade-too-fast", "log_visibility", "-0.5 * A", "-A",
             "durations are no standard deviations: files of other programs that read them fade otherwise",
             "splats/test_moving_gaussians.py::test_positions_and_opacities_are_the_equations"),

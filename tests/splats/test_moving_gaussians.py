@@ -288,6 +288,14 @@ def test_durations_stay_above_the_minimum() -> None:
     assert float(short.gaussians().extras["log_durations"].exp()) == pytest.approx(0.25)
 
 
+def test_moments_stay_within_the_time_of_the_images() -> None:
+    """Before and after it no image would show a short one, which would be kept and copied all the same."""
+    model = model_of(moving(disc()[torch.zeros(3, dtype=torch.long)], [0.0, 0.0, 0.0], 0.5, 0.3))
+    model.columns["moments"].values.data += torch.tensor([[-0.7], [0.2], [0.9]])
+    model.after_every_step(0, 0.0, True)
+    torch.testing.assert_close(model.gaussians().extras["moments"], torch.tensor([0.0, 0.7, 1.0]))
+
+
 def test_a_still_scene_has_no_columns_of_motion() -> None:
     config, made = decide(MovingGaussiansConfig(**FEW), SCENE)
     model = MovingGaussians(config, SCENE)

@@ -80,7 +80,8 @@ class GroupedMLP(nn.Module):
 
 def _initial(widths: tuple[int, ...]) -> Tensor:
     """Return random parameters (P,) of a network, in the order of `layers_of`."""
-    parts, sizes = [], list(pairwise(widths))
+    parts: list[Tensor] = []
+    sizes = list(pairwise(widths))
     for layer, (inputs, outputs) in enumerate(sizes):
         weight, bias = torch.empty(outputs, inputs), torch.empty(outputs)
         gain = 3.0 if layer == len(sizes) - 1 else 6.0  # He et al. 2015: twice as much where a ReLU follows

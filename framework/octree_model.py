@@ -13,9 +13,9 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.adam.row_gradient import RowGradient
 from nerfloom.kernels.dispatch import CPP
 from nerfloom.kernels.octree.layout import OctreeLayout
-from nerfloom.kernels.octree.leaf_gradient import LeafGradient
 from nerfloom.kernels.octree.light import MAX_DEGREE, OctreeLight, depths_of, error_bound
 from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.losses.functions import mean_squared_error
@@ -60,7 +60,7 @@ class LeafTable(nn.Module):
     def __init__(self, name: str, rate: float, width: int) -> None:
         super().__init__()
         self.table = nn.Parameter(torch.zeros(0, width))
-        self.deferred = LeafGradient() if CPP.available() else None
+        self.deferred = RowGradient() if CPP.available() else None
         self.optimised = Optimised(name, rate, sparse=True)
 
 

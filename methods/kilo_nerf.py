@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from nerfloom import Dataset, Decision, Field, Method, RayModel, Renderer, Sampler, Scene
@@ -74,16 +73,19 @@ class KiloNeRFConfig(
 class ViewDependence(LossTerm):
     """Length of the parameters of the layers that know the viewing direction: KiloNeRF, section 3.
 
-    Few photographs show a point, and colours between their directions should not be made up.
+    Few photographs show a point, and colours between their directions should not be made up. Only networks with samples
+    in the step count, because the optimiser updates no others.
     """
 
     def __init__(self) -> None:
         super().__init__("view_dependence", "view_dependence_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor:
-        field = shown.model.field
+        field, samples = shown.model.field, shown.rendered.samples
         assert isinstance(field, NetworkGrid)
-        return torch.stack([parameter.norm() for parameter in field.color_head.parameters()]).sum()
+        assert samples is not None
+        assert samples.features is not None
+        return field.color_head.length(field.owners(samples.features))
 
 
 class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):

@@ -9,21 +9,23 @@ import torch
 from torch import Tensor, nn
 
 from nerfloom.base.errors import ConfigError, shown
+from nerfloom.base.optimised import Optimised
 from nerfloom.fields.base import Field
 from nerfloom.geometry.bounds import to_unit_box
 from nerfloom.geometry.points import Points
+from nerfloom.kernels.adam.row_gradient import RowGradient, table_rows
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.frequency import frequency_encoding
-from nerfloom.kernels.math import split_density
-from nerfloom.kernels.networks.grouped import grouped_mlp
-from nerfloom.kernels.networks.mlp import Activation
-from nerfloom.kernels.table_memory import require
+from nerfloom.kernels.networks.grouped import grouped_density_mlp, grouped_mlp, layers_of, parameter_count
+from nerfloom.kernels.networks.mlp import MAX_LAYERS, MAX_WIDTH, Activation
+from nerfloom.kernels.table_memory import require, table
 
 
 class GroupedMLP(nn.Module):
     """Many fully connected networks of the same shape, with ReLU between their layers.
 
-    All networks start with the same weights, as in the authors' code.
+    All networks start with the same weights, as in the authors' code. The parameters of a network are a row of a table,
+    and the optimiser updates only the networks that a step used.
 
     Args:
         count: number of networks.
@@ -34,21 +36,16 @@ class GroupedMLP(nn.Module):
         ConfigError: if a width is less than 1, or the weights need more memory than the machine has.
     """
 
+    optimised = Optimised(sparse=True)
+
     def __init__(self, count: int, *widths: int, activation: Activation = "none") -> None:
         if min(widths) < 1:
             raise ConfigError(f"each layer of a network needs 1 feature or more, not {shown(min(widths))}")
-        sizes = list(pairwise(widths))
-        require(4.0 * count * sum((inputs + 1) * outputs for inputs, outputs in sizes), "the networks of a grid")
+        require(4.0 * count * parameter_count(widths), "the networks of a grid")
         super().__init__()
-        self.count, self.activation = count, activation
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for layer, (inputs, outputs) in enumerate(sizes):
-            weight, bias = torch.empty(outputs, inputs), torch.empty(outputs)
-            gain = 3.0 if layer == len(sizes) - 1 else 6.0  # He et al. 2015: twice as much where a ReLU follows
-            nn.init.uniform_(weight, -math.sqrt(gain / inputs), math.sqrt(gain / inputs))
-            nn.init.uniform_(bias, -math.sqrt(1 / inputs), math.sqrt(1 / inputs))
-            self.weights.append(nn.Parameter(weight.repeat(count, 1, 1)))
-            self.biases.append(nn.Parameter(bias.repeat(count, 1)))
+        self.widths, self.activation = widths, activation
+        self.table = nn.Parameter(table(count, parameter_count(widths)).copy_(_initial(widths)))
+        self.deferred: RowGradient | None = RowGradient()
 
     def forward(self, owners: Tensor, *inputs: Tensor) -> Tensor:
         """Return the outputs (N, D_out) of rows.
@@ -57,7 +54,41 @@ class GroupedMLP(nn.Module):
             owners: (N,) int64 network of each row.
             inputs: parts (N, D_i) that are concatenated along their features.
         """
-        return grouped_mlp(inputs, owners, list(self.weights), list(self.biases), self.activation)
+        return grouped_mlp(inputs, owners, self.table, self.widths, self.activation, self.deferred)
+
+    def density(self, owners: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return densities (N,) and features (N, D_out) of rows, as `grouped_density_mlp` does.
+
+        The networks must have no activation function at their output.
+
+        Args:
+            owners: (N,) int64 network of each row.
+            inputs: parts (N, D_i) that are concatenated along their features.
+        """
+        return grouped_density_mlp(inputs, owners, self.table, self.widths, self.deferred)
+
+    def length(self, owners: Tensor) -> Tensor:
+        """Return the sum () of the Euclidean norms of each layer's weights and biases, over networks that have rows.
+
+        Args:
+            owners: (N,) int64 network of each row; the number of its rows does not matter.
+        """
+        used = torch.bincount(owners, minlength=len(self.table)).nonzero()[:, 0]
+        weights, biases = layers_of(table_rows(self.table, used, self.deferred), self.widths)
+        return torch.stack([values.norm() for values in (*weights, *biases)]).sum()
+
+
+def _initial(widths: tuple[int, ...]) -> Tensor:
+    """Return random parameters (P,) of a network, in the order of `layers_of`."""
+    parts: list[Tensor] = []
+    sizes = list(pairwise(widths))
+    for layer, (inputs, outputs) in enumerate(sizes):
+        weight, bias = torch.empty(outputs, inputs), torch.empty(outputs)
+        gain = 3.0 if layer == len(sizes) - 1 else 6.0  # He et al. 2015: twice as much where a ReLU follows
+        nn.init.uniform_(weight, -math.sqrt(gain / inputs), math.sqrt(gain / inputs))
+        nn.init.uniform_(bias, -math.sqrt(1 / inputs), math.sqrt(1 / inputs))
+        parts += [weight.flatten(), bias]
+    return torch.cat(parts)
 
 
 class NetworkGrid(Field):
@@ -97,6 +128,8 @@ class NetworkGrid(Field):
         count = self.cells[0] * self.cells[1] * self.cells[2]
         self.trunk = GroupedMLP(count, 3 + 6 * position_frequencies, *[width] * depth, 1 + width)
         self.color_head = GroupedMLP(count, width + 3 + 6 * direction_frequencies, width, 3, activation="sigmoid")
+        widths = *self.trunk.widths, *self.color_head.widths
+        self.runs_on_kernels = depth < MAX_LAYERS and max(widths) <= MAX_WIDTH
 
     def located(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cell (N,) int64 of each position, and its place (N, 3) in the cell, in [-1, 1].
@@ -115,14 +148,15 @@ class NetworkGrid(Field):
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         owners, places = self.located(points.positions)
         encoded = frequency_encoding(places, self.position_frequencies)
-        sigma, hidden = split_density(self.trunk(owners, encoded))
-        # Colours are those of the same networks. Their numbers are below 2^24, which float32 represents exactly.
-        return sigma.float(), torch.cat([hidden[:, 1:], owners[:, None].to(hidden)], dim=-1)
+        return self.trunk.density(owners, encoded)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
-        owners = features[:, -1].detach().long()
         encoded = frequency_encoding(directions, self.direction_frequencies)
-        return self.color_head(owners, features[:, :-1], encoded).float()
+        return self.color_head(self.owners(features), features[:, 1:], encoded).float()
+
+    def owners(self, features: Tensor) -> Tensor:
+        """Return the cell (N,) int64 of each row of features (N, F) from `density`."""
+        return features[:, 0].detach().long()
 
 
 def cells_along(box: Tensor, resolution: int) -> tuple[int, int, int]:

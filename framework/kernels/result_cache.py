@@ -243,7 +243,10 @@ class Waves:
         Returns:
             The values, each with M rows.
         """
+        columns = list(zip(*self._values, strict=True))
+        if columns and not self._follows:
+            return tuple(gather_rows(columns, order))
         if not self._tapes:
-            return tuple(take_rows(joined(column), order) for column in zip(*self._values, strict=True))
+            return tuple(take_rows(joined(column), order) for column in columns)
         with _used(_Replay(self._tapes, order)):
             return function()

@@ -12,9 +12,9 @@ from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import StepValue
 from nerfloom.base.optimised import DefersGradient, ParameterGroup, RowChange
 from nerfloom.kernels.adam.adam import all_finite, dense_adam, sparse_adam
+from nerfloom.kernels.adam.row_gradient import RowGradient
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.planes import PlanesGradient
-from nerfloom.kernels.octree.leaf_gradient import LeafGradient
 from nerfloom.kernels.table_memory import require, table
 from nerfloom.model import Model
 from nerfloom.renderable import parts
@@ -38,7 +38,7 @@ class Adam:
     def __init__(
         self,
         groups: list[dict[str, Any]],
-        deferred: Mapping[Any, TableGradient | PlanesGradient | LeafGradient],
+        deferred: Mapping[Any, TableGradient | PlanesGradient | RowGradient],
         lr: float,
         betas: tuple[float, float],
         eps: float,

@@ -18,7 +18,9 @@ def make(kind: str) -> Field:
     if kind == "nerf":
         return NeRFField()
     if kind == "networks":
-        return NetworkGrid(BOX, 2)
+        networks = NetworkGrid(BOX, 2)
+        networks.trunk.deferred = networks.color_head.deferred = None  # autograd accumulates the gradients
+        return networks
     return EncodedField(BOX, HashGrid(num_levels=4, max_resolution=64, log2_table_size=12))
 
 

@@ -9,7 +9,9 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.fields.network_grid import GroupedMLP, NetworkGrid, cells_along
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.frequency import frequency_encoding_reference
+from nerfloom.kernels.networks.grouped import layers_of
 from nerfloom.kernels.networks.mlp import mlp_reference
+from nerfloom.training.optim import Adam
 
 BOX = torch.tensor([[-1.0, -1.0, 0.0], [1.0, 0.0, 4.0]])
 
@@ -69,7 +71,8 @@ def test_it_is_what_the_network_of_the_cell_computes() -> None:
         owner = int((cell[0] * 2 + cell[1]) * 8 + cell[2])
 
         def alone(network: GroupedMLP, *inputs: torch.Tensor, owner: int = owner) -> torch.Tensor:
-            weights, biases = ([values[owner] for values in part] for part in (network.weights, network.biases))
+            layers = layers_of(network.table, network.widths)
+            weights, biases = ([values[owner] for values in part] for part in layers)
             return mlp_reference(inputs, weights, network.activation, biases)
 
         hidden = alone(field.trunk, frequency_encoding_reference(2 * (scaled - cell)[None] - 1, 3))
@@ -80,12 +83,49 @@ def test_it_is_what_the_network_of_the_cell_computes() -> None:
 
 def test_all_networks_start_the_same_and_learn_apart() -> None:
     field = grid(position_frequencies=2)
-    for weight in field.trunk.weights:
-        assert torch.equal(weight[0].expand_as(weight), weight)
-    positions = torch.tensor([[-0.9, -0.9, 0.1]])
+    networks, positions = field.trunk.table, torch.tensor([[-0.9, -0.9, 0.1]])
+    assert torch.equal(networks[0].expand_as(networks), networks)
+    optimizer = Adam(
+        [{"params": [networks], "sparse": field.trunk.optimised.sparse}],
+        {networks: field.trunk.deferred}, 0.1, (0.9, 0.99), 1e-8,
+    )  # fmt: skip
+    before = networks.detach().clone()
     field.density(Points(positions))[0].sum().backward()
-    moved = field.trunk.weights[0].grad.flatten(1).any(-1)
+    optimizer.step()
+    moved = (networks != before).any(-1)
     assert moved.nonzero()[:, 0].tolist() == [int(field.located(positions)[0])]
+    assert optimizer.entries == (1, 64)
+
+
+def test_the_length_of_networks_that_have_rows() -> None:
+    """The norms of weights and biases, layer by layer, and their gradient, which only these networks have."""
+    torch.manual_seed(0)
+    networks = GroupedMLP(5, 3, 4, 2)
+    with torch.no_grad():
+        networks.table.normal_()
+    exact = networks.table.detach().double().requires_grad_()
+    parts = exact[[1, 3]].split([12, 4, 8, 2], dim=1)
+    true = sum((part.square().sum().sqrt() for part in parts), torch.zeros((), dtype=torch.float64))
+    found = networks.length(torch.tensor([3, 1, 1, 3, 3]))
+    found.backward()
+    true.backward()
+    assert networks.deferred is not None
+    grad = networks.deferred.summed(networks.table.detach()) if networks.deferred.pending else networks.table.grad
+    torch.testing.assert_close(found, true.float())
+    torch.testing.assert_close(grad, exact.grad.float())
+
+
+def test_features_name_their_networks() -> None:
+    field, positions = grid(), torch.lerp(BOX[0], BOX[1], torch.rand(50, 3))
+    features = field.density(Points(positions))[1]
+    assert torch.equal(field.owners(features), field.located(positions)[0])
+
+
+def test_kernels_are_for_networks_up_to_their_limits() -> None:
+    assert grid().runs_on_kernels
+    assert grid(depth=7, width=8).runs_on_kernels
+    assert not grid(depth=8, width=8).runs_on_kernels
+    assert not grid(width=384, resolution=1).runs_on_kernels
 
 
 def test_all_of_space_is_in_the_contracted_grid() -> None:

@@ -17,6 +17,7 @@ from nerfloom.geometry.points import Frustums
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels import dispatch, native
 from nerfloom.kernels.adam.adam import ALL_FINITE, DENSE_ADAM, SPARSE_ADAM
+from nerfloom.kernels.adam.row_gradient import TABLE_ROWS
 from nerfloom.kernels.compositing.density import COMPOSITE, DISTORTION
 from nerfloom.kernels.dispatch import TRITON, Backend, Operation, derivatives
 from nerfloom.kernels.encodings.contraction import CONTRACT
@@ -42,6 +43,7 @@ from nerfloom.kernels.march.fixed_slots import FILL, REACH, fill
 from nerfloom.kernels.march.occupancy import REFRESH_OCCUPANCY, Occupancy
 from nerfloom.kernels.march.ray_order import SORT_BY_RAY
 from nerfloom.kernels.march.waves import MARCH, March, march
+from nerfloom.kernels.networks.grouped import GROUPED_DENSITY_NETWORK, GROUPED_NETWORK
 from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, NETWORK
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.packed import TRACE_PACKED, PackedLeaves
@@ -157,6 +159,12 @@ def everywhere(left: int, right: int) -> Tensor:
     return records
 
 
+def grouped(outputs: int) -> Arguments:
+    """Rows, the network of each, and six networks 7-8-`outputs`, of which two have no rows."""
+    owners = torch.tensor([0, 1, 3, 5])[torch.randint(4, (60,))]
+    return [rand(60, 5), rand(60, 2)], owners, rand(6, 64 + 9 * outputs) - 0.6, (7, 8, outputs)
+
+
 def adam(parameters: int) -> Arguments:
     """Values, gradients, means, squares."""
     return tuple([rand(20, 2) for _ in range(parameters)] for _ in range(4))
@@ -183,6 +191,8 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     BAND_VARIATION: lambda: (rand(LAYOUT.num_entries, 4), ((10, 4, 5), (50, 1, 5)), PlanesGradient(LAYOUT)),
     NETWORK: lambda: ([rand(9, 5), rand(9, 2)], [rand(8, 7), rand(3, 8)], "sigmoid", [rand(8), rand(3)]),
     DENSITY_NETWORK: lambda: ([rand(40, 5), rand(40, 2)], [rand(8, 7), rand(3, 8) * 9 - 5], [rand(8), rand(3)]),
+    GROUPED_NETWORK: lambda: (*grouped(3), "sigmoid", None),
+    GROUPED_DENSITY_NETWORK: lambda: (*grouped(5), None),
     FREQUENCY_ENCODING: lambda: (rand(9, 3), 4, True),
     SPHERICAL_HARMONICS: lambda: (unit(9), 4),
     DIRECTIONAL_ENCODING: lambda: (unit(9), 3 * torch.rand(9), 5),
@@ -198,6 +208,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     BLURRED_EXCESS: lambda: (edges(6, 9), rand(6, 9), edges(6, 4), rand(6, 4) / 10, 0.03),
     SPARSE_ADAM: lambda: (*(t for (t,) in adam(1)), torch.zeros(20), *RATES),
     DENSE_ADAM: lambda: (*adam(3), [torch.full((), float(step)) for step in (0, 3, 9)], *RATES),
+    TABLE_ROWS: lambda: (rand(9, 4), torch.tensor([0, 3, 5]), None),
     ALL_FINITE: lambda: ([torch.ones(2), torch.tensor([1.0, torch.inf])],),
     GATHER_ROWS: lambda: ([[rand(4, 3), rand(5, 3)], [torch.arange(4), torch.arange(5)]], torch.tensor([8, 0, 4, 3])),
     SORT_BY_RAY: lambda: (torch.randint(5, (30,)), torch.randint(2, (30,), dtype=torch.uint8), 5),

@@ -43,6 +43,12 @@ from nerfloom.kernels.histograms.intervals import (
 )
 from nerfloom.kernels.histograms.step_functions import blurred_excess, blurred_excess_reference
 from nerfloom.kernels.images.ssim import photometric_loss, photometric_reference
+from nerfloom.kernels.networks.grouped import (
+    grouped_density_mlp,
+    grouped_density_mlp_reference,
+    grouped_mlp,
+    grouped_mlp_reference,
+)
 from nerfloom.kernels.networks.mlp import density_mlp, density_mlp_reference, mlp, mlp_reference
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.trace import trace_octree, trace_octree_reference
@@ -67,6 +73,7 @@ GRID = HashGridLayout.build(3, 4, 20, 8)
 PLANES = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
 BANDS: tuple[Band, ...] = ((0, 0, 1, 3), (0, 2, 0, 7), (1, 1, 9, 1), (1, 1, 8, 2))
 OFFSETS = torch.tensor([0, 3, 3, 8, 12])
+OWNERS = torch.arange(40) % 7 % 5  # network 5 has no rows
 TREE = OctreeLayout.build(torch.zeros(3), 0.1, (1, 1, 1), torch.cartesian_prod(*[torch.arange(1, 8, 2)] * 3))[0]
 Function = Callable[..., Tensor]
 
@@ -154,6 +161,21 @@ def rays_of(name: str) -> Function:
 def network(form: Function) -> Function:
     def run(one: Tensor, two: Tensor, first: Tensor, second: Tensor, bias: Tensor, other: Tensor) -> Tensor:
         return form([one, two], [first, second], "sigmoid", [bias, other])
+
+    return run
+
+
+def grouped_network(form: Function) -> Function:
+    def run(one: Tensor, two: Tensor, table: Tensor) -> Tensor:
+        return form([one, two], OWNERS, table, (7, 8, 3), "sigmoid")
+
+    return run
+
+
+def grouped_density_network(form: Callable[..., tuple[Tensor, Tensor]]) -> Function:
+    def run(one: Tensor, two: Tensor, table: Tensor) -> Tensor:
+        density, features = form([one, two], OWNERS, table, (7, 8, 3))
+        return torch.cat([density[:, None], features], dim=-1)
 
     return run
 
@@ -309,6 +331,18 @@ OPERATIONS = {
         },
         ("mlp_forward", "mlp_backward", *BACKWARD_BF16),
     ),
+    "grouped mlp": Operation(
+        grouped_network(grouped_mlp),
+        grouped_network(grouped_mlp_reference),
+        lambda: {"one": rand(40, 5), "two": rand(40, 2), "table": rand(6, 91) - 0.6},
+        ("grouped_mlp_forward", "grouped_mlp_backward"),
+    ),
+    "grouped mlp with density": Operation(
+        grouped_density_network(grouped_density_mlp),
+        grouped_density_network(grouped_density_mlp_reference),
+        lambda: {"one": rand(40, 5), "two": rand(40, 2), "table": rand(6, 91) - 0.6},
+        ("grouped_mlp_forward", "grouped_mlp_backward"),
+    ),
     "composite": Operation(
         composited(composite),
         composited(composite_reference),
@@ -428,8 +462,8 @@ WITHOUT_A_GRADIENT = {
     "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "hash_grid_tangent_adam", "multisampled_grid_adam",
     "hash_grid_tangent_forward",  # of the optimiser; and refused where a gradient is asked for
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
-    "splat_sort", "splat_bound", "splat_bin",  # whose results are indices
-    "octree_weights", "octree_adam", "octree_trace_packed",  # documented to have none; of the optimiser; of bytes
+    "splat_sort", "splat_bound", "splat_bin", "group_rows",  # whose results are indices
+    "octree_weights", "adam_rows", "octree_trace_packed",  # documented to have none; of the optimiser; of bytes
     "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for
 }  # fmt: skip
 

@@ -15,6 +15,7 @@ from nerfloom.fields.base import MLP, Field
 from nerfloom.fields.deformed import DeformedField
 from nerfloom.fields.encoded import DensityField, EncodedField
 from nerfloom.fields.nerf import NeRFField
+from nerfloom.fields.network_grid import NetworkGrid
 from nerfloom.fields.tensor import VM, TensorField
 from nerfloom.geometry.points import Points
 from nerfloom.kernels import native, result_cache
@@ -158,6 +159,13 @@ def tensors() -> TensorField:
     return TensorField(BOX, density, appearance, 8)
 
 
+def cells() -> NetworkGrid:
+    found = NetworkGrid(BOX, 3, width=8, position_frequencies=3)
+    nn.init.normal_(found.trunk.table, std=0.3)
+    found.trunk.deferred = None  # autograd accumulates the gradient, as that of the others
+    return found
+
+
 SPACE, TIME = ((9, 9, 9), (17, 17, 17)), ((9, 9, 9, 4), (17, 17, 17, 4))
 OURS: dict[str, Callable[[], nn.Module]] = {
     "hash grid": lambda: EncodedField(BOX, grid()),
@@ -168,6 +176,7 @@ OURS: dict[str, Callable[[], nn.Module]] = {
     "explicit": lambda: ExplicitField(BOX, FeaturePlanes(SPACE, 4), 8),
     "tensors": tensors,
     "network": nerf,
+    "networks of cells": cells,
     "network of time": lambda: nerf(time_frequencies=3),
     "deformed network": lambda: moving(nerf()),
     "deformed hash grid": lambda: moving(EncodedField(BOX, grid())),
@@ -207,7 +216,7 @@ def in_waves(density: Density, order: Tensor) -> tuple[tuple[Tensor, ...], list[
     native.spent = {}
     try:
         found = waves.choose(order, lambda: density(torch.cat(positions)[order], torch.cat(times)[order]))
-        return found, seen, set(native.spent) - {"gather_rows"}
+        return found, seen, set(native.spent) - {"gather_rows", "group_rows"}  # which evaluate nothing
     finally:
         native.spent = None
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.adam.adam import sparse_adam_reference
+from nerfloom.kernels.adam.row_gradient import RowGradient
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
 from nerfloom.kernels.octree.layout import BRICK, OctreeLayout
-from nerfloom.kernels.octree.leaf_gradient import LeafGradient
 from nerfloom.kernels.octree.light import OctreeLight, error_bound
 from nerfloom.kernels.octree.packed import PackedLeaves, trace_packed, trace_packed_reference
 from nerfloom.kernels.octree.trace import trace_octree, trace_octree_reference
@@ -201,7 +201,7 @@ def test_the_deferred_gradient_is_the_gradient() -> None:
     layout = layout_of(scattered(0.2))
     rays, background = rays_at(layout, 500), torch.rand(500, 3)
     raw, coefficients = (part.requires_grad_() for part in values(layout, 1))
-    kept = LeafGradient(), LeafGradient()
+    kept = RowGradient(), RowGradient()
     trace_octree(layout, raw, coefficients, rays, background).color.square().sum().backward()
     trace_octree(layout, raw, coefficients, rays, background, deferred=kept).color.square().sum().backward()
     leaves, rows = kept[1].parts[0]
@@ -212,7 +212,7 @@ def test_the_deferred_gradient_is_the_gradient() -> None:
 
 
 @needs_kernels
-@pytest.mark.parametrize("width", [1, 3, 12, 27, 48])
+@pytest.mark.parametrize("width", [1, 3, 12, 27, 48, 5, 1000])
 def test_adam_of_rows_is_sparse_adam(width: int) -> None:
     torch.manual_seed(width)
     tables = torch.randn(3, 500, width)
@@ -223,7 +223,7 @@ def test_adam_of_rows_is_sparse_adam(width: int) -> None:
     gradient[leaves[3]] = 0  # met, and without a gradient
     truth, counts = [table.double().clone() for table in tables], seen.double()
     sparse_adam_reference(truth[0], gradient.double(), truth[1], truth[2], counts, 0.1, (0.9, 0.99), 1e-8)
-    kept = LeafGradient()
+    kept = RowGradient()
     kept.parts.append((leaves, gradient[leaves.long()]))
     kept.adam(tables[0], tables[1], tables[2], seen, 0.1, (0.9, 0.99), 1e-8)
     for found, exact in zip(tables, truth, strict=True):

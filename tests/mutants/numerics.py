@@ -38,6 +38,16 @@ MUTANTS = {
             "rays through an octree jump over leaves", "kernels/test_octree.py"
             "::test_distances_between_bricks_are_those_by_brute_force"),
     ],
+    "nerfloom.kernels.adam.row_gradient": [
+        Mutant("first-gradient-of-rows", "RowGradient.adam", "sum(self.gradients[1:], A)", "A",
+            "the length of kilo-nerf's colour layers, or their colours, teach nothing",
+            "kernels/test_grouped.py::test_adam_of_networks_is_sparse_adam"),
+    ],
+    "nerfloom.fields.network_grid": [
+        Mutant("place-from-a-corner", "NetworkGrid.located", "2 * (A - corner) - 1", "A - corner",
+            "the networks of cells see half of their cell's range",
+            "fields/test_network_grid.py::test_positions_and_their_places_in_cells"),
+    ],
     "nerfloom.cameras.poses": [
         Mutant("held-out-in-order-of-files", "held_out", "sorted(A, key=lambda index: names[index])", "list(A)",
             "which photographs are held out depends on their order in the file, so figures are not nerfstudio's",

@@ -1,4 +1,5 @@
-// Shared by both forms of the small networks: mlp.cpp in float32, mlp_bf16.cpp in bfloat16. mlp_calls.h combines them.
+// Shared by both forms of the small networks: mlp_float32.h in float32, mlp_bf16.cpp in bfloat16. mlp_calls.h combines
+// them.
 #pragma once
 
 #include "runtime/common.h"
@@ -34,8 +35,8 @@ inline void activate(float* values, int64_t count, int activation) {
 }
 
 // Adds a layer's bias to the rows of a block, `wide` long, followed by ReLU if requested.
-inline void add_bias(float* values, const float* bias, int wide, bool relu) {
-    for (int r = 0; r < BLOCK; r++)
+inline void add_bias(float* values, const float* bias, int wide, bool relu, int rows = BLOCK) {
+    for (int r = 0; r < rows; r++)
         for (int i = 0; i < wide; i += LANES) {
             Floats v = load(values + r * wide + i);
             if (bias) v += load(bias + i);
@@ -45,8 +46,8 @@ inline void add_bias(float* values, const float* bias, int wide, bool relu) {
 }
 
 // The bias's gradient: sums over a block's rows.
-inline void add_rows(const float* grad, int wide, float* sums) {
-    for (int r = 0; r < BLOCK; r++)
+inline void add_rows(const float* grad, int wide, float* sums, int rows = BLOCK) {
+    for (int r = 0; r < rows; r++)
         for (int i = 0; i < wide; i += LANES) store(sums + i, load(sums + i) + load(grad + r * wide + i));
 }
 
@@ -66,13 +67,14 @@ struct Inputs {  // the network's input, in parts side by side
     int parts;
     const float* const* part;
     const int64_t* width;
+    const int64_t* stride = nullptr;  // distance of the rows of each part; null for its width
 
     void read(float* to, int wide, const int64_t* rows, int count) const {
         std::memset(to, 0, sizeof(float) * BLOCK * wide);
         for (int r = 0; r < count; r++) {
             float* at = to + r * wide;
             for (int p = 0; p < parts; at += width[p++])
-                std::memcpy(at, part[p] + rows[r] * width[p], sizeof(float) * width[p]);
+                std::memcpy(at, part[p] + rows[r] * (stride ? stride[p] : width[p]), sizeof(float) * width[p]);
         }
     }
 };
@@ -132,17 +134,19 @@ inline void read_output_gradient(const Incoming& incoming, int wide, const int64
     }
 }
 
-// Up to BLOCK rows of [next, end) with a nonzero gradient; the input gradient of the others is set to zero.
-inline int live_rows(const Incoming& incoming, float* const* input_grads, const Inputs& input, int64_t& next,
-                     int64_t end, int64_t* rows) {
+// Up to BLOCK rows with a nonzero gradient of those at [next, end) in `order`, or of [next, end) itself if it is null;
+// the input gradient of the others is set to zero.
+inline int live_rows(const Incoming& incoming, float* const* input_grads, const Inputs& input, const int64_t* order,
+                     int64_t& next, int64_t end, int64_t* rows) {
     int size = 0;
     for (; next < end && size < BLOCK; next++) {
-        if (!incoming.is_zero_at(next)) {
-            rows[size++] = next;
+        const int64_t row = order ? order[next] : next;
+        if (!incoming.is_zero_at(row)) {
+            rows[size++] = row;
             continue;
         }
         for (int p = 0; p < input.parts; p++)
-            if (input_grads[p]) std::memset(input_grads[p] + next * input.width[p], 0, sizeof(float) * input.width[p]);
+            if (input_grads[p]) std::memset(input_grads[p] + row * input.width[p], 0, sizeof(float) * input.width[p]);
     }
     return size;
 }

@@ -1,4 +1,4 @@
-// The calls of a network, written once for both forms (mlp.cpp in float32, mlp_bf16.cpp in bfloat16).
+// The calls of a network, written once for both forms (mlp_float32.h in float32, mlp_bf16.cpp in bfloat16).
 //
 // A form has
 //   Value, the type of an activation;
@@ -127,7 +127,7 @@ void backward(const Inputs& input, int64_t count, const int64_t* widths, int lay
         typename Form::Gradient gradient;
         for (int64_t next = sums.begin(p); next < sums.end(p);) {
             int64_t rows[BLOCK];
-            const int size = live_rows(incoming, input_grads, input, next, sums.end(p), rows);
+            const int size = live_rows(incoming, input_grads, input, nullptr, next, sums.end(p), rows);
             if (size == 0) break;
             Form::read_input(net, input, rows, size, block);
             Form::run_forward(net, block);

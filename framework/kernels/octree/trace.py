@@ -10,9 +10,9 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
+from nerfloom.kernels.adam.row_gradient import RowGradient
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
-from nerfloom.kernels.octree.leaf_gradient import LeafGradient
 from nerfloom.kernels.octree.light import (
     LAYOUT,
     RAYS,
@@ -36,7 +36,7 @@ def trace_octree(
     rays: Rays,
     background: Tensor,
     stop: float = 0.0,
-    deferred: tuple[LeafGradient, LeafGradient] | None = None,
+    deferred: tuple[RowGradient, RowGradient] | None = None,
 ) -> OctreeLight:
     """Return the light of R rays through an octree, with a gradient of its leaves; the reference has all gradients.
 
@@ -57,7 +57,7 @@ def trace_octree(
 
 def trace_octree_reference(
     layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
-    deferred: tuple[LeafGradient, LeafGradient] | None = None,
+    deferred: tuple[RowGradient, RowGradient] | None = None,
 ) -> OctreeLight:  # fmt: skip
     """Compute `trace_octree` in PyTorch, on any device and for any float type.
 
@@ -76,7 +76,7 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, raw: Tensor, coefficients: Tensor, placeholder: Tensor | None, layout: OctreeLayout, rays: Rays,
-        background: Tensor, stop: float, deferred: tuple[LeafGradient, LeafGradient] | None,
+        background: Tensor, stop: float, deferred: tuple[RowGradient, RowGradient] | None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         out, addresses = outputs_of(rays)
         count, values = coefficients.shape
@@ -119,7 +119,7 @@ class _Trace(torch.autograd.Function):
 @TRACE_OCTREE.implementation(CPP, differentiable=2)
 def _compiled(
     layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
-    deferred: tuple[LeafGradient, LeafGradient] | None = None,
+    deferred: tuple[RowGradient, RowGradient] | None = None,
 ) -> OctreeLight:  # fmt: skip
     inputs = raw.contiguous(), coefficients.contiguous()
     placeholder = None

@@ -1,0 +1,101 @@
+"""The gradient of a table of which a step uses few rows, such as the leaves of an octree, or one network per row."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nerfloom.kernels import native
+from nerfloom.kernels.adam.adam import sparse_adam
+from nerfloom.kernels.adam.deferred import Parts, waiting
+from nerfloom.kernels.dispatch import CPP, Operation
+
+_adam = native.Function("adam_rows", "ppppppqifddfi")
+
+
+class RowGradient:
+    """The deferred gradient of a table: rows, from each backward pass.
+
+    It fills the place of `nerfloom.kernels.grids.hash_grid_lookup.TableGradient`.
+    """
+
+    def __init__(self) -> None:
+        self.parts: Parts = []
+        """Rows (T,) int32 of the table, each once, and their gradient (T, F), of each backward pass."""
+
+    @property
+    def pending(self) -> bool:
+        """True if there is a gradient."""
+        return bool(self.parts)
+
+    @property
+    def gradients(self) -> list[Tensor]:
+        """The collected gradients (T, F)."""
+        return [gradient for _, gradient in self.parts]
+
+    def clear(self) -> None:
+        """Discard the gradient."""
+        self.parts.clear()
+
+    def summed(self, table: Tensor) -> Tensor:
+        """Return the gradient (E, F) of `table` and discard it."""
+        total = torch.zeros_like(table)
+        for rows, gradient in self.parts:
+            total.index_add_(0, rows, gradient)
+        self.clear()
+        return total
+
+    def adam(
+        self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+        rate: float, betas: tuple[float, float], eps: float,
+    ) -> int | Tensor:  # fmt: skip
+        """Update `table` (E, F) by `kernels.adam.adam.sparse_adam` with this gradient, and discard the gradient.
+
+        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
+        """
+        rows, first = self.parts[0]
+        if not all(torch.equal(others, rows) for others, _ in self.parts[1:]):
+            return sparse_adam(table, self.summed(table), mean, square, seen, rate, betas, eps)
+        gradient = sum(self.gradients[1:], first).contiguous()
+        shape, count = (table.shape[0], table.shape[1]), len(rows)
+        _adam(
+            native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
+            native.pointer(square, "square", shape), native.pointer(seen, "seen", shape[:1]),
+            native.pointer(gradient, "the gradient", (count, shape[1])),
+            native.pointer(rows, "rows", (count,), torch.int32), count, shape[1], rate, *betas, eps,
+            native.threads(),
+        )  # fmt: skip
+        self.clear()
+        return count
+
+
+def table_rows_reference(table: Tensor, rows: Tensor, deferred: RowGradient | None = None) -> Tensor:
+    """Compute `table_rows` in PyTorch, on any device and for any float type, with the gradient of autograd.
+
+    `table`, `rows` and `deferred` are as in `table_rows`; `deferred` is not used.
+    """
+    return table.index_select(0, rows)
+
+
+def table_rows(table: Tensor, rows: Tensor, deferred: RowGradient | None = None) -> Tensor:
+    """Return rows (T, F) of a table.
+
+    Args:
+        table: (E, F) parameters.
+        rows: (T,) int64 indices of rows, each at most once.
+        deferred: collects the gradient of the table, on compiled kernels; None to return it.
+
+    Raises:
+        IndexError: if a row does not exist.
+    """
+    return TABLE_ROWS((table,), table, rows, deferred)
+
+
+TABLE_ROWS = Operation("table_rows", table_rows_reference)
+
+
+@TABLE_ROWS.implementation(CPP)
+def _deferred_rows(table: Tensor, rows: Tensor, deferred: RowGradient | None = None) -> Tensor:
+    if deferred is None:
+        return table.index_select(0, rows)
+    return table.detach().index_select(0, rows) + waiting(table, rows.int(), table.shape[1], deferred.parts)

@@ -257,7 +257,7 @@ MUTANTS = {
         Mutant("splats-blur-of-the-camera", "SplatCamera.plain", "self.blur", "0.3",
             "the camera's blur is what it is by default",
             "kernels/test_splat_cases.py::test_a_hundred_thousand_at_one_point"),
-        Mutant("splats-lens-ignored", "SplatCamera.plain", "2.0 if self.fisheye else 1.0", "0.0",
+        Mutant("splats-lens-ignored", "SplatCamera.plain", "2.0 if self.model == 'fisheye' else 1.0", "0.0",
             "the image of a camera with a lens is drawn without its distortion",
             "kernels/test_splats.py::test_images_and_gradients"),
         Mutant("splats-gradients-in-another-order", "_Project.backward", "gradient.contiguous()",

@@ -11,14 +11,15 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.geometry.lenses import Distortion, panorama
+from nerfloom.kernels.splats.packed import pack_gaussians, project_packed
 from nerfloom.kernels.splats.project import DC, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.seam import copies
 from nerfloom.splats.drawing import draw_colors, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
 from nerfloom.splats.rasteriser import RASTERISER
-from tests.kernels.compiled import relative_error
-from tests.kernels.splat_truth import LENSES, camera, leaves, real_harmonics, scene, turned
+from tests.kernels.compiled import needs_kernels, relative_error
+from tests.kernels.splat_truth import LENSES, NAMES, camera, leaves, real_harmonics, scene, turned
 
 COEFFICIENTS = {"opencv": LENSES["opencv"], "fisheye": (-0.02, 6e-3, -2e-3, 2e-4)}
 """Of each lens; the fisheye shows all directions."""
@@ -212,6 +213,56 @@ def test_gaussians_at_the_poles_stay_finite(place: list[float]) -> None:
     assert 5 < width < by.turn
     for gradient in torch.autograd.grad(records[:, SMOOTH].sum(), own):
         assert bool(gradient.isfinite().all())
+
+
+# -- compiled ------------------------------------------------------------------------------------------------------
+
+
+def all_around(model: str, count: int = 60) -> list[Tensor]:
+    """Return parameters of Gaussians in all directions, but not at the poles, and at the places of a lens."""
+    chance = torch.Generator().manual_seed(5)
+    random = torch.rand(count, 2, generator=chance) * torch.tensor([360.0, 160.0]) - torch.tensor([180.0, 80.0])
+    places = [*random.tolist(), *(place for name, place in PLACES if name == model)]
+    return [each.float() for each in gaussians([toward(*place) for place in places], harmonics=15)]
+
+
+@needs_kernels
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("model", ["pinhole", "opencv", "fisheye", "equirectangular"])
+def test_compiled_is_the_reference(model: str, antialiased: bool) -> None:
+    """Float32 is compiled, and float64 is not."""
+    by, given = view(model, blur=0.3, antialiased=antialiased), all_around(model)
+    given.append(by.pose.float() + torch.tensor([[0.0, 0, 0, 0.1], [0, 0, 0, -0.05], [0, 0, 0, 0.02]]))
+    weights = torch.randn(len(given[0]), len(SMOOTH), generator=torch.Generator().manual_seed(6))
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        own = leaves(given, dtype)
+        seen = replace(by, pose=own[6])
+        records, _ = project_gaussians(*own[:6], seen)
+        slopes = torch.autograd.grad((records[:, SMOOTH] * weights.to(dtype)).sum(), own)
+        found.append((records.detach(), slopes))
+    (ours, our_slopes), (truth, true_slopes) = found
+    shown = truth[:, Record.CUT] > 0
+    assert int(shown.sum()) > (60 if model == "equirectangular" else 1)
+    assert torch.equal(ours[:, Record.CUT] > 0, shown)
+    for column in Record:
+        assert relative_error(ours[:, column], truth[:, column]) < 1e-4, column.name
+    for name, one, other in zip(NAMES, our_slopes, true_slopes, strict=True):
+        assert relative_error(one, other) < 1e-3, name
+
+
+@needs_kernels
+@pytest.mark.parametrize("model", ["fisheye", "equirectangular"])
+def test_packed_is_as_rows(model: str) -> None:
+    """Blocks behind the camera are not skipped."""
+    rows, by = all_around(model), view(model)
+    by = replace(by, pose=by.pose.float())
+    truth, _ = project_gaussians(*rows, by)
+    found = project_packed(pack_gaussians(*rows), by)[: len(truth)]
+    shown = truth[:, Record.CUT] > 0
+    assert int(shown.sum()) > 10
+    assert torch.equal(found[:, Record.CUT] > 0, shown)
+    torch.testing.assert_close(found[shown], truth[shown], rtol=1e-4, atol=1e-4)
 
 
 # -- the seam -----------------------------------------------------------------------------------------------------

@@ -119,11 +119,7 @@ PROJECT_PACKED = Operation("project_packed", project_packed_reference)
 _project = native.Function("splat_project_packed", "ppipqiippi")
 
 
-def _by_ewa(packed: PackedGaussians, camera: SplatCamera, basis: int) -> bool:
-    return not camera.unscented
-
-
-@PROJECT_PACKED.implementation(CPP, order=0, fits=_by_ewa)
+@PROJECT_PACKED.implementation(CPP, order=0)
 def _compiled(packed: PackedGaussians, camera: SplatCamera, basis: int) -> Tensor:
     blocks, stride = len(packed.values), packed.harmonics.shape[2]
     settings = torch.tensor(camera.plain(), dtype=torch.float64)

@@ -102,14 +102,14 @@ class SplatCamera:
         return TURN * self.intrinsics[0] if self.model == "equirectangular" else None
 
     def plain(self) -> list[float]:
-        """Return the camera as 33 numbers for a kernel."""
+        """Return the camera as 34 numbers for a kernel."""
         pose = self.pose.detach().double().cpu()
-        lens = [0.0] * 12
+        lens = [3.0 if self.model == "equirectangular" else 0.0] + [0.0] * 11
         if self.lens is not None:
             lens = [2.0 if self.model == "fisheye" else 1.0, *self.lens.table.double().flatten().tolist()]
         return [
             *pose[:, :3].flatten().tolist(), *pose[:, 3].tolist(), *self.intrinsics, float(self.width),
-            float(self.height), self.near, self.blur, float(self.antialiased), *lens,
+            float(self.height), self.near, self.blur, float(self.antialiased), *lens, float(self.unscented),
         ]  # fmt: skip
 
 
@@ -352,14 +352,7 @@ def _sizes(parameters: list[Tensor], basis: int) -> tuple[int, int, int]:
     return len(parameters[0]), basis, parameters[5].shape[2]
 
 
-def _by_ewa(
-    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
-    camera: SplatCamera, basis: int,
-) -> bool:  # fmt: skip
-    return not camera.unscented
-
-
-@PROJECT.implementation(CPP, fits=_by_ewa)
+@PROJECT.implementation(CPP)
 def _compiled(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,

@@ -10,7 +10,8 @@ centre and v_k are its axes times their standard deviations, in the camera's fra
     w_i = c_i = OUTER = 1 / (2 STEP^2),   w_0 = CENTER = 1 - 3 / STEP^2,   c_0 = CENTER + 1 - ALPHA^2 + BETA
 
 No Jacobian is taken, so a Gaussian may lie beside the camera or behind it. The covariance is returned as the columns
-sqrt(c_i) (f(p_i) - mean), whose squares cannot cancel; gradients go through all seven points.
+sqrt(c_i) (f(p_i) - mean), whose squares cannot cancel; gradients go through all seven points. `unscented.h` is the
+same in C++.
 
 **What a lens does not show.** A Gaussian is left out if its centre is. For the lenses `ALL_AROUND`, a sigma point
 beyond the reach counts at the edge of the lens's disk, so that Gaussians there keep a size. For the others, a Gaussian

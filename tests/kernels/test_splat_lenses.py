@@ -363,4 +363,4 @@ def test_an_isolated_gaussian_is_what_rays_meet(model: str, place: tuple[float, 
     off = (image.double() - alpha.view(image.shape)).abs().max()
     print(f"{model} at {place}: pictures differ by {float(off):.3f}")
     assert float(image.max()) > 0.5
-    assert float(off) < 0.04
+    assert float(off) < 0.06

@@ -151,7 +151,7 @@ def test_gradients_by_finite_differences(model: str) -> None:
         return project_gaussians(*parameters[:6], replace(by, pose=parameters[6]), degree=1)[0][:, SMOOTH]
 
     assert bool((records(*own)[:, Record.OPACITY] > 0).all())
-    assert torch.autograd.gradcheck(records, own)
+    assert torch.autograd.gradcheck(records, tuple(own))
 
 
 @pytest.mark.parametrize("model", ["fisheye", "equirectangular"])

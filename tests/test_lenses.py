@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras, subpixels
-from nerfloom.geometry.lenses import LENSES, Distortion, distort, panorama, undistort, unproject
+from nerfloom.geometry.lenses import LENSES, Distortion, distort, panorama, project, undistort, unproject
 from tests.kernels.compiled import needs_kernels
 
 GOPRO = [-0.23, 0.04, 1.2e-3, -8e-4, 6e-3, 0.02, -0.01, 1e-3, 5e-4]
@@ -140,8 +140,22 @@ def test_what_is_not_seen_is_told_and_finite(model: str, lens: list[float] | Non
     columns, rows, in_front = camera.project(points, 0)
     assert columns.isfinite().all()
     assert rows.isfinite().all()
-    behind = model in ("equirectangular", "fisheye")  # at 176 degrees
-    assert in_front.tolist()[1:] == [behind, False, True]
+    behind = model in ("equirectangular", "fisheye")  # at 176 degrees; at 180 a fisheye has a circle, not a position
+    assert in_front.tolist() == [model == "equirectangular", behind, False, True]
+
+
+@pytest.mark.parametrize(("model", "lens"), ALL)
+def test_positions_of_points_have_gradients(model: str, lens: list[float] | None) -> None:
+    """Also of a point on the axis, where the angle to it has none, and beyond the reach, by finite differences."""
+    distortion = cameras(model, lens, count=1, dtype=torch.float64).distortion
+    points = torch.tensor([[0.3, -0.2, -1.5], [0, 0, -2], [-0.5, 0.4, -1]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda local: project(model, local, distortion)[:2], points)
+    x, _, seen = project(model, points, distortion)
+    assert seen.all()
+    (slope,) = torch.autograd.grad(x[1], points)
+    assert slope[1].tolist() == pytest.approx([1 if model == "orthographic" else 0.5, 0, 0], abs=1e-12)
+    edge = torch.tensor([[30.0, 20.0, -1.0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda local: project(model, local, distortion)[:2], edge)
 
 
 def lenses(count: int) -> Tensor:

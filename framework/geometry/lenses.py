@@ -97,6 +97,10 @@ class Distortion:
     def __getitem__(self, index: Tensor) -> Distortion:
         return Distortion(self.coefficients[index], self.reach[index], self.bounds[index], self.iterations)
 
+    def to(self, like: Tensor) -> Distortion:
+        """Return the distortion on the device and in the float type of `like`."""
+        return Distortion(self.coefficients.to(like), self.reach.to(like), self.bounds.to(like), self.iterations)
+
     @cached_property
     def table(self) -> Tensor:
         """(M, 11) coefficients, reach and outer bound, the input of the compiled kernel."""
@@ -261,40 +265,43 @@ def _at_depth_1(x: Tensor, y: Tensor, area: Tensor, valid: Tensor) -> LensRays:
 
 
 def project(model: str, local: Tensor, lenses: Distortion | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Project points of the camera's frame to the image plane; the inverse of `unproject`.
+    """Project points of the camera's frame to the image plane; the inverse of `unproject`. Differentiable.
 
     Args:
         model: a key of `LENSES`.
         local: (N, 3) points in the camera's frame.
-        lenses: the N lenses, one for each point, for the models in `DISTORTED`.
+        lenses: one lens, or the N lenses, one for each point, for the models in `DISTORTED`.
 
     Returns:
         x and y (N,) in normalised image coordinates, and (N,) bool, whether the camera sees the point: it lies in front
-        of the camera and within the lens's reach. x and y are finite where it does not.
+        of the camera and within the lens's reach. x and y are finite where it does not: a point beyond the reach lies
+        on its edge.
     """
     right, down, depth = local[:, 0], -local[:, 1], -local[:, 2]
-    if model == "orthographic":
-        return right, down, depth > 0
-    off_axis = torch.hypot(right, down)
-    if model == "equirectangular":
-        latitude = torch.atan2(down, torch.hypot(right, depth))
-        return torch.atan2(right, depth), latitude, local.norm(dim=-1) > 0
     visible = depth > 0
+    if model == "orthographic":
+        return right, down, visible
+    if model == "equirectangular":
+        vertical = (right == 0) & (depth == 0)
+        ahead = torch.where(vertical, 1.0, depth)  # gradients of `hypot` and `atan2` are NaN at 0
+        latitude = torch.atan2(down, torch.where(vertical, 0.0, torch.hypot(right, ahead)))
+        return torch.atan2(right, ahead), latitude, local.detach().norm(dim=-1) > 0
     if model == "fisheye":
-        scale = torch.atan2(off_axis, depth) / off_axis.clamp(min=1e-30)
-        scale = torch.where((off_axis < 1e-12) & visible, 1 / depth.clamp(min=1e-30), scale)
+        on_axis = right.abs() + down.abs() < 1e-12  # behind the camera, such a point has no position
+        off_axis = torch.hypot(torch.where(on_axis, 1.0, right), down)
+        scale = torch.atan2(off_axis, depth) / off_axis
+        scale = torch.where(on_axis, 1 / torch.where(on_axis & visible, depth, 1.0), scale)
+        visible = visible | ~on_axis
     else:
         scale = 1 / torch.where(visible, depth, 1.0)
     x, y = right * scale, down * scale
     if model == "pinhole":
         return x, y, visible
     assert lenses is not None
-    radius = torch.hypot(x, y)
-    within = radius <= lenses.reach
-    visible = within & (off_axis + depth.abs() > 0) if model == "fisheye" else within & visible
-    shrink = torch.where(within, 1.0, lenses.reach / radius)
+    within = torch.hypot(x.detach(), y.detach()) <= lenses.reach
+    shrink = torch.where(within, 1.0, lenses.reach / torch.hypot(torch.where(within, 1.0, x), y))
     u, v, _ = distort((x * shrink).to(lenses.reach), (y * shrink).to(lenses.reach), lenses.coefficients)
-    return u.to(x), v.to(x), visible
+    return u.to(x), v.to(x), within & visible
 
 
 def panorama(width: float, height: float) -> tuple[float, float, float, float]:

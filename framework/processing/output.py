@@ -96,12 +96,11 @@ def lacks_masks(flags: ColmapFlags) -> bool:
     return flags.mask_moving and b'"mask_path"' not in (flags.output_dir / FINISHED).read_bytes()
 
 
-def ready(output: Path, method: str = "gaussian-splatting") -> str:
+def ready(output: Path) -> str:
     """Return the last line of a command: the data folder and the command to train on it.
 
     Args:
         output: the data folder.
-        method: a method that can learn from its images.
     """
-    words = ("ns-train", method, "--data", str(output), "--max-seconds", "300")
+    words = ("ns-train", "gaussian-splatting", "--data", str(output), "--max-seconds", "300")
     return f"data folder: {output}; next: {shlex.join(words)}"

@@ -82,8 +82,7 @@ def write_capture(
     more = {"orientation_override": "none"} if capture.z_is_up else {}
     name = None if capture.points is None else POINTS
     write(output / FINISHED, content(frames, capture.frame, name, more))
-    # Gaussians cannot be drawn as a panorama.
-    say(ready(output, "nerfacto" if frames[0].lens.model == PANORAMA else "gaussian-splatting"))
+    say(ready(output))
 
 
 def _with_lenses(

@@ -198,7 +198,7 @@ class ProgramFlags(ViewFlags):
     """Flags of captures that another program placed."""
 
     panoramas: Literal["views", "whole"] = "views"
-    """What becomes of panoramas: perspective views for any method, or whole, for methods that cast rays."""
+    """What becomes of panoramas: perspective views, or whole, if a capture has nothing else."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import torch
@@ -11,7 +12,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import every
 from nerfloom.data.scene import Scene
-from nerfloom.geometry.lenses import LENSES, Distortion
+from nerfloom.geometry.lenses import LENSES, Distortion, undistort
 from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.rendering.outputs import NORMALS
@@ -20,8 +21,11 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
 
-DRAWN = ("pinhole", "opencv", "fisheye")
+DRAWN = ("pinhole", "opencv", "fisheye", "equirectangular")
 """Camera models that Gaussians can be drawn with."""
+EWA_ANGLE = math.radians(89)
+"""Largest angle from the optical axis for elliptical weighted averaging, which shows less than 90 degrees. Images of a
+fisheye that show more are drawn by the unscented transform, like panoramas."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 """From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
 
@@ -36,9 +40,13 @@ def splat_camera(
 ) -> SplatCamera:
     """Return a camera in the form that the rasteriser takes.
 
+    The lens decides how Gaussians are projected: by the unscented transform where EWA would leave out what an image
+    shows, which are panoramas and images of a fisheye beyond `EWA_ANGLE`.
+
     Args:
         camera: one camera.
-        near: Gaussians at a smaller depth are not drawn, scene units.
+        near: Gaussians at a smaller depth are not drawn, scene units; by the unscented transform, those at a smaller
+            distance.
         look: the settings of drawing.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
         reduced: ratio of the camera's image size to the drawn one's.
@@ -48,21 +56,22 @@ def splat_camera(
     """
     if camera.model not in DRAWN:
         raise ConfigError(
-            f"Gaussians cannot be drawn for {camera.model} cameras, only for pinhole, opencv and fisheye; "
-            "undistort the images first, or take a method that casts rays, such as nerfacto"
+            f"Gaussians cannot be drawn for {camera.model} cameras, only for {', '.join(DRAWN)}; "
+            "convert the images to these first, or take a method that casts rays, such as nerfacto"
         )
     pose = camera.camera_to_worlds[0] if pose is None else pose
     rotation = _flipped(pose.dtype, pose.device) @ pose[:, :3].T
     to_camera = torch.cat([rotation, -(rotation @ pose[:, 3])[:, None]], 1)
     fx, fy, cx, cy = (value / reduced for value in camera.intrinsics[0])
-    lens, fisheye = None, camera.model == "fisheye"
-    if fisheye or (camera.lens is not None and LENSES[camera.model]):
+    height, width = (side // reduced for side in camera.sizes[0])
+    lens, wide = None, camera.model == "equirectangular"
+    if camera.model == "fisheye" or (camera.lens is not None and LENSES[camera.model]):
         given = (0.0,) * len(LENSES[camera.model]) if camera.lens is None else tuple(camera.lens[0].tolist())
         lens = _lens(camera.model, given)
-    height, width = (side // reduced for side in camera.sizes[0])
+        wide = camera.model == "fisheye" and _widest_angle(given, (fx, fy, cx, cy), width, height) > EWA_ANGLE
     return SplatCamera(
-        to_camera, (fx, fy, cx, cy), width, height, near, look.blur, look.antialiased, lens, fisheye,
-        look.sort == "depth",
+        to_camera, (fx, fy, cx, cy), width, height, near, look.blur, look.antialiased, lens, camera.model,
+        look.sort == "depth", wide,
     )  # fmt: skip
 
 
@@ -76,6 +85,19 @@ def _flipped(dtype: torch.dtype, device: torch.device) -> Tensor:
 def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
     """Return the distortion of a lens, cached: its range of validity is found by a slow iteration."""
     return Distortion.of(model, torch.tensor([coefficients], dtype=torch.float64))
+
+
+@lru_cache(maxsize=1024)
+def _widest_angle(
+    coefficients: tuple[float, ...], intrinsics: tuple[float, float, float, float], width: int, height: int
+) -> float:
+    """Return the largest angle, radians, between a fisheye's axis and what an image shows: at a corner, or the lens's
+    reach."""
+    fx, fy, cx, cy = intrinsics
+    across = torch.tensor([-cx, width - cx, -cx, width - cx], dtype=torch.float64) / fx
+    down = torch.tensor([-cy, -cy, height - cy, height - cy], dtype=torch.float64) / fy
+    x, y, _ = undistort(across, down, _lens("fisheye", coefficients)[torch.zeros(4, dtype=torch.int64)])
+    return float(torch.hypot(x, y).max())
 
 
 @torch.no_grad()

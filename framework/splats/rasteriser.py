@@ -12,6 +12,7 @@ from nerfloom.kernels import native
 from nerfloom.kernels.splats.blend import CHANNELS, Blended, blend
 from nerfloom.kernels.splats.packed import PackedGaussians, pack_gaussians, packed_sort_keys, project_packed
 from nerfloom.kernels.splats.project import MIN_ALPHA, SplatCamera, project_gaussians, sort_keys
+from nerfloom.kernels.splats.seam import copies
 from nerfloom.kernels.splats.tiles import TileLists, tile_lists
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.gaussians import COLUMNS, MAX_DEGREE, Gaussians
@@ -98,17 +99,26 @@ class Rasteriser:
         capacity: Capacity | None = None,
         median: bool = False,
     ) -> Blended:
-        """Return an image of Gaussians: `tile`, then `blend`.
+        """Return an image of Gaussians: `tile`, then `blend`. On a panorama, Gaussians on the seam have two sides.
 
         Args:
             shown, camera, background, channels, median: as in `blend`.
             capacity: estimated capacity of the lists, which avoids a synchronisation.
         """
-        pixels = camera.width * camera.height
+        shown, pixels = _on_both_sides(shown, camera), camera.width * camera.height
         lists = self.tile(shown, camera, None if capacity is None else capacity.of(shown.records, pixels))
         if capacity is not None:
             capacity.note(shown.records, pixels, lists)
         return self.blend(shown, lists, camera, background, channels, median)
+
+
+def _on_both_sides(shown: Projected, camera: SplatCamera) -> Projected:
+    """Return Gaussians on an image, those across the seam of a panorama with their copies."""
+    if camera.turn is None:
+        return shown
+    indices, records = copies(shown.records, camera.width, camera.turn)
+    keys = None if shown.keys is None else torch.cat([shown.keys, shown.keys[indices]])
+    return Projected(torch.cat([shown.records, records]), keys)
 
 
 class PackingRasteriser(Rasteriser):

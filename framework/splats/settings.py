@@ -65,7 +65,7 @@ class SplattingConfig(
     """Variance added to every Gaussian on an image, pixels^2: 0.3 in 3DGS and gsplat, 0.1 in Mip-Splatting."""
     sort: Sort = OURS.sort
     """Sort key of Gaussians. distance: distance from the camera; turning the camera does not change it. depth: depth
-    along the camera's axis, as in 3DGS, gsplat and most viewers."""
+    along the camera's axis, as in 3DGS, gsplat and most viewers; not of panoramas and fisheyes over 178 degrees."""
     num_gaussians: Auto[int] = AUTO
     """Maximum number of Gaussians. Default: from the budget."""
     start: Literal["auto", "points", "field", "silhouettes", "random"] = "auto"

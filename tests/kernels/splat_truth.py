@@ -52,8 +52,7 @@ def camera(width: int, height: int, lens: str = "", **settings: Any) -> SplatCam
     focal = 0.5 * (width + height) + 0.5
     bent = Distortion.of(lens, torch.tensor([LENSES[lens]], dtype=torch.float64)) if lens else None
     middle = focal, 1.03 * focal, 0.49 * width, 0.51 * height
-    fisheye = lens == "fisheye"
-    return SplatCamera(torch.eye(3, 4), middle, width, height, lens=bent, fisheye=fisheye, **settings)
+    return SplatCamera(torch.eye(3, 4), middle, width, height, lens=bent, model=lens or "pinhole", **settings)
 
 
 # -- projection ---------------------------------------------------------------------------------------------------
@@ -126,6 +125,7 @@ def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projec
     """Project Gaussians, all of `view` but its pose being used. The lens's Jacobian is a constant."""
     means, log_scales, rotations, logits, colors, harmonics, pose = given
     fx, fy, cx, cy = view.intrinsics
+    fisheye = view.model == "fisheye"
     focal, middle = torch.tensor([[fx, fy], [cx, cy]], dtype=torch.float64)
     size = torch.tensor([view.width, view.height]).double()
     turn, shift = pose[:, :3], pose[:, 3]
@@ -134,17 +134,17 @@ def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projec
     shown = p[:, 2] > view.near
     if view.lens is not None:
         radius = plane.norm(dim=-1)
-        shown = shown & ((radius.atan() if view.fisheye else radius) < view.lens.reach[0])
+        shown = shown & ((radius.atan() if fisheye else radius) < view.lens.reach[0])
     distance = p.norm(dim=-1)
     indices = shown.nonzero()[:, 0]
     indices = indices[distance[indices].sort(stable=True).indices]
     p, plane, distance = p[indices], plane[indices], distance[indices]
 
     low, high = (-BOUND * size - middle) / focal, ((1 + BOUND) * size - middle) / focal
-    bounded = p if view.fisheye else torch.cat([plane.clamp(low, high) * p[:, 2:], p[:, 2:]], -1)
+    bounded = p if fisheye else torch.cat([plane.clamp(low, high) * p[:, 2:], p[:, 2:]], -1)
     jacobian = vmap(jacrev(lambda at: at[:2] / at[2]))(bounded)
     if view.lens is not None:
-        lens = bent_by_fisheye if view.fisheye else bent
+        lens = bent_by_fisheye if fisheye else bent
         jacobian = vmap(jacrev(lens))(plane).detach() @ jacobian
         plane = vmap(lens)(plane)
     jacobian = focal[:, None] * jacobian

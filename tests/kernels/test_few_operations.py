@@ -193,8 +193,9 @@ def test_lists_of_tiles_with_little_room(room: int) -> None:
     same(*([picture] for picture in pictures))
 
 
+@pytest.mark.parametrize("model", ["pinhole", "equirectangular"])
 @pytest.mark.parametrize("basis", [0, 8])
-def test_projection(basis: int) -> None:
+def test_projection(basis: int, model: str) -> None:
     """With Gaussians behind the camera, without a size, and that are not finite, and a pose that learns."""
     torch.manual_seed(5)
     means = 2 * torch.randn(60, 3).double()
@@ -204,7 +205,8 @@ def test_projection(basis: int) -> None:
     found = []
     for form in (few(PROJECT), project_reference):
         leaves = [values.clone().requires_grad_() for values in (*given, torch.eye(3, 4).double())]
-        camera = SplatCamera(leaves[-1], (60.0, 62.0, 35.0, 25.0), 70, 50, antialiased=True)
+        by: dict[str, Any] = {"antialiased": True, "model": model, "unscented": model != "pinhole"}
+        camera = SplatCamera(leaves[-1], (60.0, 62.0, 35.0, 25.0), 70, 50, **by)
         records, dropped = form(*leaves[:-1], camera, basis)
         columns = torch.cat([records[:, : Record.CUT], records[:, Record.RED : Record.NORMAL_X]], 1)
         (columns * torch.linspace(-1, 1, 10).double().cos()).square().sum().backward()

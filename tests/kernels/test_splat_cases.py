@@ -402,7 +402,7 @@ def test_what_is_refused() -> None:
 def test_beyond_a_lenss_reach_nothing_is_drawn() -> None:
     """A barrel lens of k1 = -0.3 would fold back what is farther than 1 / sqrt(0.9) from its axis."""
     lens = Distortion.of("opencv", torch.tensor([[-0.3] + [0.0] * 8]))
-    view = SplatCamera(torch.eye(3, 4), (50.0, 50.0, 40.0, 40.0), 80, 80, lens=lens)
+    view = SplatCamera(torch.eye(3, 4), (50.0, 50.0, 40.0, 40.0), 80, 80, lens=lens, model="opencv")
     across = torch.tensor([0.0, 0.5, 1.04, 1.07, 1.2, 1.8, -1.2, -0.5])
     rows = [torch.zeros(8, count) for count in (3, 3, 4, 3)]
     rows[0][:, 0], rows[0][:, 2] = across, 1.0

@@ -267,7 +267,7 @@ MUTANTS = {
         Mutant("splats-blur-of-the-camera", "SplatCamera.plain", "self.blur", "0.3",
             "the camera's blur is what it is by default",
             "kernels/test_splat_cases.py::test_a_hundred_thousand_at_one_point"),
-        Mutant("splats-lens-ignored", "SplatCamera.plain", "2.0 if self.fisheye else 1.0", "0.0",
+        Mutant("splats-lens-ignored", "SplatCamera.plain", "2.0 if self.model == 'fisheye' else 1.0", "0.0",
             "the image of a camera with a lens is drawn without its distortion",
             "kernels/test_splats.py::test_images_and_gradients"),
         Mutant("splats-gradients-in-another-order", "_Project.backward", "gradient.contiguous()",
@@ -288,6 +288,19 @@ MUTANTS = {
             "((A * camera.width - cx) / B, (C * camera.width - cx) / B)",
             "without compiled kernels Gaussians at the edge of images that are not square are blown up",
             "kernels/test_splats.py::test_the_reference_is_the_truth"),
+    ],
+    "nerfloom.kernels.splats.unscented": [
+        Mutant("longitudes-not-within-a-turn", "_within_half_a_turn", "A - TURN * torch.round(A / TURN)", "A",
+            "Gaussians on the seam of a panorama are smeared over the whole image",
+            "kernels/test_splat_lenses.py::test_turning_the_camera_turns_the_panorama"),
+        Mutant("sigma-points-too-near", "unscented", "STEP * A", "A",
+            "Gaussians of panoramas and fisheyes are too small",
+            "kernels/test_splat_lenses.py::test_mean_and_covariance_are_those_of_samples"),
+    ],
+    "nerfloom.kernels.splats.seam": [
+        Mutant("one-side-of-the-seam", "copies", "(turn, -turn)", "(turn,)",
+            "Gaussians on the seam of a panorama are cut off on one side",
+            "kernels/test_splat_lenses.py::test_turning_the_camera_turns_the_panorama"),
     ],
     "nerfloom.kernels.splats.tiles": [
         Mutant("splats-order-not-stable", "tile_lists_reference", "A.sort(stable=True).indices",

@@ -114,7 +114,7 @@ def test_panoramas_of_metashape_may_stay_whole(tmp_path: Path) -> None:
     (tmp_path / "cameras.xml").write_text(document(sensor(0, "spherical", None, (WIDTH, WIDTH // 2)), all_cameras()))
     flags = ("--xml", tmp_path / "cameras.xml", "--panoramas", "whole")
     content, said = process("metashape", tmp_path / "photographs", tmp_path / "out", *flags)
-    assert "ns-train nerfacto --data" in said
+    assert "ns-train gaussian-splatting --data" in said
 
     def expected(index: int) -> tuple[np.ndarray, np.ndarray]:
         local = in_view(index, 3.0)

@@ -42,13 +42,13 @@ def ball(logit: float = 20.0, **changes: Any) -> Gaussians:
 
 
 def test_cameras_that_cannot_be_drawn_are_refused_before_the_run_has_a_folder(tmp_path: Path) -> None:
-    """Panoramas; a method that casts rays learns from them."""
-    data = write_capture(tmp_path / "panoramas", 8, camera_model="EQUIRECTANGULAR")
+    """Images of parallel rays; a method that casts rays learns from them."""
+    data = write_capture(tmp_path / "plans", 8, camera_model="ORTHOPHOTO")
     words = ("--data", data, "--output-dir", tmp_path / "out", "--vis", "none", "--max-num-iterations", 1)
     done = called("ns-train", "gaussian-splatting", *words)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith(
-        "error: gaussian-splatting cannot draw equirectangular cameras, only pinhole, opencv, fisheye; "
+        "error: gaussian-splatting cannot draw orthographic cameras, only pinhole, opencv, fisheye, equirectangular; "
     )
     assert not (tmp_path / "out").exists()
 
@@ -90,7 +90,7 @@ def test_the_image_position_is_the_cameras() -> None:
     """A small Gaussian is brightest where the framework's cameras project its centre, with and without a lens."""
     bent = dataclasses.replace(camera("opencv"), lens=torch.tensor([[0.2, -0.1, 0.01, -0.02, 0, 0, 0, 0, 0]]))
     fisheye = dataclasses.replace(camera("fisheye"), lens=torch.tensor([[0.1, -0.05, 0.02, 0.0]]))
-    for one in (camera(), bent, camera("fisheye"), fisheye):
+    for one in (camera(), bent, camera("fisheye"), fisheye, camera("equirectangular")):
         center = torch.tensor([[0.4, -0.7, 0.3]])
         column, row, seen = one.project(center, 0)
         assert bool(seen)
@@ -102,7 +102,7 @@ def test_the_image_position_is_the_cameras() -> None:
 
 
 def test_a_camera_that_cannot_be_drawn_for_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"orthographic cameras, .*pinhole, opencv and fisheye"):
+    with pytest.raises(ConfigError, match=r"orthographic cameras, only for pinhole, opencv, fisheye, equi"):
         splat_camera(camera("orthographic"), 0.1)
 
 

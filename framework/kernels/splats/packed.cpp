@@ -45,7 +45,7 @@ struct Sides {
     float n[4][3], length[4], per_reach[4];
     int count = 0;
     explicit Sides(const Camera& c) {
-        if (c.lens) return;  // a lens bends the sides; blocks behind the camera are still found
+        if (c.lens || c.unscented) return;  // a lens bends the sides; blocks behind the camera are still found
         // x / z of a centre and half the width of what is drawn around it: fx reach sqrt(1 + (x/z)^2) / z, where x / z
         // is bounded as in the Jacobian, and the root of what the blur adds, of a CUT of at most log(255).
         const float blur = std::sqrt(2 * std::log(1 / MIN_ALPHA) * c.blur);
@@ -63,7 +63,7 @@ struct Sides {
         float p[3];
         for (int i = 0; i < 3; i++) p[i] = c.r[i][0] * ball[0] + c.r[i][1] * ball[1] + c.r[i][2] * ball[2] + c.t[i];
         const float radius = ball[3] + 1e-5f * (std::abs(p[0]) + std::abs(p[1]) + std::abs(p[2]));  // rounding
-        if (p[2] + radius < c.near) return true;
+        if (!c.all_around() && p[2] + radius < c.near) return true;
         for (int side = 0; side < count; side++) {
             const float* of = n[side];
             if (of[0] * p[0] + of[1] * p[1] + of[2] * p[2] - length[side] * radius > per_reach[side] * reach) return true;

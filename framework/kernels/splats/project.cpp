@@ -36,6 +36,28 @@ inline void put(float* table, int64_t from, int64_t count, int width, int c, Flo
     for (int i = 0; i < LANES && from + i < count; i++) table[(from + i) * width + c] = out[i];
 }
 
+// The gradients of the centre and of the axes in the camera's frame, from those of SigmaPoints::backward.
+inline void through_points(const Projected& g, Ints visible, const Floats* of_shape, Floats* of_p, Floats (*of_v)[3]) {
+    float given[6][LANES], centers[3][LANES] = {}, axes[3][3][LANES] = {};
+    int32_t shown[LANES];
+    std::memcpy(shown, &visible, sizeof shown);
+    for (int i = 0; i < 6; i++) store(given[i], of_shape[i]);
+    for (int lane = 0; lane < LANES; lane++) {
+        if (!shown[lane]) continue;
+        double of_at[3] = {}, of_axes[3][3] = {};
+        g.points[lane].backward(given[0][lane], given[1][lane], given[2][lane], given[3][lane], given[4][lane],
+                                given[5][lane], of_at, of_axes);
+        for (int i = 0; i < 3; i++) {
+            centers[i][lane] = float(of_at[i]);
+            for (int k = 0; k < 3; k++) axes[i][k][lane] = float(of_axes[i][k]);
+        }
+    }
+    for (int i = 0; i < 3; i++) {
+        of_p[i] = load(centers[i]);
+        for (int k = 0; k < 3; k++) of_v[i][k] = load(axes[i][k]);
+    }
+}
+
 }  // namespace
 
 // A record of each Gaussian, (count, RECORD). One that is not visible has a CUT of 0, and zeros elsewhere. Returns how
@@ -137,39 +159,45 @@ EXPORT int splat_project_backward(const float* means, const float* log_scales, c
                 }
                 // det = det0 + blur (|t0|^2 + |t1|^2) + blur^2, det0 = |t0 x t1|^2; through a, b and c it would cancel.
                 of_det0 += of_det;
-                Floats of_t0[3], of_t1[3];
-                for (int k = 0; k < 3; k++) {
-                    const int i = (k + 1) % 3, j = (k + 2) % 3;
-                    of_t0[k] = of_b * g.t1[k] + 2 * camera.blur * of_det * g.t0[k] +
-                               2 * of_det0 * (g.t1[i] * g.cross[j] - g.t1[j] * g.cross[i]);
-                    of_t1[k] = of_b * g.t0[k] + 2 * (of_c + camera.blur * of_det) * g.t1[k] +
-                               2 * of_det0 * (g.cross[i] * g.t0[j] - g.cross[j] * g.t0[i]);
-                }
                 give(of_logits, 1, 0, of_base * g.base * (1.0f - g.base));
 
-                // T = (rows of the Jacobian) V.
-                Floats of_u_row[3] = {}, of_v_row[3] = {}, of_v[3][3];
-                for (int i = 0; i < 3; i++)
+                Floats of_p[3], of_v[3][3];
+                if (camera.unscented) {
+                    const Floats of_shape[] = {d[X], d[Y], camera.blur * of_det, of_b, of_c + camera.blur * of_det, of_det0};
+                    through_points(g, visible, of_shape, of_p, of_v);
+                } else {
+                    Floats of_t0[3], of_t1[3];
                     for (int k = 0; k < 3; k++) {
-                        of_u_row[i] += of_t0[k] * g.v[i][k];
-                        of_v_row[i] += of_t1[k] * g.v[i][k];
-                        of_v[i][k] = g.to_u[i] * of_t0[k] + g.to_v[i] * of_t1[k];
+                        const int i = (k + 1) % 3, j = (k + 2) % 3;
+                        of_t0[k] = of_b * g.t1[k] + 2 * camera.blur * of_det * g.t0[k] +
+                                   2 * of_det0 * (g.t1[i] * g.cross[j] - g.t1[j] * g.cross[i]);
+                        of_t1[k] = of_b * g.t0[k] + 2 * (of_c + camera.blur * of_det) * g.t1[k] +
+                                   2 * of_det0 * (g.cross[i] * g.t0[j] - g.cross[j] * g.t0[i]);
                     }
-                // The Jacobian's rows, of p; the lens's own Jacobian is taken as constant.
-                const Floats depth = visible ? g.p[2] : splat(1), over = 1.0f / depth;
-                Floats of_jx[3], of_jy[3], of_p[3];
-                for (int i = 0; i < 3; i++) {
-                    of_jx[i] = camera.fx * g.bend[0] * of_u_row[i] + camera.fy * g.bend[1] * of_v_row[i];
-                    of_jy[i] = camera.fx * g.bend[1] * of_u_row[i] + camera.fy * g.bend[2] * of_v_row[i];
+                    // T = (rows of the Jacobian) V.
+                    Floats of_u_row[3] = {}, of_v_row[3] = {};
+                    for (int i = 0; i < 3; i++)
+                        for (int k = 0; k < 3; k++) {
+                            of_u_row[i] += of_t0[k] * g.v[i][k];
+                            of_v_row[i] += of_t1[k] * g.v[i][k];
+                            of_v[i][k] = g.to_u[i] * of_t0[k] + g.to_v[i] * of_t1[k];
+                        }
+                    // The Jacobian's rows, of p; the lens's own Jacobian is taken as constant.
+                    const Floats depth = visible ? g.p[2] : splat(1), over = 1.0f / depth;
+                    Floats of_jx[3], of_jy[3];
+                    for (int i = 0; i < 3; i++) {
+                        of_jx[i] = camera.fx * g.bend[0] * of_u_row[i] + camera.fy * g.bend[1] * of_v_row[i];
+                        of_jy[i] = camera.fx * g.bend[1] * of_u_row[i] + camera.fy * g.bend[2] * of_v_row[i];
+                    }
+                    const Floats of_over = of_jx[0] + of_jy[1] - g.plane_x * of_jx[2] - g.plane_y * of_jy[2];
+                    // x / z and y / z: of the Jacobian, where not bounded, and of the image position.
+                    const Floats of_x = g.inside_x * -over * of_jx[2] +
+                                        camera.fx * g.bend[0] * d[X] + camera.fy * g.bend[1] * d[Y];
+                    const Floats of_y = g.inside_y * -over * of_jy[2] +
+                                        camera.fx * g.bend[1] * d[X] + camera.fy * g.bend[2] * d[Y];
+                    of_p[0] = of_x * over, of_p[1] = of_y * over;
+                    of_p[2] = -over * (of_over * over + of_x * g.p[0] * over + of_y * g.p[1] * over);
                 }
-                const Floats of_over = of_jx[0] + of_jy[1] - g.plane_x * of_jx[2] - g.plane_y * of_jy[2];
-                // x / z and y / z: of the Jacobian, where not bounded, and of the image position.
-                const Floats of_x = g.inside_x * -over * of_jx[2] +
-                                    camera.fx * g.bend[0] * d[X] + camera.fy * g.bend[1] * d[Y];
-                const Floats of_y = g.inside_y * -over * of_jy[2] +
-                                    camera.fx * g.bend[1] * d[X] + camera.fy * g.bend[2] * d[Y];
-                of_p[0] = of_x * over, of_p[1] = of_y * over;
-                of_p[2] = -over * (of_over * over + of_x * g.p[0] * over + of_y * g.p[1] * over);
                 const Floats over_distance = 1.0f / larger(g.distance, splat(1e-20f));
                 for (int i = 0; i < 3; i++) of_p[i] += d[DISTANCE] * g.p[i] * over_distance;
 

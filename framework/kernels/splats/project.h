@@ -4,40 +4,14 @@
 #pragma once
 
 #include "encodings/harmonics.h"
-#include "images/lens.h"
-#include "splats/splat.h"
+#include "splats/camera.h"
+#include "splats/unscented.h"
 
 #include <algorithm>
 
 namespace {
 
 constexpr int MAX_BASIS = 15;
-
-struct Camera {
-    float r[3][3], t[3], fx, fy, cx, cy, width, height, near, blur;
-    bool antialiased;
-    enum Lens { NONE, OPENCV, FISHEYE } lens;
-    float center[3];                    // of the camera, scene coordinates
-    float low_x, high_x, low_y, high_y; // limits of x / z and y / z in the Jacobian
-    double coefficients[LENS_SIZE];
-
-    explicit Camera(const double* from) {
-        for (int i = 0; i < 3; i++) {
-            for (int j = 0; j < 3; j++) r[i][j] = float(from[i * 3 + j]);
-            t[i] = float(from[9 + i]);
-        }
-        fx = float(from[12]), fy = float(from[13]), cx = float(from[14]), cy = float(from[15]);
-        width = float(from[16]), height = float(from[17]), near = float(from[18]), blur = float(from[19]);
-        antialiased = from[20] != 0, lens = Lens(int(from[21]));
-        std::memcpy(coefficients, from + 22, sizeof coefficients);
-        for (int j = 0; j < 3; j++) center[j] = -(r[0][j] * t[0] + r[1][j] * t[1] + r[2][j] * t[2]);
-        const float over = 0.15f;  // of the image's size
-        low_x = (-over * width - cx) / fx, high_x = ((1 + over) * width - cx) / fx;
-        low_y = (-over * height - cy) / fy, high_y = ((1 + over) * height - cy) / fy;
-        // A fisheye's Jacobian is bounded by itself: angles do not grow as tangents do.
-        if (lens == FISHEYE) low_x = low_y = -INFINITY, high_x = high_y = INFINITY;
-    }
-};
 
 inline Floats logistic(Floats x) { return 1.0f / (1.0f + exponential(-x)); }
 
@@ -88,6 +62,7 @@ struct Projected {
     Floats bend[3];        // the lens's Jacobian: uu, uv, vv
     Floats to_u[3], to_v[3];  // rows of the Jacobian of the image position
     Floats t0[3], t1[3], cross[3];  // rows of the Jacobian times v, and their product
+    SigmaPoints points[LANES];      // in place of all from plane_x to here, if the camera is unscented
     Floats a, b, c, det0, det;
     Floats base, factor, opacity;   // the logistic, the correction for the blur, and their product
     Floats given;          // sum of all parameters but the colours': it is finite only where they are
@@ -112,7 +87,8 @@ struct Projected {
             given += q[i];
         }
         norm = square_root(squared);
-        valid = (p[2] > camera.near) & (squared > 1e-24f);
+        const Floats ahead = camera.all_around() ? square_root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) : p[2];
+        valid = (ahead > camera.near) & (squared > 1e-24f);
         const Floats scale = 1.0f / (valid ? norm : splat(1));
         for (int i = 0; i < 4; i++) q[i] *= scale;
         const Floats w = q[0], x = q[1], y = q[2], z = q[3];
@@ -123,7 +99,28 @@ struct Projected {
             for (int k = 0; k < 3; k++)
                 v[i][k] = (camera.r[i][0] * rotation[0][k] + camera.r[i][1] * rotation[1][k] +
                            camera.r[i][2] * rotation[2][k]) * s[k];
+        if (camera.unscented)
+            shape_by_points(camera);
+        else
+            shape_by_jacobian(camera);
+        const Floats logit = in.logit(from);
+        given += logit;
+        base = logistic(logit);
+        factor = camera.antialiased ? square_root(det0 / det) : splat(1);
+        opacity = base * factor;
+        distance = square_root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
+        Floats length{};
+        for (int i = 0; i < 3; i++) {
+            direction[i] = m[i] - camera.center[i];
+            length += direction[i] * direction[i];
+        }
+        to_camera = square_root(length);
+        const Floats shrink = 1.0f / larger(to_camera, splat(1e-20f));
+        for (int i = 0; i < 3; i++) direction[i] *= shrink;
+    }
 
+    // Elliptical weighted averaging.
+    void shape_by_jacobian(const Camera& camera) {
         const Floats depth = valid ? p[2] : splat(1), over = 1.0f / depth;
         const Floats image_x = p[0] * over, image_y = p[1] * over;
         plane_x = smaller(larger(image_x, splat(camera.low_x)), splat(camera.high_x));
@@ -153,20 +150,37 @@ struct Projected {
         }
         a = first + camera.blur, c = second + camera.blur;
         det = det0 + camera.blur * (first + second) + camera.blur * camera.blur;  // no difference, so nothing cancels
-        const Floats logit = in.logit(from);
-        given += logit;
-        base = logistic(logit);
-        factor = camera.antialiased ? square_root(det0 / det) : splat(1);
-        opacity = base * factor;
-        distance = square_root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
-        Floats length{};
+    }
+
+    // The unscented transform, a lane at a time.
+    void shape_by_points(const Camera& camera) {
+        float center[3][LANES], axes[3][3][LANES], out[6][LANES] = {};
+        int32_t shown[LANES];
+        std::memcpy(shown, &valid, sizeof shown);
         for (int i = 0; i < 3; i++) {
-            direction[i] = m[i] - camera.center[i];
-            length += direction[i] * direction[i];
+            store(center[i], p[i]);
+            for (int k = 0; k < 3; k++) store(axes[i][k], v[i][k]);
         }
-        to_camera = square_root(length);
-        const Floats shrink = 1.0f / larger(to_camera, splat(1e-20f));
-        for (int i = 0; i < 3; i++) direction[i] *= shrink;
+        for (int lane = 0; lane < LANES; lane++) {
+            if (!shown[lane]) continue;
+            double at[3], of[3][3];
+            for (int i = 0; i < 3; i++) {
+                at[i] = center[i][lane];
+                for (int k = 0; k < 3; k++) of[i][k] = axes[i][k][lane];
+            }
+            SigmaPoints here;
+            here.place(camera, at, of);
+            points[lane] = here;
+            shown[lane] = here.shown ? -1 : 0;
+            const double values[6] = {here.mean_x, here.mean_y, here.xx, here.xy, here.yy, here.determinant()};
+            for (int i = 0; i < 6; i++) out[i][lane] = float(values[i]);
+        }
+        std::memcpy(&valid, shown, sizeof valid);
+        u = load(out[0]), v_image = load(out[1]);
+        const Floats first = load(out[2]), second = load(out[4]);
+        b = load(out[3]), det0 = load(out[5]);
+        a = first + camera.blur, c = second + camera.blur;
+        det = det0 + camera.blur * (first + second) + camera.blur * camera.blur;
     }
 
     void bend_by_lens(const Camera& camera, Floats& x, Floats& y) {

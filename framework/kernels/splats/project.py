@@ -11,7 +11,10 @@ Gaussian of mean m, axes R and scales s is on the image
 multiplied by sqrt(det(T T^T) / det(covariance)) (Mip-Splatting, Yu et al. 2024, section 4.2).
 
 A lens bends the image: J is then of the bent position, and the lens's own Jacobian counts as constant in gradients.
-A fisheye shows points less than 90 degrees from the camera's axis.
+By EWA a fisheye shows points less than 90 degrees from the camera's axis.
+
+Cameras that show more are `unscented`: seven points of each Gaussian, which the lens projects exactly, then give its
+centre and covariance on the image (`unscented.py`). Everything else is the same.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from nerfloom.geometry.lenses import Distortion, distort
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
+from nerfloom.kernels.splats.unscented import ALL_AROUND, TURN, unscented
 from nerfloom.kernels.triton_backend import later
 
 
@@ -60,38 +64,52 @@ DEGREES = {0: 0, 1: 3, 2: 8, 3: 15}
 
 @dataclass(frozen=True)
 class SplatCamera:
-    """A pinhole camera, or one with OpenCV's lens distortion or OpenCV's fisheye lens."""
+    """A camera with a pinhole, OpenCV's lens distortion, OpenCV's fisheye lens, or an equirectangular image."""
 
     pose: Tensor
     """(3, 4) transform from the scene to the camera's frame: x right, y down, z forward. It may require a gradient."""
     intrinsics: tuple[float, float, float, float]
-    """Focal lengths and principal point fx, fy, cx, cy, pixels; the first pixel's centre lies at (0.5, 0.5)."""
+    """Focal lengths and principal point fx, fy, cx, cy, pixels; the first pixel's centre lies at (0.5, 0.5). Focal
+    lengths of an equirectangular image are in pixels per radian."""
     width: int
     """Width of the image, pixels."""
     height: int
     """Height of the image, pixels."""
     near: float = 0.01
-    """Gaussians whose centre has a smaller depth along the optical axis are not drawn, scene units."""
+    """Gaussians whose centre has a smaller depth along the optical axis are not drawn, scene units; if the camera is
+    `all_around`, those whose centre has a smaller distance."""
     blur: float = BLUR
     """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
     """Whether opacity is reduced to compensate for the blur."""
     lens: Distortion | None = None
-    """Distortion of the projection "opencv" or "fisheye"; None for a pinhole camera."""
-    fisheye: bool = False
-    """Whether `lens` bends angles from the optical axis ("fisheye") instead of their tangents ("opencv")."""
+    """Distortion of the models "opencv" and "fisheye"; None for the others."""
+    model: str = "pinhole"
+    """Projection: "pinhole", "opencv", "fisheye" or "equirectangular", keys of `nerfloom.geometry.lenses.LENSES`."""
     by_depth: bool = False
-    """Whether Gaussians are sorted by depth along the optical axis instead of distance."""
+    """Whether Gaussians are sorted by depth along the optical axis instead of distance. Not if it is `all_around`."""
+    unscented: bool = False
+    """Whether Gaussians are projected by the unscented transform instead of EWA. Required for "equirectangular"."""
+
+    @property
+    def all_around(self) -> bool:
+        """Whether points beside and behind the camera may be shown."""
+        return self.unscented and self.model in ALL_AROUND
+
+    @property
+    def turn(self) -> float | None:
+        """Width of a whole turn of a panorama, pixels, after which positions repeat; None for other images."""
+        return TURN * self.intrinsics[0] if self.model == "equirectangular" else None
 
     def plain(self) -> list[float]:
-        """Return the camera as 33 numbers for a kernel."""
+        """Return the camera as 34 numbers for a kernel."""
         pose = self.pose.detach().double().cpu()
-        lens = [0.0] * 12
+        lens = [3.0 if self.model == "equirectangular" else 0.0] + [0.0] * 11
         if self.lens is not None:
-            lens = [2.0 if self.fisheye else 1.0, *self.lens.table.double().flatten().tolist()]
+            lens = [2.0 if self.model == "fisheye" else 1.0, *self.lens.table.double().flatten().tolist()]
         return [
             *pose[:, :3].flatten().tolist(), *pose[:, 3].tolist(), *self.intrinsics, float(self.width),
-            float(self.height), self.near, self.blur, float(self.antialiased), *lens,
+            float(self.height), self.near, self.blur, float(self.antialiased), *lens, float(self.unscented),
         ]  # fmt: skip
 
 
@@ -133,7 +151,7 @@ def sort_keys(means: Tensor, camera: SplatCamera) -> Tensor | None:
         means: (N, 3) centres, scene coordinates.
         camera: the camera.
     """
-    if not camera.by_depth:
+    if not camera.by_depth or camera.all_around:
         return None
     pose = camera.pose.detach().to(means)
     return means.detach() @ pose[2, :3] + pose[2, 3]
@@ -181,10 +199,14 @@ def _in_front(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return which Gaussians (N,) can be projected and lie in front of the camera, and which can be."""
+    """Return which Gaussians (N,) can be projected and lie in front of the camera, and which can be. If the camera
+    shows all directions, those at a distance lie in front of it."""
     pose = camera.pose.to(means)
     with torch.no_grad():  # apart from the projection, since the gradient of the pose would be NaN times 0
-        depth = means @ pose[2, :3] + pose[2, 3]
+        if camera.all_around:
+            depth = (means @ pose[:, :3].T + pose[:, 3]).norm(dim=-1)
+        else:
+            depth = means @ pose[2, :3] + pose[2, 3]
     everything = torch.cat([means, log_scales, rotations, logits[:, None], colors, harmonics.flatten(1)], 1)
     finite = everything.isfinite().all(1) & (rotations.square().sum(1) > 1e-24)
     return finite & (depth > camera.near), finite
@@ -198,14 +220,20 @@ def _projected(
     pose, basis = camera.pose.to(means), harmonics.shape[2]
     at = means @ pose[:, :3].T + pose[:, 3]
     axes = rotation_matrices(rotations)
-    center_x, center_y, to_image, within = _onto_image(at, camera)
-    rows = to_image @ pose[:, :3] @ axes * log_scales.exp()[:, None]  # (K, 2, 3)
+    if camera.unscented:
+        in_camera = pose[:, :3] @ axes * log_scales.exp()[:, None]
+        center_x, center_y, rows, within = unscented(
+            at, in_camera, camera.model, camera.lens, camera.intrinsics, camera.width
+        )
+    else:
+        center_x, center_y, to_image, within = _onto_image(at, camera)
+        rows = to_image @ pose[:, :3] @ axes * log_scales.exp()[:, None]  # (K, 2, 3)
     first, second = rows.unbind(1)
     b = (first * second).sum(-1)
     spread_x, spread_y = first.square().sum(-1), second.square().sum(-1)
     blur = camera.blur
     a, c = spread_x + blur, spread_y + blur
-    det_0 = torch.linalg.cross(first, second).square().sum(-1)
+    det_0 = _squared_minors(first, second).sum(-1)
     det = det_0 + blur * (spread_x + spread_y) + blur * blur
     opacity = torch.sigmoid(logits)
     if camera.antialiased:
@@ -232,6 +260,14 @@ def _projected(
     return visible & table.isfinite().all(1), table
 
 
+def _squared_minors(first: Tensor, second: Tensor) -> Tensor:
+    """Return the squares of the minors (K, C (C - 1) / 2) of matrices with two rows (K, C), for an odd C. Their sum is
+    the determinant of the rows' products (Cauchy-Binet)."""
+    columns = first.shape[1]
+    minors = [first * second.roll(-k, 1) - first.roll(-k, 1) * second for k in range(1, columns // 2 + 1)]
+    return torch.cat(minors, 1).square()
+
+
 def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return image positions x, y (K,) of points (K, 3), Jacobians (K, 2, 3), and a mask of points that the lens
     shows."""
@@ -239,7 +275,8 @@ def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor
     x, y, over = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2], 1 / at[:, 2]
     low_x, high_x = (-MARGIN * camera.width - cx) / fx, ((1 + MARGIN) * camera.width - cx) / fx
     low_y, high_y = (-MARGIN * camera.height - cy) / fy, ((1 + MARGIN) * camera.height - cy) / fy
-    if camera.fisheye:  # its Jacobian is bounded by itself: angles do not grow as tangents do
+    fisheye = camera.model == "fisheye"
+    if fisheye:  # its Jacobian is bounded by itself: angles do not grow as tangents do
         low_x, high_x, low_y, high_y = -torch.inf, torch.inf, -torch.inf, torch.inf
     nothing = torch.zeros_like(x)
     to_plane = torch.stack(
@@ -247,7 +284,7 @@ def _onto_image(at: Tensor, camera: SplatCamera) -> tuple[Tensor, Tensor, Tensor
     ).unflatten(-1, (2, 3))
     within = torch.ones_like(x, dtype=torch.bool)
     if camera.lens is not None:
-        if camera.fisheye:
+        if fisheye:
             x, y, to_angle = _angles(x, y)
             to_plane = to_angle.detach() @ to_plane
         within = torch.hypot(x, y) < camera.lens.reach.flatten()[0].to(x)
@@ -330,7 +367,7 @@ def _is_pinhole(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
 ) -> bool:  # fmt: skip
-    return camera.lens is None
+    return camera.lens is None and not camera.unscented
 
 
 @PROJECT.implementation(FEW_OPERATIONS, types=None, order=torch.inf)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
+from nerfloom.geometry.regions import Box
 
 MAX_COORDINATE = 1e6
 """Maximum coordinate of a camera, scene units."""
@@ -41,8 +42,8 @@ class Pose:
 class Crop:
     """Visible part of space."""
 
-    corners: tuple[tuple[float, float, float], tuple[float, float, float]]
-    """Minimum and maximum corner of a box, scene units."""
+    box: Box
+    """The box, in the frame of the scene."""
     near: float = 0.0
     """Nothing nearer to the camera is shown, scene units."""
     far: float = math.inf

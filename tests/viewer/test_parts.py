@@ -22,6 +22,7 @@ from nerfloom.cameras.view import View
 from nerfloom.cli import train as train_command
 from nerfloom.cli import viewer as viewer_command
 from nerfloom.data.scene import Scene
+from nerfloom.geometry.regions import Box
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.renderable import Renderable
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -48,7 +49,7 @@ ABOVE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0)
 def test_cropped_rays() -> None:
     camera = Request(Pose(ABOVE, 1.2), 9, 9).camera()
     whole = camera.pixel_rays(torch.arange(81), 0.5, 10.0)
-    crop = Crop(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    crop = Crop(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
     rays = CroppedCameras.of(camera, crop).pixel_rays(torch.arange(81), 0.5, 10.0)
     torch.testing.assert_close(rays.directions, whole.directions)
     assert float(rays.nears[40]) == pytest.approx(3)  # the middle pixel looks along the axis
@@ -79,11 +80,11 @@ def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
         found: list[int] = picture_within(model, view, crop, white).rgb[16, 16].round().int().tolist()
         return found
 
-    assert middle(Crop(((-3.0, -3.0, -3.0), corner))) == [1, 0, 0]
-    assert middle(Crop(((-3.0, -3.0, -3.0), (3.0, 3.0, 1.0)))) == [0, 1, 0]
-    assert middle(Crop(((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
-    assert middle(Crop(((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
-    assert middle(Crop(((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), corner))) == [1, 0, 0]
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), (3.0, 3.0, 1.0)))) == [0, 1, 0]
+    assert middle(Crop(Box((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
 
 
 class Slow(Speed):

@@ -1,6 +1,7 @@
 """What the viewer shows beside pictures: crops, errors against photographs, cells, curves, newer checkpoints."""
 
 import dataclasses
+import itertools
 import json
 import math
 import time
@@ -32,6 +33,7 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.crop import CroppedCameras, picture_within
+from nerfloom.viewer.crop_panel import FACES, edges, middle, outward
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
@@ -63,6 +65,23 @@ def test_cropped_rays() -> None:
         torch.tensor([40]), 0.5, 10.0
     )
     assert (float(between.nears), float(between.fars)) == pytest.approx((3.5, 4.5))
+
+
+def test_the_edges_and_the_arrows_of_the_box() -> None:
+    """Twelve edges between its corners; at each face an arrow at its centre, which points away from the box."""
+    box = Box((-1.0, 2.0, 3.0), (1.0, 5.0, 4.0))
+    found = edges(box).astype(float)
+    lengths = np.linalg.norm(found[:, 1] - found[:, 0], axis=1)
+    assert sorted(lengths.tolist()) == [1] * 4 + [2] * 4 + [3] * 4
+    corners = {tuple(corner) for corner in found.reshape(-1, 3).tolist()}
+    assert corners == set(itertools.product((-1, 1), (2, 5), (3, 4)))
+    for axis, side in FACES:
+        place = np.array(middle(box, (axis, side)))
+        assert place[axis] == (box.low, box.high)[side][axis]
+        assert np.delete(place - [0, 3.5, 3.5], axis).tolist() == [0, 0]
+        w, *vector = outward((axis, side))
+        turn = 2 * np.outer(vector, vector) + (2 * w * w - 1) * np.eye(3)  # of quaternions whose w is 0 or 1
+        assert (turn @ np.eye(3)[axis]).tolist() == ((2 * side - 1) * np.eye(3)[axis]).tolist()
 
 
 def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:

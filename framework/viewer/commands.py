@@ -45,7 +45,7 @@ class Commands:
             )
         assert process.stderr is not None
         with process.stderr:
-            for line in map(str.strip, process.stderr):
+            for line in filter(None, map(str.strip, process.stderr)):
                 found = PERCENT.search(line)
                 if found is None:
                     say(line)

@@ -68,26 +68,20 @@ class Page:
             viewpoint = Viewpoint(client, self._up)
         queue.add(number, Browser(show))
         queue.ask(number, panel.request)
-        parts: list[Any] = []
-        self._panels[number] = parts
         keys = [Key("L", "Level the horizon", viewpoint.level), Key("O", "Next output", panel.next_output)]
+        self._panels[number] = []
         if panel.crop is not None:
-            keys += self._add_tabs(client, tabs, panel, panel.crop, viewpoint, parts)
+            self._panels[number], others = self._add_tabs(client, tabs, panel, panel.crop, viewpoint)
+            keys += others
         add_keys(client, keys)
         if number not in self._server.get_clients():  # the browser left before it was set up
             self._farewell(client)
 
     def _add_tabs(
-        self,
-        client: viser.ClientHandle,
-        tabs: Any,
-        panel: Panel,
-        crop: CropPanel,
-        viewpoint: Viewpoint,
-        parts: list[Any],
-    ) -> list[Key]:
-        """Add the tabs of a scene with lengths, and return their keys; `parts` receives what is to be closed."""
-        queue, keys = self._queue, [Key("C", "Crop on or off", crop.toggle)]
+        self, client: viser.ClientHandle, tabs: Any, panel: Panel, crop: CropPanel, viewpoint: Viewpoint
+    ) -> tuple[list[Any], list[Key]]:
+        """Add the tabs of a scene with lengths, and return the parts to close when the browser leaves, and keys."""
+        queue, parts, keys = self._queue, list[Any](), [Key("C", "Crop on or off", crop.toggle)]
         if queue.loaded.source is not None:
             with tabs.add_tab("Photographs"):
                 cameras = CameraPanel(client, self._photographs, viewpoint.move)
@@ -103,7 +97,7 @@ class Page:
         if self._commands is not None:
             with tabs.add_tab("Export"):
                 ExportPanel(client, lambda: queue.loaded, panel.request, crop, self._commands)
-        return keys
+        return parts, keys
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         self._queue.remove(client.client_id)

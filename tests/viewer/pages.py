@@ -89,7 +89,9 @@ def choose(tab: Tab, label: str, option: str) -> None:
     script = f"""(() => {{
       const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
       const row = found[0].parentElement.parentElement;
-      const box = (document.getElementById(found[0].htmlFor) || row.querySelector("input")).getBoundingClientRect();
+      const list = document.getElementById(found[0].htmlFor) || row.querySelector("input");
+      list.scrollIntoView({{block: "nearest"}});
+      const box = list.getBoundingClientRect();
       return [box.x + box.width / 2, box.y + box.height / 2];
     }})()"""
     tab.click(*tab.evaluate(script))
@@ -121,7 +123,7 @@ def type_number(tab: Tab, label: str, text: str) -> None:
     script = f"""(() => {{
       let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
       while (!row.querySelector("[role=slider]")) row = row.parentElement;
-      const field = row.querySelector(".mantine-NumberInput-input");
+      const field = row.querySelector("input:not([type=hidden])");
       field.scrollIntoView({{block: "center"}});
       field.focus();
       field.select();

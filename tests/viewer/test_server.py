@@ -34,6 +34,10 @@ from tests.patience import until
 from tests.viewer.client import LOOK, Client
 
 
+FROM_THE_SIDE: dict[str, Any] = {"position": (0.0, -4.0, 0.0), "wxyz": (0.5**0.5, -(0.5**0.5), 0.0, 0.0)}
+"""A camera that looks along y, with z up in its picture."""
+
+
 class Served:
     """A viewer of a tiny trained model, whose pictures are drawn in a thread of their own."""
 
@@ -170,7 +174,7 @@ def test_an_arrow_moves_a_face_of_the_box_and_the_file_is_the_region(
     """The box that arrows have made cuts the picture as the same numbers do, and its file is a region of exports."""
     client, typed = connected(), connected()
     for one in (client, typed):
-        one.look(position=(0.0, -4.0, 0.0), wxyz=(0.5**0.5, -(0.5**0.5), 0.0, 0.0))  # from the side: z is up
+        one.look(**FROM_THE_SIDE)
         whole = one.finished()
         one.set("Crop", True)
     low, high = served.model.scene.box.double().tolist()
@@ -199,7 +203,7 @@ def test_an_arrow_moves_a_face_of_the_box_and_the_file_is_the_region(
 @pytest.mark.medium
 def test_the_camera_is_levelled_and_its_field_of_view_set(served: Served, connected: Callable[..., Client]) -> None:
     client = connected()
-    client.look(up_direction=(0.3, -0.9, 0.1))
+    client.look(**FROM_THE_SIDE, up_direction=(0.3, 0.1, 0.9))
     client.finished()
     client.set("Level", True)
     assert client.message("SetCameraUpDirectionMessage", initial=False)["position"] == pytest.approx([0, 0, 1])

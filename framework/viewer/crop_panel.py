@@ -104,7 +104,7 @@ class CropPanel:
         """Draw the edges and the arrows, if the box is shown."""
         scene, box = self._client.scene, self._box()
         scene.remove_by_name(ROOM)
-        self._arrows = {}
+        self._arrows, self._dragged = {}, None
         if box is None or not (self._cropping.value is True and self._boxed.value is True):
             return
         scene.add_frame(ROOM, show_axes=False)
@@ -131,7 +131,7 @@ class CropPanel:
     def _place(self) -> None:
         """Move the edges and the arrows to the box; the arrow that is dragged is where the pointer is."""
         box = self._box()
-        if box is None:
+        if box is None or not self._arrows:
             return
         self._edges.points = edges(box)
         for face, arrow in self._arrows.items():

@@ -33,7 +33,6 @@ from nerfloom.viewer.server import close_server, open_server
 from tests.patience import until
 from tests.viewer.client import LOOK, Client
 
-
 FROM_THE_SIDE: dict[str, Any] = {"position": (0.0, -4.0, 0.0), "wxyz": (0.5**0.5, -(0.5**0.5), 0.0, 0.0)}
 """A camera that looks along y, with z up in its picture."""
 

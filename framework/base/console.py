@@ -1,10 +1,12 @@
 """Output on the terminal: messages on standard error, and the progress of long operations.
 
-Progress is a bar on a terminal. Elsewhere, for example in a file, it is a line every ten seconds.
+Progress is a bar on a terminal. Elsewhere, for example in a file, it is a line every ten seconds, or every second if
+NERFLOOM_PROGRESS is "often".
 """
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +19,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 from nerfloom.base.errors import printable
 from nerfloom.base.meter import Meter
 
-SECONDS_BETWEEN_LINES = 10.0
+PROGRESS, OFTEN = "NERFLOOM_PROGRESS", "often"
+"""Environment variable of the lines of progress, and its value for programs that show them."""
+SECONDS_BETWEEN_LINES = 1.0 if os.environ.get(PROGRESS) == OFTEN else 10.0
 """Seconds between lines of progress without a terminal."""
 
 T = TypeVar("T")

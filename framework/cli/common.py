@@ -52,20 +52,21 @@ def chosen_kind(
     return name, kinds[name], arguments[1:]
 
 
-def with_run(arguments: list[str], several: Collection[str] = ()) -> list[str]:
+def with_run(arguments: list[str], several: Collection[str] = (), flag: str = "--load-config") -> list[str]:
     """Insert --load-config before a run's path that lacks it: `ns-eval RUN` becomes `ns-eval --load-config RUN`.
 
     Args:
         arguments: arguments of the command; each flag has one value, as the next argument or after a "=".
         several: flags that take several words; a path ends them.
+        flag: the flag that is inserted.
     """
-    if any(word.partition("=")[0] == "--load-config" for word in arguments):
+    if any(word.partition("=")[0] == flag for word in arguments):
         return arguments
     index = 0
     while index < len(arguments):
         word = arguments[index]
         if not word.startswith("-"):
-            return [*arguments[:index], "--load-config", *arguments[index:]]
+            return [*arguments[:index], flag, *arguments[index:]]
         index += 1 if "=" in word or word in HELP else 2
         while word.replace("_", "-") in several and index < len(arguments) and _is_word(arguments[index]):
             index += 1

@@ -1,8 +1,9 @@
-"""The command `ns-viewer`: a trained run, a file of Gaussians or an octree in a browser."""
+"""The command `ns-viewer`: a trained run, a file of Gaussians or an octree in a browser, alone or beside another."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.extras import install_command
@@ -16,6 +17,8 @@ from nerfloom.cli.run_flags import OPENS, RunFlags
 class ViewerFlags(RunFlags):
     """View a run, a file of Gaussians or an octree in a browser. New checkpoints are shown at once; Ctrl-C ends it."""
 
+    beside: Path | None = None
+    """A second run or file of the same data, shown right of a divider. The flag's name may be omitted."""
     websocket_host: str = ViewerConfig.websocket_host
     """Interface to listen on; 0.0.0.0: all, so that other machines can connect. There is no password."""
     websocket_port: int = ViewerConfig.websocket_port
@@ -29,15 +32,18 @@ def main() -> None:
 
 def _command(arguments: list[str]) -> None:
     words, named = with_format("ns-viewer", with_run([_without_prefix(word) for word in arguments]))
-    flags = read_flags(ViewerFlags, "ns-viewer", words, takes=OPENS)
+    words = with_run(words, flag="--beside")
+    flags = read_flags(ViewerFlags, "ns-viewer", words, takes=f"{OPENS} [{OPENS}]")
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
-    found = flags.check()
+    other = None if flags.beside is None else replace(flags, load_config=flags.beside, load_checkpoint=None)
+    found, second = flags.check(), None if other is None else other.check()
     from nerfloom.viewer.trained_viewer import view_loaded
 
     loaded = flags.load(found, named)
     follow = flags.load_checkpoint is None and loaded.is_run
-    view_loaded(loaded, flags.websocket_host, flags.websocket_port, follow)
+    beside = None if other is None or second is None else other.load(second, named)
+    view_loaded(loaded, flags.websocket_host, flags.websocket_port, follow, beside)
 
 
 def _without_prefix(word: str) -> str:

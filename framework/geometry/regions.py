@@ -4,49 +4,83 @@ A file of a region is YAML or JSON with a box or a sphere, in the frame and unit
 
     box: {low: [-1, -1, 0], high: [1, 1, 2]}
 
+    box: {low: [-1, -1, 0], high: [1, 1, 2], axes: [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]}
+
     sphere: {center: [0, 0, 1], radius: 2.5}
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TypeAlias
 
 import torch
+import yaml
 from torch import Tensor
 
 from nerfloom.base.arguments import arguments_of
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.plain import read_yaml
+from nerfloom.base.plain import read_yaml, to_plain
 
 Vector: TypeAlias = tuple[float, float, float]
 """Three coordinates."""
+AXES: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+"""The axes of the frame."""
+AXES_TOLERANCE = 1e-4
+"""Largest error of the scalar products of a box's axes."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box parallel to the axes.
+    """A box, parallel to the axes of the frame or to axes of its own.
 
     Raises:
-        ConfigError: if it has no volume.
+        ConfigError: if it has no volume, or its axes are no unit vectors at right angles.
     """
 
     low: Vector
-    """Minimum corner."""
+    """Minimum corner: coordinates along `axes`."""
     high: Vector
-    """Maximum corner."""
+    """Maximum corner: coordinates along `axes`."""
+    axes: tuple[Vector, Vector, Vector] = AXES
+    """Unit vectors along its edges."""
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise ConfigError(
                 f"the box from {self.low} to {self.high} is empty: each of low must be below that of high"
             )
+        for row, first in enumerate(self.axes):
+            for column, second in enumerate(self.axes):
+                product = sum(a * b for a, b in zip(first, second, strict=True))
+                if not abs(product - (row == column)) <= AXES_TOLERANCE:
+                    raise ConfigError(f"the box's axes {self.axes} must be three unit vectors at right angles")
+
+    def along(self, points: Tensor) -> Tensor:
+        """Return the coordinates (N, 3) of `points` (N, 3), or of directions, along the axes of the box."""
+        return (points[:, None, :] * points.new_tensor(self.axes)).sum(-1)  # no matmul: those may round (TF32)
 
     def contains(self, points: Tensor) -> Tensor:
         """Return whether `points` (N, 3) are in the box, (N,) bool; its faces belong to it."""
-        return ((points >= points.new_tensor(self.low)) & (points <= points.new_tensor(self.high))).all(-1)
+        found = self.along(points)
+        return ((found >= points.new_tensor(self.low)) & (found <= points.new_tensor(self.high))).all(-1)
+
+    def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Box:
+        """Return the box after a similarity transform x -> scale * rotation @ x + shift.
+
+        Args:
+            rotation: (3, 3) rotation, float64, on the CPU.
+            scale: factor of lengths.
+            shift: (3,) shift, float64, on the CPU.
+        """
+        axes = torch.tensor(self.axes, dtype=torch.float64) @ rotation.T
+        shifts = axes @ shift
+        low, high = (scale * torch.tensor(corner, dtype=torch.float64) + shifts for corner in (self.low, self.high))
+        first, second, third = map(_vector, axes)
+        return Box(_vector(low), _vector(high), (first, second, third))
 
 
 @dataclass(frozen=True)
@@ -93,6 +127,28 @@ def read_region(file: Path) -> Region:
         )
     ((name, values),) = content.items()
     return KINDS[name](**arguments_of(KINDS[name], values, f"{file}: {name}"))
+
+
+def write_region(file: Path, region: Region) -> None:
+    """Write a region that `read_region` reads as the same one.
+
+    Args:
+        file: path of the YAML file.
+        region: a box or a sphere.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    (name,) = [name for name, kind in KINDS.items() if kind is type(region)]
+    values = {each.name: (getattr(region, each.name), each.default) for each in fields(region)}
+    content = {name: {key: to_plain(value) for key, (value, default) in values.items() if value != default}}
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+    write_atomically(file, lambda stream: stream.write(text.encode()))
+
+
+def _vector(values: Tensor) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def inside_all(points: Tensor, regions: Sequence[Region]) -> Tensor:

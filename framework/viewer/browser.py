@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nerfloom.evaluation.outputs import Arrays, distance_range
+from nerfloom.viewer.beside import with_divider
 from nerfloom.viewer.canvas import enlarged, paste
 from nerfloom.viewer.drawing import colored, number_kept
 from nerfloom.viewer.pace import Piece, Rays, Speed, Waiting, refinement
@@ -75,7 +76,7 @@ class Browser:
         self.drawn, self.stride, self.step, self.pieces = request, stride, step, left
         self._canvas = dict(kept)
         self._range = None if (name := number_kept(kept)) is None else distance_range([kept], name)
-        self.show(colored(kept, self._range), ROUGH_QUALITY if left else FINE_QUALITY)
+        self._show(ROUGH_QUALITY if left else FINE_QUALITY)
 
     def renew(self, speed: Speed, rays: Rays, step: int, seconds: float) -> None:
         """Start to redraw the finished picture for a changed model.
@@ -108,4 +109,11 @@ class Browser:
         paste(self._canvas, kept, piece)
         if not self.pieces and (name := number_kept(self._canvas)) is not None:
             self._range = distance_range([self._canvas], name)
-        self.show(colored(self._canvas, self._range), ROUGH_QUALITY if self.pieces else FINE_QUALITY)
+        self._show(ROUGH_QUALITY if self.pieces else FINE_QUALITY)
+
+    def _show(self, quality: int) -> None:
+        """Send the picture as it is now. While the camera moves its pixels are coarse, and it has no divider."""
+        assert self.drawn is not None
+        picture = colored(self._canvas, self._range)
+        is_whole = picture.shape[1] == self.drawn.width
+        self.show(with_divider(picture, self.drawn.divider if is_whole else None), quality)

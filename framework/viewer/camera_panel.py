@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -24,10 +25,13 @@ class CameraPanel:
     Args:
         client: the browser.
         photographs: the training images.
+        move: function of a pose (3, 4) and a field of view that moves the browser's camera.
     """
 
-    def __init__(self, client: viser.ClientHandle, photographs: Photographs) -> None:
-        self._client, self._photographs = client, photographs
+    def __init__(
+        self, client: viser.ClientHandle, photographs: Photographs, move: Callable[[Tensor, float], None]
+    ) -> None:
+        self._client, self._photographs, self._move = client, photographs, move
         self._generation = 0
         self._shown = client.gui.add_checkbox(
             "Show cameras", False, hint="Cameras of the training images; click on one to go there."
@@ -86,24 +90,18 @@ class CameraPanel:
             return
         self.visit(int(number_in(self._number.value, 0, len(cameras) - 1, 0)))
 
+    def step(self, count: int) -> None:
+        """Move the browser's camera to the photograph `count` after the last one."""
+        cameras = self._photographs.cameras
+        if cameras is not None:
+            last = int(number_in(self._number.value, 0, len(cameras) - 1, 0))
+            self.visit((last + count) % len(cameras))
+
     def visit(self, index: int) -> None:
         """Move the browser's camera to the photograph `index`."""
-        move_camera(self._client, self._photographs.pose(index), self._photographs.fov(index))
+        self._number.value = index
+        self._move(self._photographs.pose(index), self._photographs.fov(index))
         self._note.content = f"photograph {index}: {plain(self._photographs.name(index))}"
-
-
-def move_camera(client: Any, pose: Tensor, fov: float) -> None:
-    """Move a browser's camera.
-
-    Args:
-        client: the browser.
-        pose: (3, 4) camera-to-scene, OpenGL axes.
-        fov: vertical field of view, radians.
-    """
-    with client.atomic():
-        client.camera.position = tuple(pose[:, 3].tolist())
-        client.camera.wxyz = quaternion_of(pose.detach().cpu())  # keeps the orbit axis as close as possible
-        client.camera.fov = float(fov)
 
 
 def plain(text: str) -> str:

@@ -47,7 +47,8 @@ def cropped(rays: Rays, crop: Crop) -> Rays:
         rays: R rays.
         crop: the box and the distances.
     """
-    enter, leave = intersect_box(rays.origins, rays.directions, rays.origins.new_tensor(crop.corners))
+    box, corners = crop.box, rays.origins.new_tensor([crop.box.low, crop.box.high])
+    enter, leave = intersect_box(box.along(rays.origins), box.along(rays.directions), corners)
     missed = leave <= enter
     nears = torch.maximum(rays.nears, enter).clamp(min=crop.near)
     fars = torch.minimum(rays.fars, leave).clamp(max=crop.far)
@@ -118,6 +119,5 @@ def within(points: Tensor, camera: Cameras, crop: Crop) -> Tensor:
         camera: one camera; the crop's distances are measured from it.
         crop: the box and the distances.
     """
-    low, high = points.new_tensor(crop.corners)
     distances = (points - camera.camera_to_worlds[0, :, 3]).norm(dim=-1)
-    return ((points >= low) & (points <= high)).all(-1) & (distances >= crop.near) & (distances <= crop.far)
+    return crop.box.contains(points) & (distances >= crop.near) & (distances <= crop.far)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -42,7 +43,7 @@ def draw(loaded: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth:
         loaded: the model and its run.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
-        truth: true images for the output `error`; where unknown, the rendered colours are returned.
+        truth: true images for the output `error` and the overlay; where unknown, the rendered colours are returned.
     """
     model = loaded.model
     camera = request.camera(piece.stride, (piece.top, piece.bottom), ndc).to(model.device)
@@ -52,7 +53,7 @@ def draw(loaded: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth:
     if request.background is not None:
         background = background.new_tensor(request.background)
     with _appearance(loaded, request.appearance), torch.no_grad():
-        if request.output == "rgb" and crop is None:
+        if request.output == RGB.name and crop is None and not request.overlay:
             kept = rendered_outputs(model, view, background, [RGB], loaded.unit)
         else:
             if crop is None:
@@ -67,9 +68,14 @@ def draw(loaded: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth:
 def _kept(
     loaded: Loaded, request: Request, view: View, picture: Picture, background: Tensor, truth: Truth | None
 ) -> Arrays:
+    if truth is not None and (request.output == FLAWS or (request.output == RGB.name and request.overlay)):
+        found = truth(view, picture.rgb, background)
+    else:
+        found = None
     if request.output == FLAWS:
-        found = None if truth is None else truth(view, picture.rgb, background)
         return kept_outputs(picture, [RGB if found is None else ERROR], loaded.unit, found)
+    if found is not None:
+        picture = replace(picture, rgb=torch.lerp(picture.rgb, found, request.overlay))
     known = {output.name: output for output in (*FIXED, *loaded.model.outputs)} | {DEPTH: MEDIAN_DEPTH}
     return kept_outputs(picture, [known.get(request.output, RGB)], loaded.unit)
 

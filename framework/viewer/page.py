@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-import subprocess
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
-from nerfloom.base.console import say
 from nerfloom.cameras.poses import looked_at
+from nerfloom.geometry.regions import Vector
 from nerfloom.renderable import training_poses
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
+from nerfloom.viewer.commands import Commands
+from nerfloom.viewer.crop_panel import CropPanel
+from nerfloom.viewer.export_panel import ExportPanel
+from nerfloom.viewer.keys import Key, add_keys
 from nerfloom.viewer.measure_panel import MeasurePanel
 from nerfloom.viewer.panel import Panel
 from nerfloom.viewer.path_panel import PathPanel
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.reports import curve, heading
+from nerfloom.viewer.viewpoint import FIRST_FOV, Viewpoint
 
 if TYPE_CHECKING:
     import viser
@@ -32,19 +36,21 @@ class Page:
         server: the server.
         queue: draws the pictures.
         photos: the training images.
-        may_render: whether a browser may start ns-render on its path.
+        may_start: whether browsers may start ns-render and ns-export.
     """
 
-    def __init__(self, server: viser.ViserServer, queue: RenderQueue, photos: Photographs, may_render: bool) -> None:
+    def __init__(self, server: viser.ViserServer, queue: RenderQueue, photos: Photographs, may_start: bool) -> None:
         self._server, self._queue, self._photographs = server, queue, photos
-        self._renders: list[subprocess.Popen[bytes]] | None = [] if may_render else None
+        self._commands = Commands() if may_start else None
         self._panels: dict[int, list[Any]] = {}
         self._curve: Any = None
         self._heading = server.gui.add_markdown("")
+        if queue.second is not None:
+            server.gui.add_markdown(f"right of the divider:  \n{heading(queue.second.loaded)}")
         with server.gui.add_folder("Learning curve", expand_by_default=False):
             self._place_of_curve = server.gui.add_folder(None)
         self.refresh()
-        self._place_camera()
+        self._up = self._place_camera()
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(self._farewell)
 
@@ -59,20 +65,39 @@ class Page:
         tabs = client.gui.add_tab_group()
         with tabs.add_tab("View"):
             panel = Panel(client, queue)
+            viewpoint = Viewpoint(client, self._up)
         queue.add(number, Browser(show))
         queue.ask(number, panel.request)
-        parts: list[Any] = []
-        self._panels[number] = parts
-        if not queue.loaded.model.scene.warped:
-            if queue.loaded.source is not None:
-                with tabs.add_tab("Photographs"):
-                    parts.append(CameraPanel(client, self._photographs))
-            with tabs.add_tab("Path"):
-                parts.append(PathPanel(client, lambda: queue.loaded, panel.request, self._renders))
-            with tabs.add_tab("Measure"):
-                MeasurePanel(client, queue, panel.request)
+        keys = [Key("L", "Level the horizon", viewpoint.level), Key("O", "Next output", panel.next_output)]
+        self._panels[number] = []
+        if panel.crop is not None:
+            self._panels[number], others = self._add_tabs(client, tabs, panel, panel.crop, viewpoint)
+            keys += others
+        add_keys(client, keys)
         if number not in self._server.get_clients():  # the browser left before it was set up
             self._farewell(client)
+
+    def _add_tabs(
+        self, client: viser.ClientHandle, tabs: Any, panel: Panel, crop: CropPanel, viewpoint: Viewpoint
+    ) -> tuple[list[Any], list[Key]]:
+        """Add the tabs of a scene with lengths, and return the parts to close when the browser leaves, and keys."""
+        queue, parts, keys = self._queue, list[Any](), [Key("C", "Crop on or off", crop.toggle)]
+        if queue.loaded.source is not None:
+            with tabs.add_tab("Photographs"):
+                cameras = CameraPanel(client, self._photographs, viewpoint.move)
+            parts.append(cameras)
+            keys += [
+                Key("N", "Next photograph", lambda: cameras.step(1)),
+                Key("P", "Previous photograph", lambda: cameras.step(-1)),
+            ]
+        with tabs.add_tab("Path"):
+            parts.append(PathPanel(client, lambda: queue.loaded, panel.request, viewpoint.move, self._commands))
+        with tabs.add_tab("Measure"):
+            MeasurePanel(client, queue, panel.request)
+        if self._commands is not None:
+            with tabs.add_tab("Export"):
+                ExportPanel(client, lambda: queue.loaded, panel.request, crop, self._commands)
+        return parts, keys
 
     def _farewell(self, client: viser.ClientHandle) -> None:
         self._queue.remove(client.client_id)
@@ -106,8 +131,8 @@ class Page:
         elif len(self._curve.data[0]) != len(seconds):
             self._curve.data = data
 
-    def _place_camera(self) -> None:
-        """Place the initial camera at the first training camera, with the same view direction."""
+    def _place_camera(self) -> Vector:
+        """Place the initial camera at the first training camera, with the same view direction; return what is up."""
         model = self._queue.loaded.model
         scene, poses = model.scene, training_poses(model)
         if poses is None or not len(poses) or scene.warped:
@@ -123,17 +148,17 @@ class Page:
             middle = (scene.box.mean(0).cpu() if seen is None else seen.float()) - pose[:, 3]
             distance = max(float(-(middle @ pose[:, 2])), 0.1 * float(middle.norm()), 1e-3)
             position, center = pose[:, 3], pose[:, 3] - distance * pose[:, 2]
-        self._server.scene.set_up_direction(tuple(up.tolist()))
+        x, y, z = up.tolist()
+        self._server.scene.set_up_direction((x, y, z))
         camera = self._server.initial_camera
         camera.position, camera.look_at = tuple(position.tolist()), tuple(center.tolist())
-        camera.fov = math.radians(50)
+        camera.fov = math.radians(FIRST_FOV)
+        return x, y, z
 
     def close(self) -> None:
         """End everything that browsers have started."""
         for number in list(self._panels):
             for part in self._panels.pop(number, ()):
                 part.close()
-        for process in self._renders or ():
-            if process.poll() is None:
-                process.terminate()
-                say("viewer: the render was stopped; repeat the ns-render command to continue it")
+        if self._commands is not None:
+            self._commands.close()

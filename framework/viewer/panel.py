@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nerfloom.evaluation.appearance import appearance_of
-from nerfloom.viewer.crop import meaning
+from nerfloom.viewer.crop_panel import CropPanel
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.render_queue import RenderQueue
-from nerfloom.viewer.request import (
-    MAX_COORDINATE,
-    OUTPUTS,
-    Crop,
-    Request,
-    color_of,
-    corner_of,
-    number_in,
-    one_of,
-    pose_of,
-    size_of,
-)
+from nerfloom.viewer.request import OUTPUTS, Request, color_of, number_in, one_of, pose_of, size_of
 
 if TYPE_CHECKING:
     import viser
@@ -43,7 +31,8 @@ class Panel:
     def __init__(self, client: viser.ClientHandle, queue: RenderQueue) -> None:
         self._client, self._queue = client, queue
         scene = queue.loaded.model.scene
-        declared = [output.name for output in queue.loaded.model.outputs]
+        both = [queue.loaded, *(() if queue.second is None else (queue.second.loaded,))]
+        declared = [output.name for output in both[0].model.outputs if output in both[-1].model.outputs]
         has_photographs = queue.loaded.source is not None and not scene.warped
         self._outputs = [*OUTPUTS[:-1], *declared, *(OUTPUTS[-1:] if has_photographs else ())]
         gui = client.gui
@@ -53,17 +42,23 @@ class Panel:
         )
         self._time = gui.add_slider("Time", 0.0, 1.0, 0.01, 0.0) if scene.moving else None
         self._appearance = self._add_appearance()
+        self._overlay: Any = None
+        if has_photographs:
+            self._overlay = gui.add_slider(
+                "Overlay", 0.0, 1.0, 0.01, 0.0, hint="Opacity of the photograph, where one was taken."
+            )
+        self._divider: Any = None
+        if queue.second is not None:
+            self._divider = gui.add_slider("Divider", 0.0, 1.0, 0.005, 0.5, hint="The second run is on its right.")
         with gui.add_folder("Background", expand_by_default=False):
             self._own_background = gui.add_checkbox("Own colour", False)
             self._background = gui.add_rgb("Colour", (255, 255, 255))
-        self._crop_values: list[Any] = []
-        if not scene.warped:
-            self._add_crop()
+        self.crop = None if scene.warped else CropPanel(client, lambda: queue.loaded, self._ask)
         if shown_cells(queue.loaded.model, 1) is not None:
             self._cells = gui.add_checkbox("Occupied cells", False, hint="Outer cells of the sampled region")
             self._cells.on_update(lambda _: self._show_cells())
         handles = [self._output, self._size, self._time, self._appearance, self._own_background, self._background]
-        for handle in [*handles, *self._crop_values]:
+        for handle in [*handles, self._overlay, self._divider]:
             if handle is not None:
                 handle.on_update(self._changed)
         client.camera.on_update(self._moved)
@@ -76,27 +71,21 @@ class Panel:
             "Appearance", -1, len(appearance.vectors) - 1, 1, -1, hint=f"Number of a training image; -1: {MEAN}"
         )
 
-    def _add_crop(self) -> None:
-        model, gui = self._queue.loaded.model, self._client.gui
-        low, high = (tuple(corner) for corner in model.scene.box.cpu().tolist())
-        step = float((model.scene.box[1] - model.scene.box[0]).max()) / 200
-        with gui.add_folder("Crop", expand_by_default=False):
-            gui.add_markdown(meaning(model))
-            self._crop_values = [
-                gui.add_checkbox("Crop", False),
-                gui.add_vector3("Lowest corner", low, step=step),
-                gui.add_vector3("Highest corner", high, step=step),
-                gui.add_number("Near", 0.0, min=0.0, step=step, hint="Distance from the camera, scene units"),
-                gui.add_number("Far", round(float(model.scene.far), 3), min=0.0, step=step),
-            ]
+    def next_output(self) -> None:
+        """Show the next output of the list."""
+        index = self._outputs.index(one_of(self._output.value, self._outputs))
+        self._output.value = self._outputs[(index + 1) % len(self._outputs)]
 
     # -- requests ---------------------------------------------------------------------------------------------
 
-    def _changed(self, _: Any) -> None:
+    def _ask(self) -> None:
         self._queue.ask(self._client.client_id, self.request)
 
+    def _changed(self, _: Any) -> None:
+        self._ask()
+
     async def _moved(self, _: Any) -> None:  # in the server's own thread, so that cameras stay in order
-        self._queue.ask(self._client.client_id, self.request)
+        self._ask()
 
     def request(self, last: Request | None = None) -> Request | None:
         """Return the browser's current request; the `last` request if its camera is invalid."""
@@ -114,26 +103,14 @@ class Panel:
             time=None if self._time is None else number_in(self._time.value, 0, 1, 0),
             appearance=self._image(),
             background=color_of(self._background.value) if self._own_background.value is True else None,
-            crop=self._crop(),
+            crop=None if self.crop is None else self.crop.crop(),
+            overlay=0.0 if self._overlay is None else number_in(self._overlay.value, 0, 1, 0),
+            divider=None if self._divider is None else number_in(self._divider.value, 0, 1, 0.5),
         )
 
     def _image(self) -> int | None:
         chosen = -1 if self._appearance is None else int(number_in(self._appearance.value, -1, 1e7, -1))
         return None if chosen < 0 else chosen
-
-    def _crop(self) -> Crop | None:
-        if not self._crop_values or self._crop_values[0].value is not True:
-            return None
-        _, low, high, near, far = (handle.value for handle in self._crop_values)
-        first, second = corner_of(low, (-1, -1, -1)), corner_of(high, (1, 1, 1))
-        if not all(a < b for a, b in zip(first, second, strict=True)):
-            return None
-        begin, end = number_in(near, 0, MAX_COORDINATE, 0), number_in(far, 0, MAX_COORDINATE, MAX_COORDINATE)
-        return Crop((first, second), begin, end if end > begin else math.inf)
-
-    def time(self) -> float | None:
-        """Return the displayed time; None for a static scene."""
-        return None if self._time is None else number_in(self._time.value, 0, 1, 0)
 
     # -- the scene --------------------------------------------------------------------------------------------
 

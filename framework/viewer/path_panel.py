@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shlex
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
-from nerfloom.base.child import python_command
 from nerfloom.base.console import say
 from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
 from nerfloom.evaluation.video_suffixes import default_video
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.camera_panel import move_camera
+from nerfloom.viewer.command_panel import CommandPanel
+from nerfloom.viewer.commands import Commands
 from nerfloom.viewer.keyframes import MAX_KEYFRAMES, Editor, listed, path_file
 from nerfloom.viewer.request import Request, number_in
 
@@ -40,7 +40,8 @@ class PathPanel:
         client: the browser.
         loaded: function that returns the model and its run.
         request: function that returns the browser's request; None if its camera is invalid.
-        renders: processes that render paths, at most one at a time; None if rendering is not allowed.
+        move: function of a pose (3, 4) and a field of view that moves the browser's camera.
+        commands: the commands of all browsers; None if rendering is not allowed.
     """
 
     def __init__(
@@ -48,9 +49,10 @@ class PathPanel:
         client: viser.ClientHandle,
         loaded: Callable[[], Loaded],
         request: Callable[[], Request | None],
-        renders: list[subprocess.Popen[bytes]] | None,
+        move: Callable[[Tensor, float], None],
+        commands: Commands | None,
     ) -> None:
-        self._client, self._loaded, self._request, self._renders = client, loaded, request, renders
+        self._client, self._loaded, self._request, self._move = client, loaded, request, move
         self._editor = Editor()
         self._playing = False
         gui = client.gui
@@ -68,9 +70,10 @@ class PathPanel:
         self._height = gui.add_number("Height", 720, min=16, max=8192, step=2)
         self._name = gui.add_text("Name", "", hint="Letters, digits, - and _; camera_path.json if empty")
         gui.add_button("Save").on_click(lambda _: self._save())
-        if renders is not None:
-            gui.add_button("Save and render").on_click(lambda _: self._render())
         self._note = gui.add_markdown("")
+        if commands is not None:
+            gui.add_button("Save and render").on_click(lambda _: self._render())
+            self._command = CommandPanel(client, commands)
 
     def close(self) -> None:
         """Stop the preview when the browser has left."""
@@ -98,7 +101,7 @@ class PathPanel:
         action, keyframe = event.target.value, self._keyframe()
         if action == "go to":
             chosen = self._editor.keyframes[index]
-            move_camera(self._client, chosen.pose, math.radians(chosen.fov))
+            self._move(chosen.pose, math.radians(chosen.fov))
         elif action == "remove":
             self._edit(lambda editor: editor.without(index))
         elif action == "move here" and keyframe is not None:
@@ -153,7 +156,7 @@ class PathPanel:
         try:
             while self._playing and (passed := time.monotonic() - start) < path.seconds:
                 index = min(int(passed * path.fps), len(path) - 1)
-                move_camera(self._client, path.poses[index], math.radians(float(path.fovs[index])))
+                self._move(path.poses[index], math.radians(float(path.fovs[index])))
                 self._client.flush()
                 time.sleep(1 / min(MAX_PREVIEW_FPS, path.fps))
         finally:
@@ -181,21 +184,11 @@ class PathPanel:
 
     def _render(self) -> None:
         """Start ns-render on the path in another process."""
-        assert self._renders is not None
-        if any(process.poll() is None for process in self._renders):
-            self._note.content = "A path is being rendered; wait until it is finished."
-            return
         file = self._save()
-        if file is None:
-            return
-        output = file.with_name(default_video(file.stem).name)
-        words = ["--camera-path-filename", file, "--output-path", output]
-        command = python_command("nerfloom.cli.render", "camera-path", self._loaded().origin, *words)
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-        self._renders[:] = [process]
-        self._note.content = f"Rendering {output.name} ..."
-        status = process.wait()
-        self._note.content = f"Rendered {output.name}." if status == 0 else "Rendering failed; see the terminal."
+        if file is not None:
+            output = file.with_name(default_video(file.stem).name)
+            words = [self._loaded().origin, "--camera-path-filename", file, "--output-path", output]
+            self._command.run("nerfloom.cli.render", ["camera-path", *words], lambda: output)
 
 
 def _or_zero(value: Any) -> int:

@@ -14,8 +14,9 @@ from nerfloom.cameras.ndc import Ndc
 from nerfloom.evaluation.outputs import Arrays
 from nerfloom.renderable import RendersRays
 from nerfloom.training.loaded import Loaded
+from nerfloom.viewer.beside import Beside, draw_beside
 from nerfloom.viewer.browser import Browser
-from nerfloom.viewer.drawing import Truth, draw
+from nerfloom.viewer.drawing import Truth
 from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
 from nerfloom.viewer.request import Request, smaller
 
@@ -42,6 +43,7 @@ class RenderQueue:
         piece_seconds: time limit for a piece of a refinement.
         ndc: function that returns the normalised device coordinates of the scene; None if it has none.
         truth: true images for the output `error`.
+        second: a second run, drawn beside the first; None for none.
     """
 
     def __init__(
@@ -51,8 +53,9 @@ class RenderQueue:
         piece_seconds: float = 0.1,
         ndc: Ndc | None = None,
         truth: Truth | None = None,
+        second: Beside | None = None,
     ) -> None:
-        self.loaded = loaded
+        self.loaded, self.second = loaded, second
         self.coarse_seconds, self.piece_seconds = coarse_seconds, piece_seconds
         self.hurried = False
         self._ndc, self._truth = ndc, truth
@@ -153,7 +156,8 @@ class RenderQueue:
 
     @property
     def _piece_seconds(self) -> float:
-        return self.piece_seconds if isinstance(self.loaded.model, RendersRays) else NO_LIMIT
+        shown = (self.loaded,) if self.second is None else (self.loaded, self.second.loaded)
+        return self.piece_seconds if all(isinstance(one.model, RendersRays) for one in shown) else NO_LIMIT
 
     @property
     def _rays(self) -> Rays:
@@ -163,7 +167,7 @@ class RenderQueue:
     def _timed(self, request: Request, piece: Piece) -> Arrays:
         """Draw a piece and measure its time."""
         start = time.perf_counter()
-        kept = draw(self.loaded, request, piece, self._ndc, self._truth)
+        kept = draw_beside(self.loaded, self.second, request, piece, self._ndc, self._truth)
         pixels = smaller(request.width, request.height, piece.stride)[0] * (piece.bottom - piece.top)
         self._speed = self._speed.with_one(pixels * piece.rays, time.perf_counter() - start)
         return kept

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
+from nerfloom.geometry.regions import Box
 
 MAX_COORDINATE = 1e6
 """Maximum coordinate of a camera, scene units."""
@@ -41,8 +42,8 @@ class Pose:
 class Crop:
     """Visible part of space."""
 
-    corners: tuple[tuple[float, float, float], tuple[float, float, float]]
-    """Minimum and maximum corner of a box, scene units."""
+    box: Box
+    """The box, in the frame of the scene."""
     near: float = 0.0
     """Nothing nearer to the camera is shown, scene units."""
     far: float = math.inf
@@ -69,6 +70,26 @@ class Request:
     """Colour behind the scene, 0 to 1; None for the evaluation background."""
     crop: Crop | None = None
     """Visible part of space; None for all."""
+    overlay: float = 0.0
+    """Opacity of the photograph over the colours, 0 to 1, if one was taken from the camera."""
+    divider: float | None = None
+    """Width of the first run's part, as a fraction of the picture; None for a single run."""
+
+    def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Request:
+        """Return the same view after a similarity transform of its scene, x -> scale * rotation @ x + shift.
+
+        Args:
+            rotation: (3, 3) rotation, float64, on the CPU.
+            scale: factor of lengths.
+            shift: (3,) shift, float64, on the CPU.
+        """
+        pose = self.pose.tensor()
+        place = scale * (rotation @ pose[:, 3]) + shift
+        matrix = torch.cat([rotation @ pose[:, :3], place[:, None]], dim=1)
+        crop = self.crop
+        if crop is not None:
+            crop = Crop(crop.box.moved(rotation, scale, shift), scale * crop.near, scale * crop.far)
+        return replace(self, pose=Pose(tuple(matrix.flatten().tolist()), self.pose.fov), crop=crop)
 
     def camera(self, stride: int = 1, rows: tuple[int, int] | None = None, ndc: Ndc | None = None) -> Cameras:
         """Return the camera of a smaller picture of the same view, or of some of its rows.

@@ -9,6 +9,7 @@ from pathlib import Path
 from nerfloom.base.console import say
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.training.loaded import Loaded
+from nerfloom.viewer.beside import Beside, check_beside
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
@@ -19,7 +20,7 @@ SECONDS_PER_LOOK = 2.0
 """Seconds between checks for a newer checkpoint."""
 
 
-def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
+def view_loaded(loaded: Loaded, host: str, port: int, follow: bool, second: Loaded | None = None) -> None:
     """Serve a run, a file of Gaussians or an octree to browsers until Ctrl-C.
 
     Args:
@@ -27,16 +28,19 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool) -> None:
         host: interface to listen on.
         port: port to listen on; the next free one if it is taken.
         follow: whether to show newer checkpoints of the run as they are written.
+        second: a second run or file of the same data, which is shown beside the first; None for none.
 
     Raises:
-        ConfigError: if viser is missing, or the address cannot be used.
+        ConfigError: if viser is missing, the address cannot be used, or the two cannot be shown side by side.
         KeyboardInterrupt: on Ctrl-C, after the server has stopped.
     """
     queue: RenderQueue
     photographs = Photographs(loaded.source, lambda: queue.loaded.model)
-    queue = RenderQueue(loaded, ndc=_ndc(loaded.model.scene.warped, photographs), truth=photographs.truth)
+    beside = None if second is None else _beside(loaded, second)
+    ndc = _ndc(loaded.model.scene.warped, photographs)
+    queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=beside)
     server = open_server(host, port, "nerfloom")
-    page = Page(server, queue, photographs, may_render=follow)
+    page = Page(server, queue, photographs, may_start=follow)
     say("Ctrl-C ends it")
     seen, looked = loaded.checkpoint, time.monotonic()
     try:
@@ -66,6 +70,11 @@ def _follow(queue: RenderQueue, page: Page, seen: Path) -> Path:
         queue.loaded = found
         page.refresh()
     return newer
+
+
+def _beside(loaded: Loaded, second: Loaded) -> Beside:
+    check_beside(loaded, second)
+    return Beside(second, Photographs(second.source, lambda: second.model).truth)
 
 
 def _ndc(warped: bool, photographs: Photographs) -> Ndc | None:

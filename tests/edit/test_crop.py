@@ -11,7 +11,7 @@ from nerfloom import edit
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.edit.crop import inside_polygon
 from nerfloom.edit.edited import Edited
-from nerfloom.geometry.regions import Box, Sphere, inside_all, read_region
+from nerfloom.geometry.regions import Box, Region, Sphere, inside_all, read_region, write_region
 from nerfloom.splats.files import write_gaussians
 from nerfloom.training.load import load
 from tests.dataparsers.captures import HEIGHT, POINTS, WIDTH, poses, seen_at, write_capture
@@ -61,6 +61,45 @@ def test_regions_of_files(tmp_path: Path) -> None:
         inside_all(points + 100, [box])
 
 
+ROTATION = ((0.36, 0.48, -0.8), (-0.8, 0.6, 0.0), (0.48, 0.64, 0.6))
+"""A rotation matrix of fractions; its rows are unit vectors at right angles."""
+
+
+def test_a_turned_box_keeps_what_numpy_finds_in_it() -> None:
+    low, high = (-0.5, -1.0, 0.0), (1.0, 0.3, 2.0)
+    means = scattered().gaussians.means.double()
+    along = means.numpy() @ np.array(ROTATION).T
+    truth = np.all((along >= low) & (along <= high), axis=1)
+    assert 0 < truth.sum() < len(truth)
+    np.testing.assert_array_equal(Box(low, high, ROTATION).contains(means), truth)
+
+
+def test_a_box_moves_with_what_is_in_it() -> None:
+    box = Box((-0.5, -1.0, 0.0), (1.0, 0.3, 2.0), ROTATION)
+    points = scattered().gaussians.means.double()
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).double() @ torch.tensor(ROTATION, dtype=torch.float64)
+    shift = torch.tensor([3.0, -20.0, 0.7], dtype=torch.float64)
+    moved = box.moved(turn, 2.5, shift)
+    assert torch.equal(moved.contains(2.5 * points @ turn.T + shift), box.contains(points))
+    back = moved.moved(turn.T, 1 / 2.5, -(turn.T @ shift) / 2.5)
+    np.testing.assert_allclose([back.low, back.high], [box.low, box.high], atol=1e-12)
+    np.testing.assert_allclose(back.axes, box.axes, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        Box((-1.0, -2.0, 1e-7), (1.0, 2.0, 3.5)),
+        Box((-1.0, -2.0, -3.0), (1.0, 2.0, 1e7), ROTATION),
+        Sphere((0.1, 0.2, 0.3), 1 / 3),
+    ],
+)
+def test_a_written_region_is_read_as_the_same_one(region: Region, tmp_path: Path) -> None:
+    write_region(tmp_path / "r.yml", region)
+    assert read_region(tmp_path / "r.yml") == region
+    assert ("axes" in (tmp_path / "r.yml").read_text()) == (getattr(region, "axes", None) == ROTATION)
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -68,6 +107,9 @@ def test_regions_of_files(tmp_path: Path) -> None:
         *("sphere: {center: [0, 0], radius: 1}", "sphere: {center: [0, 0, 0], radius: -1}", "{"),
         *("sphere: {center: [0, 0, .nan], radius: 1}", "sphere: {center: [0, 0, 0], radius: 1, side: 2}"),
         "sphere: {center: [0, 0, 0], radius: 1}\nbox: {low: [0, 0, 0], high: [1, 1, 1]}",
+        "box: {low: [0, 0, 0], high: [1, 1, 1], axes: [[1, 0, 0], [0, 1, 0]]}",
+        "box: {low: [0, 0, 0], high: [1, 1, 1], axes: [[1, 0, 0], [0, 1, 0], [0, 0.1, 1]]}",
+        "box: {low: [0, 0, 0], high: [1, 1, 1], axes: [[1, 0, 0], [0, 1, 0], [0, 0, 1e200]]}",
     ],
 )
 def test_files_that_hold_no_region_are_refused(text: str, tmp_path: Path) -> None:

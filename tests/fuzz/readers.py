@@ -50,7 +50,7 @@ from nerfloom.evaluation.surfaces import drawn
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.geometry.rays import Rays
-from nerfloom.geometry.regions import read_region
+from nerfloom.geometry.regions import Box, read_region, write_region
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import bundler, metashape, opensfm, polycam, realitycapture, record3d
@@ -532,12 +532,14 @@ def write_edits(folder: Path) -> None:
     ]
     write_steps(folder / "edit.yml", steps)
     (folder / "region.yml").write_text("sphere: {center: [0, 0, 1], radius: 2.5}\n", encoding="utf-8")
+    write_region(folder / "box.yml", Box((-1, -1, 0), (1, 1.5, 2), ((0.6, 0.8, 0), (-0.8, 0.6, 0), (0, 0, 1))))
 
 
 def read_edits(folder: Path, scratch: Path) -> None:
     for step in read_steps(folder / "edit.yml"):
         require(step.name in STEPS, "a step that does not exist")
-    require(read_region(folder / "region.yml").contains(torch.zeros(1, 3)).shape == (1,), "another shape")
+    for name in ("region.yml", "box.yml"):
+        require(read_region(folder / name).contains(torch.zeros(1, 3)).shape == (1,), "another shape")
 
 
 READERS: dict[str, Reader] = {
@@ -585,7 +587,7 @@ READERS: dict[str, Reader] = {
     "bundler": Reader(write_bundler, partial(convert, read_bundler, "photographs"), ("bundle.out", "list.txt")),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),
-    "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius")),
+    "edits": Reader(write_edits, read_edits, ("*.yml",), ("steps", "low", "keep", "factor", "radius", "axes")),
     "blocks": Reader(
         write_two_blocks, read_scene_in_blocks, ("blocks.yml",), ("version", "box", "run", "center", "cameras", "color")
     ),

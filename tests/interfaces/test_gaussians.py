@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nerfloom import GaussianModel, View
 from nerfloom.cameras.poses import Placement
+from nerfloom.geometry.regions import Box
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.methods.gaussian_splatting import METHOD, GaussianSplatting
 from nerfloom.registry import load_method
@@ -170,6 +171,6 @@ def test_a_moment_is_exported(
 
 def test_a_crop_box_holds_what_is_inside_at_its_time() -> None:
     model, black = drifting([2.0, 0.0, 0.0]), torch.zeros(3)
-    right = Crop(((0.5, -0.5, -0.5), (1.5, 0.5, 0.5)))
+    right = Crop(Box((0.5, -0.5, -0.5), (1.5, 0.5, 0.5)))
     shown = [float(picture_within(model, View(camera(), time), right, black).rgb.max()) for time in (0.0, 1.0)]
     assert shown[0] == 0 < shown[1]

@@ -168,6 +168,11 @@ MUTANTS = {
             "long frustums are taken for wider ones, and blur",
             "test_multisamples.py::test_mean_and_variances_are_the_frustums"),
     ],
+    "nerfloom.geometry.regions": [
+        Mutant("shift-not-turned", "Box.moved", "axes @ shift", "shift",
+            "the crop box that the viewer saves is beside the one it draws, for captures",
+            "edit/test_crop.py::test_a_box_moves_with_what_is_in_it"),
+    ],
     "nerfloom.kernels.adam.adam": [
         Mutant("adam-no-bias-correction", "sparse_adam_reference", "A * unbias1", "A",
             "without compiled kernels, entries that are seldom used hardly move",

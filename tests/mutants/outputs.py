@@ -45,6 +45,16 @@ MUTANTS = {
             "what two blocks have learned is drawn twice",
             "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],
+    "nerfloom.viewer.beside": [
+        Mutant("another-place", "draw_beside", "request.moved(*A)", "request",
+            "the second run is seen from another place than the first",
+            "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
+    ],
+    "nerfloom.viewer.request": [
+        Mutant("crop-stays-behind", "Request.moved", "crop.box.moved(A, B, C)", "crop.box",
+            "the second run is cropped in another place than the first",
+            "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
+    ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
             "exports stay in the unit of the input after a true length was given",

@@ -81,6 +81,28 @@ class Tab:
         self.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
         self.mouse("mouseReleased", x, y, button="left", buttons=0, clickCount=1)
 
+    def key(self, key: str, code: str, number: int, held: float = 0.0) -> None:
+        """Press a key, and hold it for some seconds."""
+        for kind, pause in (("keyDown", held), ("keyUp", 0.0)):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
+            time.sleep(pause)
+
+    def swipe(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
+        """Draw one finger over the page."""
+        for step in range(steps + 1):
+            x, y = (a + (b - a) * step / steps for a, b in zip(start, end, strict=True))
+            kind = "touchMove" if step else "touchStart"
+            self.send("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y}])
+            time.sleep(0.03)
+        self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def phone(self, width: int, height: int, address: str) -> None:
+        """Open a page as a phone does, which has a narrow screen and no mouse."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1}
+        self.send("Emulation.setDeviceMetricsOverride", **size, mobile=True)
+        self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+        self.send("Page.navigate", url=address)
+
     def press(self, text: str) -> None:
         """Click what shows a text."""
         script = f"""(() => {{

@@ -75,6 +75,14 @@ class Client:
                 self.controls[label] = (message["uuid"], message)
         return content["messages"]
 
+    def message(self, kind: str, **values: Any) -> dict[str, Any]:
+        """The next message of a kind that has some values."""
+        for _ in count():
+            for message in self.messages(30.0):
+                if message["type"] == kind and all(message.get(name) == value for name, value in values.items()):
+                    return message
+        raise AssertionError
+
     def picture(self, seconds: float = 30.0) -> np.ndarray:
         """The next picture, (H, W, 3) uint8."""
         for _ in count():

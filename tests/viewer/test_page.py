@@ -2,10 +2,7 @@
 
 import json
 import re
-import subprocess
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -19,150 +16,29 @@ from nerfloom.cameras.view import View
 from nerfloom.runs import load
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.request import Pose, Request
-from tests.cli.helpers import TINY_NGP, command, train
+from tests.cli.helpers import TINY_NGP, command
 from tests.conftest import write_tiny
-from tests.patience import PATIENCE, until
+from tests.patience import until
 from tests.training.helpers import tiny_trainer
-from tests.viewer.chromium import Chromium, Tab, chromium
+from tests.viewer.chromium import Chromium
+from tests.viewer.pages import (
+    PICTURE,
+    choose,
+    decibels,
+    expected,
+    look_of,
+    meets_box,
+    shown,
+    size_of,
+    started,
+    text_of,
+    tick,
+    to_the_end,
+    type_into,
+)
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 pytestmark = pytest.mark.slow
-PICTURE = np.s_[200:520, 60:540]
-"""Rows and columns of the page beside the panel and below the note that WebGL is slow here."""
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    with chromium(tmp_path_factory.mktemp("chromium")) as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Path:
-    return train(shared_tiny, tmp_path_factory.mktemp("runs"), "--max-num-iterations", 300)
-
-
-@contextmanager
-def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A command that serves the viewer, and its address."""
-    process = subprocess.Popen([*map(str, words)], stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
-    address = ""
-    for line in process.stderr:
-        if found := re.search(r"viewer: (http://\S+)", line):
-            address = found[1]
-            break
-    assert address, "the command ended before it served anything"
-    try:
-        yield process, address
-    finally:
-        process.terminate()
-        process.communicate(timeout=PATIENCE)
-
-
-def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
-    """The page when it has stopped changing."""
-    end, before = time.monotonic() + seconds, tab.screenshot()
-    while time.monotonic() < end:
-        time.sleep(1.5)
-        now = tab.screenshot()
-        if np.array_equal(now, before) and now[150:500, 50:500].std() > 5:
-            return now
-        before = now
-    raise AssertionError("the page did not come to rest")
-
-
-def shown(tab: Tab) -> np.ndarray:
-    """The picture at rest."""
-    return settled(tab)[PICTURE].astype(float)
-
-
-def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None) -> np.ndarray:
-    """What the run's model renders from the page's camera: position, target and up."""
-    width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
-    position, target, up = (torch.tensor(camera[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
-    back = torch.nn.functional.normalize(position - target, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
-    matrix = torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
-    model = load_trained(run, device_type="cpu").model
-    request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(50)), width, height, time=time)
-    picture = model.render_view(View(request.camera(), time=time), model.background)
-    return picture.rgb.clamp(0, 1).numpy()[PICTURE] * 255
-
-
-def decibels(a: np.ndarray, b: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / (np.square(a - b).mean() + 1e-6)))
-
-
-def choose(tab: Tab, label: str, option: str) -> None:
-    """Choose an option of a list, which is the input beside its label."""
-    script = f"""(() => {{
-      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
-      const row = found[0].parentElement.parentElement;
-      const box = (document.getElementById(found[0].htmlFor) || row.querySelector("input")).getBoundingClientRect();
-      return [box.x + box.width / 2, box.y + box.height / 2];
-    }})()"""
-    tab.click(*tab.evaluate(script))
-    time.sleep(0.5)
-    tab.press(option)
-
-
-def to_the_end(tab: Tab) -> None:
-    """Press End on the first slider, which is that of time where there is one."""
-    tab.evaluate("document.querySelector('[role=slider]').focus()")
-    for kind in ("keyDown", "keyUp"):
-        tab.send("Input.dispatchKeyEvent", type=kind, key="End", code="End", windowsVirtualKeyCode=35)
-
-
-def type_into(tab: Tab, label: str, index: int, text: str) -> None:
-    """Replace what one of the fields beside a label holds, as the keyboard does."""
-    script = f"""(() => {{
-      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
-      const first = document.getElementById(found[0].htmlFor).closest(".mantine-NumberInput-root");
-      const field = first.parentElement.querySelectorAll("input")[{index}];
-      field.focus();
-      field.select();
-    }})()"""
-    tab.evaluate(script)
-    tab.send("Input.insertText", text=text)
-
-
-def tick(tab: Tab, label: str) -> None:
-    """Click the box beside a label, when it has come to rest: a folder opens slowly."""
-    script = f"""(() => {{
-      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
-      const box = document.getElementById(found[0].htmlFor).getBoundingClientRect();
-      return [box.x + box.width / 2, box.y + box.height / 2];
-    }})()"""
-    places = [[], tab.evaluate(script)]
-    while places[-2] != places[-1]:
-        time.sleep(0.3)
-        places.append(tab.evaluate(script))
-    tab.click(*places[-1])
-
-
-def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """Which rays of the page's picture meet a box: slabs, in float64, independent of what the viewer does."""
-    width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
-    position, target, up = (np.array(camera[i : i + 3]) for i in (0, 3, 6))
-    ahead = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(ahead, up)
-    right /= np.linalg.norm(right)
-    focal = 0.5 * height / np.tan(np.radians(25))
-    across = (np.arange(width) + 0.5 - width / 2) / focal
-    down = (np.arange(height) + 0.5 - height / 2) / focal
-    rays = ahead + across[None, :, None] * right + down[:, None, None] * np.cross(ahead, right)
-    sides = (np.array([low, high])[:, None, None] - position) / rays
-    enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
-    return (leave > np.maximum(enter, 0))[PICTURE]
-
-
-def look_of(run: Path) -> list[float]:
-    """The camera that the page begins with: position, target and up."""
-    camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
-    assert camera is not None
-    position, back = camera[0, :, 3], camera[0, :, 2]
-    return [*position.tolist(), *(position - back).tolist(), 0.0, 0.0, 1.0]
 
 
 def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
@@ -214,6 +90,7 @@ def test_crop(browser: Chromium, run: Path) -> None:
         whole = shown(tab)
         tab.press("Crop")
         tick(tab, "Crop")
+        tick(tab, "Show the box")  # its lines would count as matter
         type_into(tab, "Highest corner", 2, "0")  # the upper half of the ball is cut away
         time.sleep(1)
         cut = shown(tab)
@@ -237,15 +114,15 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 17507) as (_, address):
         tab = browser.open(address)
         shown(tab)
-        width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+        width, height = size_of(tab)
         tab.press("Measure")
         tick(tab, "Pick points")
-        until(lambda: "first point" in tab.evaluate("document.body.innerText"))
+        until(lambda: "first point" in text_of(tab))
         tab.click(*places[0])
-        until(lambda: "second point" in tab.evaluate("document.body.innerText"))
+        until(lambda: "second point" in text_of(tab))
         tab.click(*places[1])
         length = r"(\d+\.\d+) (± \d|\(error unknown)"  # two cameras may not agree on so coarse a ball
-        found = until(lambda: re.search(length, tab.evaluate("document.body.innerText")))
+        found = until(lambda: re.search(length, text_of(tab)))
         time.sleep(1)
         picture = tab.screenshot(tmp_path / "measure.png")
         tab.press("Set the scale")
@@ -255,7 +132,7 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
         until(file.is_file)
         scale = json.loads(file.read_text())
         file.unlink()
-        scaled = until(lambda: re.search(r"\b1(\.0+)? m (±|\()", tab.evaluate("document.body.innerText")))
+        scaled = until(lambda: re.search(r"\b1(\.0+)? m (±|\()", text_of(tab)))
         tab.screenshot(tmp_path / "scaled.png")
         tab.close()
     loaded = load(run, device="cpu")
@@ -312,7 +189,7 @@ def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path)
         tab = browser.open(address)
 
         def step() -> int:
-            found = re.search(r"step ([\d,]+) · \d+ s", tab.evaluate("document.body.innerText"))
+            found = re.search(r"step ([\d,]+) · \d+ s", text_of(tab))
             return int(found[1].replace(",", "")) if found else 0
 
         until(lambda: tab.screenshot()[PICTURE].std() > 5)

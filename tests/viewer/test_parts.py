@@ -1,6 +1,7 @@
 """What the viewer shows beside pictures: crops, errors against photographs, cells, curves, newer checkpoints."""
 
 import dataclasses
+import itertools
 import json
 import math
 import time
@@ -22,6 +23,7 @@ from nerfloom.cameras.view import View
 from nerfloom.cli import train as train_command
 from nerfloom.cli import viewer as viewer_command
 from nerfloom.data.scene import Scene
+from nerfloom.geometry.regions import Box
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.renderable import Renderable
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -31,6 +33,7 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.crop import CroppedCameras, picture_within
+from nerfloom.viewer.crop_panel import FACES, edges, middle, outward
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
@@ -48,7 +51,7 @@ ABOVE = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0)
 def test_cropped_rays() -> None:
     camera = Request(Pose(ABOVE, 1.2), 9, 9).camera()
     whole = camera.pixel_rays(torch.arange(81), 0.5, 10.0)
-    crop = Crop(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
+    crop = Crop(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
     rays = CroppedCameras.of(camera, crop).pixel_rays(torch.arange(81), 0.5, 10.0)
     torch.testing.assert_close(rays.directions, whole.directions)
     assert float(rays.nears[40]) == pytest.approx(3)  # the middle pixel looks along the axis
@@ -62,6 +65,23 @@ def test_cropped_rays() -> None:
         torch.tensor([40]), 0.5, 10.0
     )
     assert (float(between.nears), float(between.fars)) == pytest.approx((3.5, 4.5))
+
+
+def test_the_edges_and_the_arrows_of_the_box() -> None:
+    """Twelve edges between its corners; at each face an arrow at its centre, which points away from the box."""
+    box = Box((-1.0, 2.0, 3.0), (1.0, 5.0, 4.0))
+    found = edges(box).astype(float)
+    lengths = np.linalg.norm(found[:, 1] - found[:, 0], axis=1)
+    assert sorted(lengths.tolist()) == [1] * 4 + [2] * 4 + [3] * 4
+    corners = {tuple(corner) for corner in found.reshape(-1, 3).tolist()}
+    assert corners == set(itertools.product((-1, 1), (2, 5), (3, 4)))
+    for axis, side in FACES:
+        place = np.array(middle(box, (axis, side)))
+        assert place[axis] == (box.low, box.high)[side][axis]
+        assert np.delete(place - [0, 3.5, 3.5], axis).tolist() == [0, 0]
+        w, *vector = outward((axis, side))
+        turn = 2 * np.outer(vector, vector) + (2 * w * w - 1) * np.eye(3)  # of quaternions whose w is 0 or 1
+        assert (turn @ np.eye(3)[axis]).tolist() == ((2 * side - 1) * np.eye(3)[axis]).tolist()
 
 
 def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
@@ -79,11 +99,11 @@ def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
         found: list[int] = picture_within(model, view, crop, white).rgb[16, 16].round().int().tolist()
         return found
 
-    assert middle(Crop(((-3.0, -3.0, -3.0), corner))) == [1, 0, 0]
-    assert middle(Crop(((-3.0, -3.0, -3.0), (3.0, 3.0, 1.0)))) == [0, 1, 0]
-    assert middle(Crop(((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
-    assert middle(Crop(((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
-    assert middle(Crop(((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), corner))) == [1, 0, 0]
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), (3.0, 3.0, 1.0)))) == [0, 1, 0]
+    assert middle(Crop(Box((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
+    assert middle(Crop(Box((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
 
 
 class Slow(Speed):

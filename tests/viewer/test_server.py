@@ -1,5 +1,6 @@
 """The server, met by clients that speak its protocol, by clients that do not, and by pages from elsewhere."""
 
+import math
 import socket
 import threading
 import time
@@ -7,18 +8,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
+from nerfloom.geometry.regions import Box, read_region
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import create_folder
 from nerfloom.training.trainer import Trainer
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.render_queue import RenderQueue
-from nerfloom.viewer.request import pose_of
+from nerfloom.viewer.request import pose_of, quaternion_of
 from nerfloom.viewer.server import free_port, is_allowed
 from nerfloom.viewer.training_viewer import in_training
 from tests.training.helpers import tiny_run
@@ -28,6 +32,9 @@ pytest.importorskip("viser", reason="the extra [viewer] is not installed")
 from nerfloom.viewer.server import close_server, open_server
 from tests.patience import until
 from tests.viewer.client import LOOK, Client
+
+FROM_THE_SIDE: dict[str, Any] = {"position": (0.0, -4.0, 0.0), "wxyz": (0.5**0.5, -(0.5**0.5), 0.0, 0.0)}
+"""A camera that looks along y, with z up in its picture."""
 
 
 class Served:
@@ -41,10 +48,10 @@ class Served:
             trainer.train_step()
         self.photographs = Photographs(run, lambda: trainer.model)
         self.queue = RenderQueue(in_training(run, trainer), truth=self.photographs.truth)
-        self.folder, self.model = folder, trainer.model
+        self.folder, self.data, self.model = folder, data, trainer.model
         self._server = open_server("127.0.0.1", 17007, "test")
         self.port = self._server.get_port()
-        self.page = Page(self._server, self.queue, self.photographs, may_render=False)
+        self.page = Page(self._server, self.queue, self.photographs, may_start=False)
         self._ending = False
         self._thread = threading.Thread(target=self._draw)
         self._thread.start()
@@ -157,6 +164,91 @@ def test_a_crop_box_leaves_the_background(served: Served, connected: Callable[..
     client.set("Highest corner", [6.0, 6.0, 6.0])
     client.set("Crop", True)
     assert client.finished().min() > 250  # white
+
+
+@pytest.mark.medium
+def test_an_arrow_moves_a_face_of_the_box_and_the_file_is_the_region(
+    served: Served, connected: Callable[..., Client]
+) -> None:
+    """The box that arrows have made cuts the picture as the same numbers do, and its file is a region of exports."""
+    client, typed = connected(), connected()
+    for one in (client, typed):
+        one.look(**FROM_THE_SIDE)
+        whole = one.finished()
+        one.set("Crop", True)
+    low, high = served.model.scene.box.double().tolist()
+    arrow = client.message("TransformControlsMessage", name="/crop/z1")
+    assert arrow["props"]["active_axes"] == [False, False, True]
+    drag = {"name": "/crop/z1", "owner": arrow["owner"]}
+    move = {**drag, "type": "TransformControlsUpdateMessage", "wxyz": (1.0, 0.0, 0.0, 0.0)}
+    client.send({**drag, "type": "TransformControlsDragStartMessage"})
+    client.send({**move, "position": [float("nan")] * 3})
+    client.send({**move, "position": (0.0, 0.0, low[2] - 5.0)})  # beyond the opposite face
+    client.send({**move, "position": (0.0, 0.0, 0.25)})
+    client.send({**drag, "type": "TransformControlsDragEndMessage"})
+    typed.set("Highest corner", [*high[:2], 0.25])
+    cut = client.finished()
+    assert np.abs(cut.astype(int) - typed.finished()).max() < 8
+    assert decibels(cut, whole) < 25
+    client.set("Save the box", True)
+    file = served.folder / "crop.yaml"
+    until(file.is_file)
+    found, placement = read_region(file), served.queue.loaded.placement
+    assert isinstance(found, Box)
+    ends = placement.points(torch.tensor([found.low, found.high]))  # the tiny data set is placed without a rotation
+    np.testing.assert_allclose(ends, [low, [*high[:2], 0.25]], atol=1e-6)
+
+
+@pytest.mark.medium
+def test_the_camera_is_levelled_and_its_field_of_view_set(served: Served, connected: Callable[..., Client]) -> None:
+    client = connected()
+    client.look(**FROM_THE_SIDE, up_direction=(0.3, 0.1, 0.9))
+    client.finished()
+    client.set("Level", True)
+    assert client.message("SetCameraUpDirectionMessage", initial=False)["position"] == pytest.approx([0, 0, 1])
+    client.set("Up", "-x")
+    assert client.message("SetCameraUpDirectionMessage", initial=False)["position"] == pytest.approx([-1, 0, 0])
+    client.set("Field of view", 80.0)
+    assert client.message("SetCameraFovMessage", initial=False)["fov"] == pytest.approx(math.radians(80))
+    client.set("Field of view", 1e9)
+    assert client.message("SetCameraFovMessage", initial=False)["fov"] == pytest.approx(math.radians(140))
+
+
+@pytest.mark.medium
+def test_keys(served: Served, connected: Callable[..., Client]) -> None:
+    client = connected()
+    client.look()
+    whole = client.finished()
+
+    def press(label: str) -> None:
+        client.send({"type": "CommandTriggerMessage", "uuid": client.controls[label][0]})
+
+    press("Next output")
+    assert decibels(client.finished(), whole) < 25  # depth
+    client.set("Output", "rgb")
+    client.finished()
+    press("Next photograph")
+    pose = served.photographs.pose(1)
+    assert client.message("SetCameraPositionMessage", initial=False)["position"] == pytest.approx(pose[:, 3].tolist())
+
+
+@pytest.mark.medium
+def test_a_photograph_lies_over_the_picture(served: Served, connected: Callable[..., Client]) -> None:
+    """From where one was taken; from elsewhere the picture is the model's alone."""
+    client, pose = connected(), served.photographs.pose(3)
+    where = {"wxyz": quaternion_of(pose), "position": tuple(pose[:, 3].tolist()), "fov": served.photographs.fov(3)}
+    client.look(**where, image_width=60)
+    model = client.finished()
+    client.set("Overlay", 1.0)
+    rgba = iio.imread(served.data / "train" / "r_3.png").astype(float)
+    photograph = rgba[..., :3] * rgba[..., 3:] / 255 + 255 - rgba[..., 3:]
+    small = torch.from_numpy(photograph).permute(2, 0, 1)[None]
+    large = torch.nn.functional.interpolate(small, (60, 60), mode="bilinear")[0].permute(1, 2, 0).numpy()
+    assert decibels(client.finished(), large) > 30
+    client.set("Overlay", 0.5)
+    assert decibels(client.finished(), (large + model) / 2) > 30
+    client.look(position=(0.0, 0.5, -4.0))
+    assert decibels(client.finished(), truth(served, 80, position=(0.0, 0.5, -4.0))) > 35
 
 
 def test_garbage_on_the_socket(served: Served, connected: Callable[..., Client]) -> None:

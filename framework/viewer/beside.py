@@ -1,0 +1,94 @@
+"""A second run beside the first: both are drawn from the same camera, and a divider separates them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.ndc import Ndc
+from nerfloom.evaluation.outputs import Arrays
+from nerfloom.training.loaded import Loaded
+from nerfloom.viewer.drawing import Truth, draw
+from nerfloom.viewer.pace import Piece
+from nerfloom.viewer.request import Request
+
+COLOR = (255, 190, 0)
+"""Colour of the divider."""
+
+
+@dataclass(frozen=True)
+class Beside:
+    """A second run or file of the same data."""
+
+    loaded: Loaded
+    """The second run; its scene may be placed in another way."""
+    truth: Truth | None = None
+    """True images for its output `error`."""
+
+
+def check_beside(loaded: Loaded, second: Loaded) -> None:
+    """Check that two runs can be shown side by side.
+
+    Args:
+        loaded: the first run or file.
+        second: the second run or file.
+
+    Raises:
+        ConfigError: if one of them is in normalised device coordinates, in which frames differ by no similarity.
+    """
+    for one in (loaded, second):
+        if one.model.scene.warped:
+            raise ConfigError(f"{one.origin} is in normalised device coordinates (--ndc): it can only be shown alone")
+
+
+def draw_beside(
+    loaded: Loaded, second: Beside | None, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None
+) -> Arrays:
+    """Return the part of a piece of a view that the requested output needs, of one run or of two.
+
+    Args:
+        loaded: the first run, left of the divider.
+        second: the second run; None for the first alone.
+        request: the view, in the frame of the first run's scene.
+        piece: rows at a stride.
+        ndc: normalised device coordinates of the scene; None if it has none.
+        truth: true images of the first run for the output `error`.
+    """
+    if second is None or request.divider is None or request.divider >= 1:
+        return draw(loaded, request, piece, ndc, truth)
+    there = second.loaded.scaled(loaded.scale)
+    moved = request.moved(*loaded.placement.similarity_to(there.placement))
+    right = draw(there, moved, piece, None, second.truth)
+    return joined(draw(loaded, request, piece, None, truth), right, request.divider)
+
+
+def joined(left: Arrays, right: Arrays, divider: float) -> Arrays:
+    """Return arrays whose left part is of one picture, and the rest of another.
+
+    Args:
+        left: arrays (H, W, ...) of the picture on the left.
+        right: as many arrays of the same shapes; those of `left` give the names.
+        divider: width of the left part, as a fraction of the whole.
+    """
+    found = {}
+    for (name, one), other in zip(left.items(), right.values(), strict=True):
+        column = round(divider * one.shape[1])
+        found[name] = np.concatenate([one[:, :column], other[:, column:]], axis=1)
+    return found
+
+
+def with_divider(picture: np.ndarray, divider: float | None) -> np.ndarray:
+    """Return a picture (H, W, 3) uint8 with a line of two pixels at the divider.
+
+    Args:
+        picture: the picture.
+        divider: width of the part left of it, as a fraction of the whole; None for no line.
+    """
+    if divider is None:
+        return picture
+    column = round(divider * picture.shape[1])
+    found = picture.copy()
+    found[:, max(column - 1, 0) : column + 1] = COLOR
+    return found

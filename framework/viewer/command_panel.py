@@ -1,0 +1,82 @@
+"""The progress of a command that a browser has started, and the download of the file that it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nerfloom.viewer.camera_panel import plain
+from nerfloom.viewer.commands import Commands
+
+if TYPE_CHECKING:
+    import viser
+
+MAX_DOWNLOAD = 2**29
+"""Maximum size of a file that is sent to a browser, bytes."""
+
+
+class CommandPanel:
+    """A bar, a line of text and a button of one browser.
+
+    Only the file that its last command has written is sent. A browser cannot name a file.
+
+    Args:
+        client: the browser.
+        commands: the commands of all browsers.
+    """
+
+    def __init__(self, client: viser.ClientHandle, commands: Commands) -> None:
+        self._client, self._commands = client, commands
+        self._file: Path | None = None
+        self._bar = client.gui.add_progress_bar(0.0, visible=False)
+        self._note = client.gui.add_markdown("")
+        self._download = client.gui.add_button("Download", visible=False)
+        self._download.on_click(lambda _: self._send())
+
+    def run(self, module: str, arguments: Sequence[object], written: Callable[[], Path]) -> None:
+        """Run a command to its end, and offer its file.
+
+        Args:
+            module: module of the command, such as nerfloom.cli.render.
+            arguments: its arguments.
+            written: function that returns the file that it has written.
+        """
+        last = ""
+
+        def tell(line: str, percent: int | None) -> None:
+            nonlocal last
+            last = line
+            self._note.content = plain(line.replace("%", "percent"))
+            if percent is not None:
+                self._bar.value = float(percent)
+
+        self._file, self._download.visible = None, False
+        self._bar.value, self._bar.visible = 0.0, True
+        self._note.content = "Starting ..."
+        status = self._commands.run(module, arguments, tell)
+        self._bar.visible = False
+        if status is None:
+            self._note.content = "Another command is running; wait until it has ended."
+        elif status:
+            self._note.content = plain(last) if last.startswith("error: ") else "It failed; see the terminal."
+        else:
+            self._offer(written())
+
+    def _offer(self, file: Path) -> None:
+        size = file.stat().st_size
+        self._note.content = f"Wrote {plain(file.name)}, {size / 1e6:.2f} MB."
+        if size <= MAX_DOWNLOAD:
+            self._file, self._download.visible = file, True
+
+    def _send(self) -> None:
+        """Send the file."""
+        file = self._file
+        if file is None:
+            return
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            self._note.content = f"Cannot read {plain(file.name)}: {error.strerror or error}"
+            return
+        self._client.send_file_download(file.name, content, save_immediately=True)

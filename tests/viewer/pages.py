@@ -1,0 +1,185 @@
+"""What tests of the page share: a viewer that is started, its controls as a person uses them, and its picture."""
+
+import json
+import re
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerfloom.cameras.view import View
+from nerfloom.training.trained import load_trained
+from nerfloom.viewer.request import Pose, Request
+from tests.patience import PATIENCE
+from tests.viewer.chromium import Tab
+
+PICTURE = np.s_[200:520, 60:540]
+"""Rows and columns of the page beside the panel and below the note that WebGL is slow here."""
+
+
+@contextmanager
+def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A command that serves the viewer, and its address."""
+    process = subprocess.Popen([*map(str, words)], stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    address = ""
+    for line in process.stderr:
+        if found := re.search(r"viewer: (http://\S+)", line):
+            address = found[1]
+            break
+    assert address, "the command ended before it served anything"
+    try:
+        yield process, address
+    finally:
+        process.terminate()
+        process.communicate(timeout=PATIENCE)
+
+
+def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
+    """The page when it has stopped changing."""
+    end, before = time.monotonic() + seconds, tab.screenshot()
+    while time.monotonic() < end:
+        time.sleep(1.5)
+        now = tab.screenshot()
+        if np.array_equal(now, before) and now[150:500, 50:500].std() > 5:
+            return now
+        before = now
+    raise AssertionError("the page did not come to rest")
+
+
+def size_of(tab: Tab) -> tuple[int, int]:
+    """Width and height of the picture, pixels of the page."""
+    width, height = tab.evaluate("(c => [c.clientWidth, c.clientHeight])(document.querySelector('canvas'))")
+    return width, height
+
+
+def text_of(tab: Tab) -> str:
+    """The words of the page."""
+    return str(tab.evaluate("document.body.innerText"))
+
+
+def shown(tab: Tab) -> np.ndarray:
+    """The picture at rest."""
+    return settled(tab)[PICTURE].astype(float)
+
+
+def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None, fov: float = 50.0) -> np.ndarray:
+    """What the run's model renders from the page's camera: position, target and up."""
+    width, height = size_of(tab)
+    position, target, up = (torch.tensor(camera[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
+    back = torch.nn.functional.normalize(position - target, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
+    matrix = torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
+    model = load_trained(run, device_type="cpu").model
+    request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(fov)), width, height, time=time)
+    picture = model.render_view(View(request.camera(), time=time), model.background)
+    return picture.rgb.clamp(0, 1).numpy()[PICTURE] * 255
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / (np.square(a - b).mean() + 1e-6)))
+
+
+def choose(tab: Tab, label: str, option: str) -> None:
+    """Choose an option of a list, which is the input beside its label."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const row = found[0].parentElement.parentElement;
+      const list = document.getElementById(found[0].htmlFor) || row.querySelector("input");
+      list.scrollIntoView({{block: "nearest"}});
+      const box = list.getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    tab.click(*tab.evaluate(script))
+    time.sleep(0.5)
+    tab.press(option)
+
+
+def to_the_end(tab: Tab) -> None:
+    """Press End on the first slider, which is that of time where there is one."""
+    tab.evaluate("document.querySelector('[role=slider]').focus()")
+    tab.key("End", "End", 35)
+
+
+def type_into(tab: Tab, label: str, index: int, text: str) -> None:
+    """Replace what one of the fields beside a label holds, as the keyboard does."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      const first = document.getElementById(found[0].htmlFor).closest(".mantine-NumberInput-root");
+      const field = first.parentElement.querySelectorAll("input")[{index}];
+      field.focus();
+      field.select();
+    }})()"""
+    tab.evaluate(script)
+    tab.send("Input.insertText", text=text)
+
+
+def type_number(tab: Tab, label: str, text: str) -> None:
+    """Replace the number beside a slider."""
+    script = f"""(() => {{
+      let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
+      while (!row.querySelector("[role=slider]")) row = row.parentElement;
+      const field = row.querySelector("input:not([type=hidden])");
+      field.scrollIntoView({{block: "center"}});
+      field.focus();
+      field.select();
+    }})()"""
+    tab.evaluate(script)
+    tab.send("Input.insertText", text=text)
+    time.sleep(1)
+
+
+def tick(tab: Tab, label: str) -> None:
+    """Click the box beside a label, when it has come to rest: a folder opens slowly."""
+    script = f"""(() => {{
+      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
+      document.getElementById(found[0].htmlFor).scrollIntoView({{block: "nearest"}});
+      const box = document.getElementById(found[0].htmlFor).getBoundingClientRect();
+      return [box.x + box.width / 2, box.y + box.height / 2];
+    }})()"""
+    places = [[], tab.evaluate(script)]
+    while places[-2] != places[-1]:
+        time.sleep(0.3)
+        places.append(tab.evaluate(script))
+    tab.click(*places[-1])
+
+
+def pixel_of(tab: Tab, camera: list[float], point: Sequence[float]) -> tuple[np.ndarray, float]:
+    """Where the page shows a point, and the pixels of a length of 1 there: a pinhole, in float64."""
+    width, height = size_of(tab)
+    position, target, up = (np.array(camera[i : i + 3]) for i in (0, 3, 6))
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    offset, focal = np.array(point) - position, 0.5 * height / np.tan(np.radians(25))
+    depth = offset @ ahead
+    column, row = offset @ right, -(offset @ np.cross(right, ahead))
+    return np.array([width / 2 + focal * column / depth, height / 2 + focal * row / depth]), focal / depth
+
+
+def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequence[float]) -> np.ndarray:
+    """Which rays of the page's picture meet a box: slabs, in float64, independent of what the viewer does."""
+    width, height = size_of(tab)
+    position, target, up = (np.array(camera[i : i + 3]) for i in (0, 3, 6))
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    focal = 0.5 * height / np.tan(np.radians(25))
+    across = (np.arange(width) + 0.5 - width / 2) / focal
+    down = (np.arange(height) + 0.5 - height / 2) / focal
+    rays = ahead + across[None, :, None] * right + down[:, None, None] * np.cross(ahead, right)
+    sides = (np.array([low, high])[:, None, None] - position) / rays
+    enter, leave = sides.min(0).max(-1), sides.max(0).min(-1)
+    return (leave > np.maximum(enter, 0))[PICTURE]
+
+
+def look_of(run: Path) -> list[float]:
+    """The camera that the page begins with: position, target and up."""
+    camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
+    assert camera is not None
+    position, back = camera[0, :, 3], camera[0, :, 2]
+    return [*position.tolist(), *(position - back).tolist(), 0.0, 0.0, 1.0]

@@ -1,0 +1,87 @@
+"""Commands that browsers start: what they print, their progress and their end."""
+
+import os
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from nerfloom.export.kinds import KINDS
+from nerfloom.viewer import commands
+from nerfloom.viewer.commands import Commands
+from nerfloom.viewer.export_panel import CHOICES, newest
+from tests.patience import until
+
+PRINTS = """
+import os, sys
+print("42 frames take long", file=sys.stderr)
+print("Rendering: 34 %, 41 of 120, 12 s left", os.environ["NERFLOOM_PROGRESS"], file=sys.stderr)
+print("error: the disk is full", file=sys.stderr)
+sys.exit(int(sys.argv[1]))
+"""
+WAITS = """
+import os, sys, time
+print("begun", file=sys.stderr, flush=True)
+while not os.path.exists(sys.argv[1]):
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module is the text of a program here."""
+    monkeypatch.setattr(commands, "python_command", lambda text, *words: [sys.executable, "-c", text, *map(str, words)])
+
+
+@pytest.mark.parametrize("status", [0, 3])
+def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    told: list[tuple[str, int | None]] = []
+    found = Commands().run(PRINTS, [status], lambda line, percent: told.append((line, percent)))
+    assert found == status
+    assert told == [
+        ("42 frames take long", None),
+        ("Rendering: 34 %, 41 of 120, 12 s left often", 34),
+        ("error: the disk is full", None),
+    ]
+    said = capsys.readouterr().err
+    assert "the disk is full" in said
+    assert "Rendering" not in said  # the page shows it
+
+
+def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
+    running, told, ended = Commands(), list[str](), list[int | None]()
+
+    def run(file: Path) -> threading.Thread:
+        told.clear()
+        words = [file]
+        thread = threading.Thread(
+            target=lambda: ended.append(running.run(WAITS, words, lambda line, _: told.append(line)))
+        )
+        thread.start()
+        until(lambda: told)
+        return thread
+
+    first = run(tmp_path / "end")
+    assert running.run(PRINTS, [0], lambda line, _: told.append(line)) is None
+    (tmp_path / "end").touch()
+    first.join()
+    assert ended == [0]
+    assert told == ["begun"]
+    second = run(tmp_path / "never")
+    running.close()
+    second.join()
+    assert ended[1] not in (0, None)
+    running.close()  # nothing is left to stop
+
+
+def test_every_kind_and_format_is_offered() -> None:
+    assert {name for name, _ in CHOICES.values()} == set(KINDS)
+    assert "gaussian-splat .spz" in CHOICES
+
+
+def test_the_newest_file_is_offered(tmp_path: Path) -> None:
+    for age, name in enumerate(("b.ply", "a.ply", "c.ply", "d.spz")):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (1000 - age, 1000 - age))
+    assert newest(tmp_path, ".ply").name == "b.ply"

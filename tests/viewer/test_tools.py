@@ -1,0 +1,239 @@
+"""The viewer's tools in headless Chromium: the box, the lens, the overlay, exports, two runs, keys and fingers."""
+
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from nerfloom.geometry.regions import Box, read_region
+from nerfloom.splats.files import read_gaussians
+from nerfloom.splats.gaussians import HasGaussians
+from nerfloom.training.trained import load_trained
+from nerfloom.viewer.crop_panel import ARROW, COLOR
+from tests.cli.helpers import command, train
+from tests.patience import until
+from tests.training.helpers import tiny_trainer
+from tests.viewer.chromium import Chromium, Tab
+from tests.viewer.pages import (
+    PICTURE,
+    choose,
+    decibels,
+    expected,
+    look_of,
+    pixel_of,
+    settled,
+    shown,
+    size_of,
+    started,
+    text_of,
+    tick,
+    type_into,
+    type_number,
+)
+
+pytest.importorskip("viser", reason="the extra [viewer] is not installed")
+pytestmark = pytest.mark.slow
+WATCH = """(() => {
+  window.saved = [];
+  const make = URL.createObjectURL;
+  URL.createObjectURL = blob => { window.saved.push(blob.size); return make.call(URL, blob); };
+})()"""
+"""Keeps the sizes of what the page saves."""
+
+
+def edge_pixels(tab: Tab) -> int:
+    """How many pixels of the page at rest have the colour of the box's edges."""
+    return int((np.abs(settled(tab)[:, :560].astype(int) - COLOR).max(-1) < 50).sum())
+
+
+def test_the_box_is_drawn_and_an_arrow_is_dragged(browser: Chromium, run: Path) -> None:
+    low, high = load_trained(run, device_type="cpu").model.scene.box.double().tolist()
+    look, placement = look_of(run), load_trained(run, device_type="cpu").placement
+    with started(command("ns-viewer"), run, "--websocket-port", 17607) as (_, address):
+        tab = browser.open(address)
+        without = edge_pixels(tab)
+        tab.press("Crop")
+        tick(tab, "Crop")
+        type_into(tab, "Highest corner", 2, "0.3")
+        time.sleep(1)
+        drawn = edge_pixels(tab)
+        top = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0.3]
+        root, scale = pixel_of(tab, look, top)
+        tip, _ = pixel_of(tab, look, [*top[:2], 0.3 + ARROW / scale])
+        start, rise = root + 0.6 * (tip - root), 0.7 * ARROW / scale
+        tab.drag(tuple(start), tuple(start + 0.7 * (tip - root)))
+        tab.press("Save the box")
+        file = run / "crop.yaml"
+        until(file.is_file)
+        tick(tab, "Show the box")
+        time.sleep(1)
+        hidden = edge_pixels(tab)
+        tab.close()
+    found = read_region(file)
+    file.unlink()
+    print(f"pixels of edges: {without} without, {drawn} drawn, {hidden} hidden")
+    assert isinstance(found, Box)
+    assert drawn > without + 100
+    assert hidden < without + 50
+    ends = placement.points(torch.tensor([found.low, found.high])).tolist()
+    np.testing.assert_allclose(ends[0], low, atol=1e-5)
+    np.testing.assert_allclose(ends[1][:2], high[:2], atol=1e-5)
+    print(f"the face rose by {ends[1][2] - 0.3:.3f} of {rise:.3f}")
+    assert ends[1][2] - 0.3 == pytest.approx(rise, rel=0.2)
+
+
+def test_field_of_view_and_up(browser: Chromium, run: Path) -> None:
+    look = look_of(run)
+    with started(command("ns-viewer"), run, "--websocket-port", 17707) as (_, address):
+        tab = browser.open(address)
+        first = shown(tab)
+        type_number(tab, "Field of view", "80")
+        assert decibels(shown(tab), expected(run, tab, look, fov=80.0)) > 30
+        type_number(tab, "Field of view", "50")
+        choose(tab, "Up", "x")
+        time.sleep(1)
+        tilted = shown(tab)
+        assert decibels(tilted, expected(run, tab, [*look[:6], 1.0, 0.0, 0.0])) > 30
+        assert decibels(tilted, first) < 25
+        choose(tab, "Up", "scene")
+        time.sleep(1)
+        assert decibels(shown(tab), first) > 35
+        tab.close()
+
+
+def test_a_photograph_lies_over_the_picture(browser: Chromium, run: Path, shared_tiny: Path) -> None:
+    rgba = iio.imread(shared_tiny / "train" / "r_0.png").astype(float)
+    small = torch.from_numpy(rgba[..., :3] * rgba[..., 3:] / 255 + 255 - rgba[..., 3:]).permute(2, 0, 1)[None]
+    with started(command("ns-viewer"), run, "--websocket-port", 17807) as (_, address):
+        tab = browser.open(address)
+        shown(tab)
+        tab.press("Photographs")
+        tab.press("Go to the photograph")
+        time.sleep(1)
+        tab.press("View")
+        below = shown(tab)
+        type_number(tab, "Overlay", "1")
+        over = shown(tab)
+        width, height = size_of(tab)
+        tab.close()
+    large = torch.nn.functional.interpolate(small, (height, height), mode="bilinear")[0].permute(1, 2, 0).numpy()
+    left = (width - height) // 2  # the photograph is a square as high as the page
+    truth = np.full((height, width, 3), np.nan)
+    truth[:, max(left, 0) : left + height] = large[:, max(-left, 0) : width - left]
+    truth = truth[PICTURE]
+    seen = np.isfinite(truth).all(-1)
+    print(
+        f"against the photograph: {decibels(below[seen], truth[seen]):.1f} dB, {decibels(over[seen], truth[seen]):.1f}"
+    )
+    assert seen.mean() > 0.5
+    assert decibels(over[seen], truth[seen]) > 33
+    assert decibels(over[seen], truth[seen]) > decibels(below[seen], truth[seen]) + 3
+
+
+def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", max_num_iterations=60)
+    trainer.train()
+    run = trainer.folder
+    with started(command("ns-viewer"), run, "--websocket-port", 17907) as (_, address):
+        tab = browser.open(address)
+        shown(tab)
+        tab.evaluate(WATCH)
+        tab.press("Crop")
+        tick(tab, "Crop")
+        type_into(tab, "Highest corner", 2, "0")
+        time.sleep(1)
+        tab.press("Export")
+        time.sleep(1)
+        tab.press("Export")  # the button in the tab
+        until(lambda: "Wrote splat.ply" in text_of(tab))
+        file = run / "exports" / "splat.ply"
+        tab.press("Download")
+        until(lambda: file.stat().st_size in tab.evaluate("window.saved"))
+        choose(tab, "What", "cameras .json")
+        tab.press("Export")
+        until(lambda: "takes no crop" in text_of(tab))
+        tab.close()
+    model = load_trained(run, device_type="cpu").model
+    assert isinstance(model, HasGaussians)
+    means = read_gaussians(file).gaussians.means.double()
+    assert 0 < len(means) < len(model.gaussians())
+    region = read_region(run / "crop.yaml")
+    assert region.contains(means).all()
+
+
+def test_a_video_has_a_bar_and_is_downloaded(browser: Chromium, run: Path) -> None:
+    with started(command("ns-viewer"), run, "--websocket-port", 18007) as (_, address):
+        tab = browser.open(address)
+        shown(tab)
+        tab.evaluate(WATCH)
+        tab.press("Path")
+        tab.press("Add this camera")
+        tab.drag((300, 400), (420, 380))
+        time.sleep(1)
+        tab.press("Add this camera")
+        time.sleep(1)
+        tab.press("Save and render")
+        until(lambda: tab.evaluate("document.querySelector('[role=progressbar]') !== null"))
+        until(lambda: "Wrote camera" in text_of(tab))
+        assert tab.evaluate("document.querySelector('[role=progressbar]') === null")
+        (video,) = [file for file in run.glob("camera_path.*") if file.is_file() and file.suffix != ".json"]
+        tab.press("Download")
+        until(lambda: video.stat().st_size in tab.evaluate("window.saved"))
+        tab.close()
+    video.unlink()
+
+
+def test_two_runs_side_by_side(browser: Chromium, run: Path, shared_tiny: Path, tmp_path: Path) -> None:
+    second, look = train(shared_tiny, tmp_path, "--max-num-iterations", 20), look_of(run)
+    with started(command("ns-viewer"), run, second, "--websocket-port", 18107) as (_, address):
+        tab = browser.open(address)
+        both, middle = shown(tab), size_of(tab)[0] // 2 - PICTURE[1].start
+        ours, theirs = expected(run, tab, look), expected(second, tab, look)
+        type_number(tab, "Divider", "1")
+        alone = shown(tab)
+        tab.close()
+    left, right = np.s_[:, : middle - 16], np.s_[:, middle + 16 :]  # JPEG's blocks carry errors across the divider
+    assert decibels(ours[left], theirs[left]) < 28  # so it matters
+    assert decibels(both[left], ours[left]) > 30
+    assert decibels(both[right], theirs[right]) > 30
+    assert decibels(alone, ours) > 30
+
+
+def test_keys(browser: Chromium, run: Path) -> None:
+    with started(command("ns-viewer"), run, "--websocket-port", 18207) as (_, address):
+        tab = browser.open(address)
+        first = shown(tab)
+        tab.key("o", "KeyO", 79)
+        time.sleep(1)
+        assert decibels(shown(tab), first) < 20  # depth
+        without = edge_pixels(tab)
+        tab.key("c", "KeyC", 67)
+        time.sleep(1)
+        assert edge_pixels(tab) > without + 100
+        tab.key("c", "KeyC", 67)
+        time.sleep(1)
+        before = shown(tab)
+        tab.key("ArrowLeft", "ArrowLeft", 37, held=0.7)
+        assert decibels(shown(tab), before) < 30  # the camera has orbited
+        tab.close()
+
+
+def test_a_narrow_screen_and_a_finger(browser: Chromium, run: Path) -> None:
+    with started(command("ns-viewer"), run, "--websocket-port", 18307) as (_, address):
+        tab = browser.open("about:blank")
+        tab.phone(390, 780, address)
+        until(lambda: "Field of view" in text_of(tab))
+        before = settled(tab)[180:300, 60:330].astype(float)
+        assert before.std() > 5
+        assert tab.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        inside = """[...document.querySelectorAll("[role=tab]")].every(tab => {
+          const box = tab.getBoundingClientRect();
+          return box.left >= 0 && box.right <= window.innerWidth;
+        })"""
+        assert tab.evaluate(inside)
+        tab.swipe((120, 240), (260, 230))
+        assert decibels(settled(tab)[180:300, 60:330], before) < 25  # the finger has turned the camera
+        tab.close()

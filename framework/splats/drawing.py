@@ -11,7 +11,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import every
 from nerfloom.data.scene import Scene
-from nerfloom.geometry.lenses import LENSES, Distortion
+from nerfloom.geometry.lenses import LENSES, Distortion, unproject
 from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.rendering.outputs import NORMALS
@@ -76,6 +76,37 @@ def _flipped(dtype: torch.dtype, device: torch.device) -> Tensor:
 def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
     """Return the distortion of a lens, cached: its range of validity is found by a slow iteration."""
     return Distortion.of(model, torch.tensor([coefficients], dtype=torch.float64))
+
+
+def ray_directions(camera: SplatCamera) -> Tensor:
+    """Return the unit directions (H, W, 3) of the rays through an image's pixels, in the scene's frame.
+
+    They have no gradient. A pixel without a ray has some finite direction.
+
+    Args:
+        camera: the image.
+    """
+    c, pose = camera, camera.pose.detach()
+    return _local_directions(c.width, c.height, c.intrinsics, c.lens, c.fisheye, pose.device).to(pose) @ pose[:, :3]
+
+
+@lru_cache(maxsize=4)
+def _local_directions(
+    width: int,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    lens: Distortion | None,
+    fisheye: bool,
+    device: torch.device,
+) -> Tensor:
+    """Return unit directions (H, W, 3) in the camera's frame, cached: inverting the distortion is slow."""
+    fx, fy, cx, cy = intrinsics
+    rows, columns = torch.arange(height) + 0.5, torch.arange(width) + 0.5
+    y, x = (part.flatten() for part in torch.meshgrid((rows - cy) / fy, (columns - cx) / fx, indexing="ij"))
+    model = "fisheye" if fisheye else "pinhole" if lens is None else "opencv"
+    lenses = None if lens is None else lens[torch.zeros(len(x), dtype=torch.long)]
+    upwards = unproject(model, x, y, lenses).directions  # x right, y up, looking along -z
+    return (upwards @ torch.tensor(FLIPPED)).view(height, width, 3).to(device)
 
 
 @torch.no_grad()

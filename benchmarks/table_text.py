@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Any
 
 from benchmarks.tables import Result, Row, Table, kept
 from nerfloom.evaluation.lpips import NETWORK
@@ -44,6 +45,9 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
     def of_image(name: str) -> Callable[[Result], float | None]:
         return lambda result: next((image["psnr"] for image in result["per_image"] if image["name"] == name), None)
 
+    def of_surface(figure: Callable[[dict[str, Any]], float | None]) -> Callable[[Result], float | None]:
+        return lambda result: None if result.get("geometry") is None else figure(result["geometry"])
+
     def memory(result: Result) -> float | None:
         return None if (used := of_run("peak_memory_bytes")(result)) is None else used / 2**30
 
@@ -55,6 +59,10 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
         *((f"size {size}", of_size(size), "{:.2f} dB".format) for size in sizes),
         *((heading, of_image(name), "{:.2f} dB".format) for heading, name in images.items()),
         ("floaters", lambda result: result["results"].get("floaters"), "{:.2f} %".format),
+        ("Chamfer", of_surface(lambda found: found["chamfer_percent"]), "{:.3f} %".format),
+        ("F-score", of_surface(lambda found: 100 * found["f_scores"][0]["f_score"]), "{:.1f} %".format),
+        ("normals", of_surface(lambda found: (found["normals"] or {}).get("degrees")), "{:.2f}°".format),
+        ("faces", of_surface(lambda found: found["faces"]), "{:,.0f}".format),
         ("steps", of_run("steps"), "{:,.0f}".format),
         ("training rays/s", of_run("rays_per_second"), lambda rate: f"{float(f'{rate:.3g}'):,.0f}"),
         ("samples a ray", of_run("samples_per_ray"), "{:.1f}".format),
@@ -126,5 +134,11 @@ def estimate(row: Row, done: Sequence[tuple[Row, Result]]) -> float:
     """
     near = [(other, found) for other, found in done if other.data == row.data]
     same = [(other, found) for other, found in near if other.method == row.method] or near
-    known = [found["results"]["num_images"] / found["results"]["fps"] for _, found in same]
+    known = [_evaluation_seconds(found) for _, found in same]
     return LOADING + row.seconds + (fmean(known) if known else EVALUATION)
+
+
+def _evaluation_seconds(result: Result) -> float:
+    """Return the seconds of a result's images, and of its surface if it was judged."""
+    of_images = result["results"]["num_images"] / result["results"]["fps"]
+    return of_images if result.get("geometry") is None else of_images + result["geometry"]["seconds"]

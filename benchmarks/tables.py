@@ -1,15 +1,16 @@
 """Tables of results: each row a run in a process of its own, judged on every held-out image and kept in a JSON file.
 
 A table is a YAML file. Its `rows` are blocks: every data set of a block with every method, budget and seed of it is a
-row. The results of a table are one JSON file, `rows`, by name. Rows that are in it are not run again, so that a table
-of many hours grows over days. A row that was stopped goes on where it was.
+row. If a block's `geometry` names a reference, the surfaces of its rows are compared with it. The results of a table
+are one JSON file, `rows`, by name. Rows that are in it are not run again, so that a table of many hours grows over
+days. A row that was stopped goes on where it was.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, shown
 from nerfloom.base.plain import from_plain, read_yaml
 from nerfloom.benchmarks.results import add_row, read_rows
+from nerfloom.cli.geometry_flags import FILES, GeometryFlags
 from nerfloom.comparison.measures import measure, read_json
 from nerfloom.comparison.plan import FIRST_SEED, Conditions, Contender, PlannedRun, split_words
 from nerfloom.comparison.runner import job_of
@@ -40,6 +42,8 @@ class Block:
     """Seconds of training."""
     seeds: int = 1
     """Number of seeds."""
+    geometry: GeometryFlags = field(default_factory=GeometryFlags)
+    """Reference of the surfaces, in the folder of all data, and how they are compared with it."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,8 @@ class Row:
     """The run."""
     conditions: Conditions
     """Its data and budget."""
+    geometry: GeometryFlags
+    """How its surface is judged; not at all without a reference."""
 
     @property
     def seconds(self) -> float:
@@ -133,15 +139,24 @@ def _rows(block: Any, where: str, root: Path, runs: Path, scale: float) -> Itera
     numbers = from_plain(Block(), others, where)
     if not data or not methods or not numbers.seconds or numbers.seeds < 1:
         raise ConfigError(f"{where} has no rows; it must have data, methods, seconds, and at least one seed")
+    geometry = _below(root, numbers.geometry)
     for seed in range(FIRST_SEED, FIRST_SEED + numbers.seeds):
         for data_name, place in data.items():
             for seconds in numbers.seconds:
                 for method_name, method in methods.items():
                     conditions = _conditions(place, root, seconds * scale, None if scale == 1 else TRIED)
+                    conditions = replace(conditions, geometry=geometry.words() if geometry.reference else ())
                     # The label gives runs with other flags of the method or data another folder.
                     contender = replace(Contender.of(method), label=f"{method} on {place or 'the embedded scene'}")
                     planned = PlannedRun(contender, seed, runs / f"{seconds * scale:g}s")
-                    yield Row(data_name, method_name, planned, conditions)
+                    yield Row(data_name, method_name, planned, conditions, geometry)
+
+
+def _below(root: Path, geometry: GeometryFlags) -> GeometryFlags:
+    """Return flags with their files in the folder `root`."""
+    given = {name: getattr(geometry, name) for name in FILES}
+    files: dict[str, Any] = {name: root / file for name, file in given.items() if file is not None}
+    return replace(geometry, **files)
 
 
 def _texts(value: Any, where: str) -> dict[str, str]:
@@ -192,12 +207,14 @@ def run_rows(rows: Sequence[Row], root: Path, file: Path, launcher: Launcher) ->
         Name of each failed row -> reason.
 
     Raises:
-        ConfigError: if the launcher cannot run them.
+        ConfigError: if the launcher cannot run them, or a surface cannot be judged.
         Stopped: on a signal, after the running rows have saved.
     """
     missing = {
         replace(job_of(row.planned, row.conditions), title=row.name): row for row in rows if kept(row, file) is None
     }
+    for row in missing.values():
+        row.geometry.check_geometry()
 
     def keep(job: Job) -> None:
         add_row(file, missing[job].name, found := result_of(missing[job], root))
@@ -225,4 +242,6 @@ def result_of(row: Row, root: Path) -> Result:
         "decisions": list(measured.decisions),
     }
     images = evaluation.pop("per_image")
+    if evaluation.get("geometry") is not None:
+        evaluation["geometry"]["reference"] = Path(evaluation["geometry"]["reference"]).name
     return {**evaluation, "experiment_name": row.data, "run": run, "per_image": images}

@@ -12,16 +12,19 @@ from nerfloom.base.device import HostValue
 from nerfloom.base.optimised import RowChange
 from nerfloom.base.pace import Pace
 from nerfloom.data.scene import Scene
+from nerfloom.kernels.splats.blend import Blended
 from nerfloom.kernels.splats.project import SplatCamera
+from nerfloom.losses.depth_normals import normal_error
 from nerfloom.model import Model
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.density_control import DensityControl
-from nerfloom.splats.drawing import smallest_depth
+from nerfloom.splats.drawing import ray_directions, smallest_depth
 from nerfloom.splats.drawn import DrawsGaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
 from nerfloom.splats.mcmc import Mcmc, shaken
+from nerfloom.splats.normals import with_normals
 from nerfloom.splats.rasteriser import Projected
 from nerfloom.splats.relocation import Relocation
 from nerfloom.splats.resolution import ImageSizes, most_octaves
@@ -32,6 +35,8 @@ from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, us
 
 MAX_NEW_GAUSSIANS = 1_000
 """Maximum number of Gaussians in a new model."""
+NORMALS_FROM = 7 / 30
+"""Share of the budget after which normals count: 7,000 of 30,000 steps in the code of 2D Gaussian Splatting."""
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
     "mcmc": lambda config: Mcmc(),
@@ -160,6 +165,46 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         shown = self.rasteriser.project(gaussians, camera, degree)
         self.strategy.watch(shown.records, camera)
         return shown
+
+    def aligns_normals(self, progress: float) -> bool:
+        """Return whether `surface_terms` compares normals with drawn distances at a point of the run.
+
+        Args:
+            progress: share of the budget that is spent.
+        """
+        return self.config.normal_loss_mult > 0 and progress >= NORMALS_FROM
+
+    def surface_terms(
+        self,
+        gaussians: Gaussians,
+        shown: Projected,
+        camera: SplatCamera,
+        drawn: Blended,
+        kept: Tensor | None,
+        progress: float,
+    ) -> dict[str, Tensor]:
+        """Return the terms of a loss that make Gaussians flat and turn them along surfaces, with their weights.
+
+        Args:
+            gaussians: N Gaussians, with gradient.
+            shown: these Gaussians on an image.
+            camera: camera of the image.
+            drawn: the image, with distances if `aligns_normals`.
+            kept: (H, W) bool, pixels that count; None for all.
+            progress: share of the budget that is spent.
+        """
+        config, terms = self.config, dict[str, Tensor]()
+        if config.flatness_penalty > 0 and len(gaussians):
+            # As in PGSR (Chen et al. 2024). Of equal scales a single one gets the gradient, so round Gaussians flatten.
+            smallest = gaussians.log_scales.min(-1).values.exp()
+            terms["flatness"] = config.flatness_penalty / self.extent * smallest.mean()
+        if self.aligns_normals(progress):
+            black, colored = torch.zeros(3, device=self.device), with_normals(shown, gaussians, camera)
+            normals = self.rasteriser.draw(colored, camera, black, capacity=self.capacity).image
+            rays = ray_directions(camera)
+            error = normal_error(normals, drawn.image[..., 3], drawn.transmittance, rays, kept)
+            terms["normals"] = config.normal_loss_mult * error
+        return terms
 
     def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:
         self.strategy.after_every_step(finite)

@@ -186,9 +186,9 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         gaussians = self.learnt_gaussians(batch.view.time)
         shown = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
-        content = CHANNELS["rgb" if known is None else "distance"]
+        content = CHANNELS["rgb" if known is None and not self.aligns_normals(self.progress) else "distance"]
         drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
-        rgb = self.lit(drawn.image if known is None else drawn.image[..., :3], batch.index)
+        rgb = self.lit(drawn.image if content == CHANNELS["rgb"] else drawn.image[..., :3], batch.index)
         kept = None if batch.kept is None else reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
         if kept is not None:  # other pixels have no error
             target = torch.where(kept[..., None], target, rgb.detach())
@@ -200,6 +200,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             terms["opacity"] = weight * self.penalised_opacities(gaussians, batch.view.time).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
+        terms |= self.surface_terms(gaussians, shown, camera, drawn, kept, self.progress)
         return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))
 
     def penalised_opacities(self, gaussians: Gaussians, time: float | None) -> Tensor:

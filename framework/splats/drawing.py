@@ -12,7 +12,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import every
 from nerfloom.data.scene import Scene
-from nerfloom.geometry.lenses import LENSES, Distortion, undistort
+from nerfloom.geometry.lenses import DISTORTED, LENSES, Distortion, undistort, unproject
 from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.rendering.outputs import NORMALS
@@ -98,6 +98,37 @@ def _widest_angle(
     down = torch.tensor([-cy, -cy, height - cy, height - cy], dtype=torch.float64) / fy
     x, y, _ = undistort(across, down, _lens("fisheye", coefficients)[torch.zeros(4, dtype=torch.int64)])
     return float(torch.hypot(x, y).max())
+
+
+def ray_directions(camera: SplatCamera) -> Tensor:
+    """Return the unit directions (H, W, 3) of the rays through an image's pixels, in the scene's frame.
+
+    They have no gradient. A pixel without a ray has some finite direction.
+
+    Args:
+        camera: the image.
+    """
+    c, pose = camera, camera.pose.detach()
+    model = "pinhole" if c.lens is None and c.model in DISTORTED else c.model
+    return _local_directions(c.width, c.height, c.intrinsics, c.lens, model, pose.device).to(pose) @ pose[:, :3]
+
+
+@lru_cache(maxsize=4)
+def _local_directions(
+    width: int,
+    height: int,
+    intrinsics: tuple[float, float, float, float],
+    lens: Distortion | None,
+    model: str,
+    device: torch.device,
+) -> Tensor:
+    """Return unit directions (H, W, 3) in the camera's frame, cached: inverting the distortion is slow."""
+    fx, fy, cx, cy = intrinsics
+    rows, columns = torch.arange(height) + 0.5, torch.arange(width) + 0.5
+    y, x = (part.flatten() for part in torch.meshgrid((rows - cy) / fy, (columns - cx) / fx, indexing="ij"))
+    lenses = None if lens is None else lens[torch.zeros(len(x), dtype=torch.long)]
+    upwards = unproject(model, x, y, lenses).directions  # x right, y up, looking along -z
+    return (upwards @ torch.tensor(FLIPPED)).view(height, width, 3).to(device)
 
 
 @torch.no_grad()

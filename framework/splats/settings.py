@@ -54,6 +54,8 @@ class SplattingConfig(
         "noise": AT_LEAST_0,
         "opacity_penalty": AT_LEAST_0,
         "scale_penalty": AT_LEAST_0,
+        "flatness_penalty": AT_LEAST_0,
+        "normal_loss_mult": AT_LEAST_0,
         "reduced_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
@@ -109,6 +111,12 @@ class SplattingConfig(
     scale_penalty: float | None = None
     """Weight of the mean scale, in scene extents, in the loss. Default: 0 if Gaussians start on a field's surfaces in a
     bounded scene, else 0.01."""
+    flatness_penalty: float = 0.0
+    """Weight of the mean of each Gaussian's smallest scale, in scene extents, in the loss. It makes Gaussians flat, as
+    in PGSR."""
+    normal_loss_mult: float = 0.0
+    """Weight of the disagreement between the normals of Gaussians and those of the surface at the drawn distances, as
+    in 2DGS. It counts after 7/30 of the budget. Such steps draw a second image, of normals."""
 
     def look(self) -> Look:
         """Return how Gaussians are drawn."""

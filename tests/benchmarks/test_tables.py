@@ -40,6 +40,18 @@ def write(folder: Path, text: str = ROWS) -> Path:
     return path
 
 
+SURFACES = """
+rows:
+  - data: {solids: shapes}
+    methods: {ngp: instant-ngp, planes: kplanes}
+    seconds: [10]
+    geometry: {reference_mesh: shapes/true.ply, f_score_at: [0.5], crop: 0.1}
+  - data: {ball: ball}
+    methods: {ngp: instant-ngp}
+    seconds: [10]
+"""
+
+
 def psnr_of(planned: PlannedRun, seconds: float) -> float:
     """A PSNR that differs between rows."""
     return 20 + len(planned.contender.label) / 10 + seconds / 100 + (planned.seed - 42) / 4
@@ -101,6 +113,10 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
         ("rows: [{data: {../a: b}, methods: {c: kplanes}, seconds: [1]}]", "is not a name for a row"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1, 1]}]", "two rows are called a-c-1s"),
         ("rows: [{data: {a: b}, methods: {c: kplanes}, second: [1]}]", "unknown key"),
+        (
+            "rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1], geometry: {referenc_mesh: a.ply}}]",
+            "geometry: unknown key 'referenc_mesh'. Did you mean 'reference_mesh'",
+        ),
     ],
 )
 def test_what_is_no_table(text: str, reason: str, tmp_path: Path) -> None:
@@ -112,7 +128,7 @@ def test_what_is_no_table(text: str, reason: str, tmp_path: Path) -> None:
 def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By the commands that are run, which are parsed as they will be; the data need not be there."""
     formats = {"fern": "llff", "statue_of_liberty": "llff", "record3d_door": "record3d", "lego": "blender"}
-    formats |= {"bouncingballs": "dnerf", "standup": "dnerf"}
+    formats |= {"bouncingballs": "dnerf", "standup": "dnerf", "solids": "blender"}
 
     def here(data: Path | None, named: str | None = None) -> tuple[Path | None, str]:
         return (data, named or formats[data.name]) if data and data.name in formats else found(data, named)
@@ -207,6 +223,69 @@ def test_means_and_spreads_over_seeds(
     assert cells[3][2:6] == ["0.900", "29.00 ± 0.00 dB", "30.00 ± 0.00 dB", f"{fmean(psnrs) - 1:.2f} ± {spread}"]
     assert cells[3][6:] == ["1,000", "22,000", "1.0 GiB", "0.25 s/image", "`ball-ngp-45s`"]
     assert cells[2][1:] == [""] * 10
+
+
+def test_surfaces_are_judged_by_the_reference_of_their_block(tmp_path: Path) -> None:
+    rows = read_table(write(tmp_path, SURFACES), tmp_path / "data", tmp_path / "runs").rows
+    reference = str((tmp_path / "data" / "shapes" / "true.ply").resolve())
+    words = ["--reference-mesh", reference, "--f-score-at", "0.5", "--crop", "0.1"]
+    for row in rows[:2]:
+        assert row.planned.eval_command(row.conditions)[-len(words) :] == words
+    assert "--reference-mesh" not in rows[2].planned.eval_command(rows[2].conditions)
+
+
+def test_a_reference_that_is_not_there_is_refused_before_a_run(
+    ran: list[tuple[str, float, int]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write(tmp_path, SURFACES)
+    with pytest.raises(SystemExit):
+        bench(monkeypatch, tmp_path)
+    assert "true.ply is not a file" in capsys.readouterr().err
+    assert ran == []
+    bench(monkeypatch, tmp_path, "--only", "ball")
+    assert len(ran) == 1
+
+
+def test_figures_of_surfaces_are_kept_and_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("trimesh")
+    reference = tmp_path / "data" / "shapes" / "true.ply"
+    reference.parent.mkdir(parents=True)
+    reference.touch()
+
+    def outcome(planned: PlannedRun, seconds: float) -> None:
+        finish(planned, 30.0, seconds)
+        if "shapes" in planned.contender.label:
+            evaluation = json.loads(planned.evaluation.read_text())
+            normals = {"degrees": 6.0, "cosine": 0.99} if planned.contender.method == "kplanes" else None
+            evaluation["geometry"] = {
+                "reference": str(reference), "chamfer_percent": 0.25, "faces": 1234, "seconds": 70.0,
+                "f_scores": [{"distance": 0.5, "f_score": 0.4}], "normals": normals,
+            }  # fmt: skip
+            planned.evaluation.write_text(json.dumps(evaluation))
+
+    monkeypatch.setattr(Processes, "run", at_once(outcome))
+    path = write(tmp_path, SURFACES)
+    bench(monkeypatch, tmp_path)
+    rows = rows_of(tmp_path / "results")
+    assert rows["solids-ngp-10s"]["geometry"]["reference"] == "true.ply"
+    assert str(tmp_path) not in json.dumps(rows)
+    capsys.readouterr()
+    bench(monkeypatch, tmp_path, "--show", "markdown")
+    head, _, *lines = capsys.readouterr().out.splitlines()
+    titles, *cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in (head, *lines))
+    first = titles.index("Chamfer")
+    assert titles[first : first + 4] == ["Chamfer", "F-score", "normals", "faces"]
+    assert [row[first : first + 4] for row in cells] == [
+        ["0.250 %", "40.0 %", "", "1,234"], ["0.250 %", "40.0 %", "6.00°", "1,234"], ["", "", "", ""]
+    ]  # fmt: skip
+    known = {row.name: row for row in read_table(path, tmp_path, tmp_path).rows}
+    done = [(known["solids-ngp-10s"], rows["solids-ngp-10s"])]
+    assert estimate(known["solids-planes-10s"], done) == LOADING + 10 + 16 / 4 + 70  # images and surface
 
 
 def test_what_is_no_file_of_results_is_kept(tmp_path: Path) -> None:

@@ -328,6 +328,17 @@ MUTANTS = {
             "proposals spread over what is empty",
             "kernels/test_step_functions.py::test_blurred_weights_are_integrals_of_the_convolution"),
     ],
+    "nerfloom.losses.depth_normals": [
+        Mutant("normals-of-distances-away", "normals_of_distances", "torch.linalg.cross(A, B)",
+            "torch.linalg.cross(B, A)",
+            "a loss of normals turns flat Gaussians away from the surface", "splats/test_flat.py"
+            "::test_normals_of_a_plane_are_its_own"),
+    ],
+    "nerfloom.splats.normals": [
+        Mutant("normals-of-the-longest-axis", "facing_normals", "A.argmin(-1)", "A.argmax(-1)",
+            "a loss of normals stands flat Gaussians on edge",
+            "splats/test_flat.py::test_normals_are_drawn_as_pictures_show_them"),
+    ],
     "nerfloom.losses.functions": [
         Mutant("depth-loss-unknown", "depth_error", "(A * has_depth).sum() / has_depth.sum().clamp(min=1)", "A.mean()",
             "pixels without a depth are pulled to distance 1", "test_depths.py::test_depth_error_in_closed_form"),

@@ -43,14 +43,20 @@ def job_of(planned: PlannedRun, conditions: Conditions) -> Job:
         description=conditions.budget(),
         steps=(train, Step(tuple(planned.eval_command(conditions)))),
         log=planned.log,
-        finished=partial(is_done, planned),
+        finished=partial(is_done, planned, judges_surface=bool(conditions.geometry)),
         resources=Resources(conditions.num_threads, num_gpus(conditions.device_type)),
     )
 
 
-def is_done(planned: PlannedRun) -> bool:
-    """Return whether the run `planned` is completely trained and evaluated, with finite images."""
+def is_done(planned: PlannedRun, judges_surface: bool = False) -> bool:
+    """Return whether a run is completely trained and evaluated, with finite images.
+
+    Args:
+        planned: the run.
+        judges_surface: whether its surface must have been judged too.
+    """
     summary, evaluation = read_json(planned.folder / "summary.json"), read_json(planned.evaluation)
     if not isinstance(summary, dict) or summary.get("interrupted") is not False or not isinstance(evaluation, dict):
         return False
-    return evaluation.get("results", {}).get("psnr") is not None
+    judged = not judges_surface or evaluation.get("geometry") is not None
+    return judged and evaluation.get("results", {}).get("psnr") is not None

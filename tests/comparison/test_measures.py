@@ -67,6 +67,11 @@ def test_a_run_is_done_once_it_was_judged_and_is_finite(tmp_path: Path) -> None:
     blown_up.evaluation.write_text(json.dumps(evaluation))
     assert [is_done(planned) for planned in (whole, stopped, blown_up)] == [True, False, False]
     assert measure(blown_up, CONDITIONS) is None
+    known = json.loads(whole.evaluation.read_text())
+    for geometry, done in ((None, False), ({"chamfer_percent": 0.1}, True)):
+        whole.evaluation.write_text(json.dumps({**known, "geometry": geometry}))
+        assert is_done(whole)
+        assert is_done(whole, judges_surface=True) is done
 
 
 def test_seeds_are_put_together(tmp_path: Path) -> None:

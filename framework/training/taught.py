@@ -231,7 +231,7 @@ def batch_source(model: Model[Any], dataset: Dataset, config: TrainConfig) -> Ba
         config: the settings of the run.
 
     Raises:
-        ConfigError: if settings contradict each other, or the teacher is missing or cannot teach the model.
+        ConfigError: if the teacher is missing or cannot teach the model.
     """
     photographs = make_source(model.batches, dataset, config)
     if config.teacher is None:

@@ -80,7 +80,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "nerf-plus-plus": {"method": "nerf-plus-plus", "num_layers": 3},
     "tensorf": {"method": "tensorf", "sampler": "proposal", "samples_per_batch": 24 * 8},
     "captures": {"appearance_embedding_dim": 4, "camera_optimizer": "SO3xR3", "lr_warmup_steps": 9},
-    "screws, by error": {"camera_optimizer": "SE3", "draw_by_error": True, "lr_schedule": "exponential"},
+    "screws": {"camera_optimizer": "SE3", "lr_schedule": "exponential"},
     "normals, four rays": {"predict_normals": True, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.0},
 }
 

@@ -71,22 +71,6 @@ def doubted_error(rgb: Tensor, true: Tensor, doubt: Tensor, least: float, weight
     return (each if weights is None else each * weights).mean()
 
 
-def opacity_of_transparent(accumulation: Tensor, alpha: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the mean () over pixels of the rendered opacity where it should be 0; 0 for no pixels.
-
-    The gradient does not vanish with the opacity, as that of a squared error would, so thin fog is removed too.
-
-    Args:
-        accumulation: (P,) rendered opacity.
-        alpha: (P,) opacity of the images' pixels; only pixels with exactly 0 count.
-        weights: (P,) factor of each pixel; None for 1.
-    """
-    if accumulation.numel() == 0:
-        return accumulation.sum()
-    wrong = torch.where(alpha == 0, accumulation, torch.zeros_like(accumulation))
-    return (wrong if weights is None else wrong * weights).mean()
-
-
 def normalised_distortion(weights: Tensor, samples: Samples, scale: float | None = None) -> Tensor:
     """Return the mean distortion () of rays in normalised distance: mip-NeRF 360 (Barron et al. 2022), equation 15.
 

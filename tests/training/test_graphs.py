@@ -76,7 +76,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "mip-nerf-360": {"method": "mip-nerf-360", "num_layers": 3, "encoding": "integrated"},
     "zip-nerf": {"method": "zip-nerf", "exposure": True},
     "vanilla-nerf": {"method": "vanilla-nerf", "num_layers": 3, "sampler": "hierarchical"},
-    "dnerf": {"method": "dnerf", "num_layers": 3, "sampler": "hierarchical", "transparent_share": 1.0},
+    "dnerf": {"method": "dnerf", "num_layers": 3, "sampler": "hierarchical"},
     "nerf-plus-plus": {"method": "nerf-plus-plus", "num_layers": 3},
     "tensorf": {"method": "tensorf", "sampler": "proposal", "samples_per_batch": 24 * 8},
     "captures": {"appearance_embedding_dim": 4, "camera_optimizer": "SO3xR3", "lr_warmup_steps": 9},

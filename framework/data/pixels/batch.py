@@ -66,23 +66,6 @@ class PixelBatch:
         return max(len(self.rays) // max(len(self), 1), 1)
 
 
-def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
-    """Drop some of a batch's transparent pixels; return the batch and the indices (Q,) int64 of the remaining pixels.
-
-    The weights of the remaining ones grow accordingly, so that the mean of a loss has the same expectation.
-
-    Args:
-        batch: pixels with alpha.
-        share: probability of keeping a pixel with alpha 0.
-    """
-    assert batch.alpha is not None
-    transparent = batch.alpha == 0
-    kept = (~transparent | (torch.rand(len(batch), device=transparent.device) < share)).nonzero().squeeze(-1)
-    left = batch[kept]
-    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(left) / max(len(batch), 1))
-    return replace(left, weights=weights if left.weights is None else weights * left.weights), kept
-
-
 @dataclass(frozen=True)
 class ViewBatch:
     """One whole training image, or one that a teacher has rendered."""

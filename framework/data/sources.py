@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -72,13 +73,15 @@ class BatchSource(ABC):
     def draw(self, request: Request) -> Any:
         """Return a `PixelBatch` or a `ViewBatch` for `request`."""
 
-    @abstractmethod
     def drawing_from(self, dataset: Dataset) -> BatchSource:
         """Return a source of the same kind for a changed data set, with this source's learnt state.
 
         Args:
             dataset: the same images, with a different selection of pixels to draw.
         """
+        source = copy(self)
+        source.dataset = dataset
+        return source
 
     def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:  # noqa: B027, most have nothing to learn
         """Record the errors of a rendered batch.
@@ -154,9 +157,9 @@ class PixelSource(BatchSource):
         return partial(self.stream.look_up, step)
 
     def drawing_from(self, dataset: Dataset) -> PixelSource:
-        return PixelSource(
-            dataset, self.background, self.seed, self.keypoints, self.clear, self.num_images, self.contradicted
-        )
+        source = copy(self)
+        source.dataset, source.stream = dataset, None
+        return source
 
     def learn(self, request: Request, batch: PixelBatch, rgb: Tensor) -> None:
         if self.contradicted is not None:
@@ -232,9 +235,6 @@ class ViewSource(BatchSource):
             generator = torch.Generator().manual_seed((self.seed * 1_000_003 + epoch) % 2**63)
             self._order = epoch, torch.randperm(len(self.dataset), generator=generator).tolist()
         return self._order[1][place]
-
-    def drawing_from(self, dataset: Dataset) -> ViewSource:
-        return ViewSource(dataset, self.background, self.seed)
 
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:

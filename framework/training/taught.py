@@ -120,9 +120,6 @@ class TaughtPixels(BatchSource):
         values = picture.rgb.reshape(-1, 3), picture.accumulation.reshape(-1), known_depths(picture).reshape(-1)
         return numbers[chosen], tuple(each[chosen] for each in values)
 
-    def drawing_from(self, dataset: Dataset) -> TaughtPixels:
-        return TaughtPixels(self.teacher, dataset, self.background)
-
 
 @dataclass(frozen=True)
 class Shot:
@@ -177,9 +174,6 @@ class TaughtViews(BatchSource):
             view = View.of(unseen_cameras(self.cameras, near), 0, None if times is None else times[near])
             picture = self.teacher.picture(view, torch.zeros(3, device=self.dataset.device))
         return Shot(view, picture.rgb.half(), picture.accumulation.half(), known_depths(picture))
-
-    def drawing_from(self, dataset: Dataset) -> TaughtViews:
-        return TaughtViews(self.teacher, dataset, self.background, self.seed)
 
 
 class MixedSource(BatchSource):

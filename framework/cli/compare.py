@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError
 from nerfloom.cli.common import check_weights, run_command
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import read_flags, take
 from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.cli.job_flags import JobFlags
 from nerfloom.training.run_path import check_data, check_writable
@@ -28,10 +28,6 @@ class CompareFlags(JobFlags, GeometryFlags):
 
     methods: tuple[str, ...] = ()
     """Methods; quote a method with flags: instant-ngp "vanilla-nerf --sampler occupancy"."""
-    data: Path | None = None
-    """Folder of the data set. Default: the embedded scene."""
-    data_flags: str = ""
-    """Flags of the data format, for all methods, quoted after an "=": --data-flags="--downscale-factor 2"."""
     max_seconds: float | None = None
     """Seconds of training of each method, without evaluation and saving."""
     max_num_iterations: int | None = None
@@ -49,10 +45,6 @@ class CompareFlags(JobFlags, GeometryFlags):
     """File of LPIPS weights with AlexNet (.npz). Default: those of the lpips package, if installed."""
     curve_images: int = 4
     """Number of views in evaluations during training; 0: none."""
-    num_threads: int | None = None
-    """CPU threads of each run. Default: all cores."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to train on."""
 
 
 def main() -> None:
@@ -63,8 +55,8 @@ def main() -> None:
 def _command(arguments: list[str]) -> None:
     from nerfloom.base.plain import from_plain, read_yaml
 
-    recipe, arguments = _recipe(arguments)
-    default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(recipe), str(recipe))
+    recipe, arguments = take(arguments, "--load-config")
+    default = CompareFlags() if recipe is None else from_plain(CompareFlags(), read_yaml(Path(recipe)), recipe)
     flags = read_flags(CompareFlags, "ns-compare", arguments, default=default)
     if flags.data is not None:
         check_data(flags.data)
@@ -77,16 +69,6 @@ def _command(arguments: list[str]) -> None:
     say(f"report: {plan.folder / 'report.html'} (also report.md, results.json, results.csv)")
     if failed:
         raise ConfigError(f"{len(failed)} of {len(rows)} methods failed: {', '.join(failed)}; the report says why")
-
-
-def _recipe(arguments: list[str]) -> tuple[Path | None, list[str]]:
-    """Return the file after --load-config, if given, and the other arguments."""
-    if "--load-config" not in arguments:
-        return None, arguments
-    index = arguments.index("--load-config")
-    if index + 1 == len(arguments):
-        raise FlagError("--load-config needs a file, such as configs/compare-lego.yml")
-    return Path(arguments[index + 1]), arguments[:index] + arguments[index + 2 :]
 
 
 def plan_of(flags: CompareFlags) -> Plan:

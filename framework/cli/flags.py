@@ -68,6 +68,26 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
     return settings
 
 
+def take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
+    """Return the value of a flag that names a path, None if it is not given, and the other arguments.
+
+    Args:
+        arguments: arguments of a command.
+        flag: the flag, such as "--load-config".
+
+    Raises:
+        FlagError: if the flag has no value.
+    """
+    for index, argument in enumerate(arguments):
+        if argument == flag:
+            if index + 1 == len(arguments):
+                raise FlagError(f"{flag} needs a path")
+            return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
+        if argument.startswith(flag + "="):
+            return argument[len(flag) + 1 :], arguments[:index] + arguments[index + 1 :]
+    return None, arguments
+
+
 def in_one_line(box: str, prog: str) -> str:
     """Return tyro's error box as one line: what is wrong, and where to look.
 

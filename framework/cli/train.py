@@ -13,7 +13,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.from_nerfstudio import flag_answer, taken, vis_answer
 from nerfloom.cli.common import run_command
-from nerfloom.cli.flags import HELP, read_flags
+from nerfloom.cli.flags import HELP, read_flags, take
 from nerfloom.registry import entry_of, registered, summary
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ def _command(arguments: list[str]) -> None:
     from nerfloom.cli.train_paths import check_paths  # here, so that the help above is fast
     from nerfloom.training.run_path import config_file
 
-    resumed, flags = _take(arguments, "--resume")
-    recipe, flags = _take(flags, "--load-config")
+    resumed, flags = take(arguments, "--resume")
+    recipe, flags = take(flags, "--load-config")
     if resumed is not None:
         found = config_file(Path(resumed))
         check_paths(flags, found, found.parent)
@@ -67,18 +67,6 @@ def _command(arguments: list[str]) -> None:
     from nerfloom.cli.session import start
 
     start(_parse_flags(run, flags, fresh=True))
-
-
-def _take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
-    """Return the value of `flag`, None if it is not given, and the other arguments."""
-    for index, argument in enumerate(arguments):
-        if argument == flag:
-            if index + 1 == len(arguments):
-                raise FlagError(f"{flag} needs a path")
-            return arguments[index + 1], arguments[:index] + arguments[index + 2 :]
-        if argument.startswith(flag + "="):
-            return argument[len(flag) + 1 :], arguments[:index] + arguments[index + 1 :]
-    return None, arguments
 
 
 def _overview() -> str:
@@ -143,10 +131,10 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
     flags, notes = taken(flags, set(_flag_names(run.config)))
     for note in notes:
         say(note)
-    if (answer := vis_answer(_take(flags, "--vis")[0] or "")) is not None:
+    if (answer := vis_answer(take(flags, "--vis")[0] or "")) is not None:
         raise FlagError(answer)
     if _are_pairs(flags):
-        given, word = _take(flags, "--data")[0], None
+        given, word = take(flags, "--data")[0], None
         asked = run.config.data if given is None else None if given == "None" else Path(given)
     else:  # a word may be a flag's value or a format's name, depending on the flags' types
         asking_nothing = [flag for flag in flags if flag not in HELP]

@@ -52,7 +52,7 @@ def test_two_methods_one_that_fails_and_a_second_call(shared_tiny: Path, tmp_pat
         (("--max-seconds", 1), 2, "--methods is empty"),
         (("--methods", "kplanez", "--max-seconds", 1), 1, "Did you mean 'kplanes'"),
         (("--methods", "kplanes", "--max-seconds", 1, "--data", "/no/such/folder"), 1, "there is no such folder"),
-        (("--load-config",), 2, "--load-config needs a file"),
+        (("--load-config",), 2, "--load-config needs a path"),
     ],
 )
 def test_what_cannot_be_compared(flags: tuple[object, ...], status: int, reason: str, tmp_path: Path) -> None:

@@ -82,14 +82,10 @@ COLOR_ERROR = ColorError()
 
 
 class SamplerLoss(LossTerm):
-    """Loss that trains the sampler itself (`Sampler.loss`), such as the interlevel loss of proposals.
+    """Loss that trains the sampler itself (`Sampler.loss`), such as the interlevel loss of proposals."""
 
-    Args:
-        name: name of the term in logs.
-    """
-
-    def __init__(self, name: str = "interlevel") -> None:
-        super().__init__(name)
+    def __init__(self) -> None:
+        super().__init__("interlevel")
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return model.sampler.learns_from_weights

@@ -26,7 +26,6 @@ VARIANTS: dict[str, list[str]] = {
     "as it is": [],
     "no visual hull (cells and pixels)": ["--silhouette-cells", "False"],
     "pixels that see background alone are drawn": ["--silhouette-pixels", "False"],
-    "pixels drawn by error": ["--draw-by-error", "True"],
     "hidden samples evaluated": ["--train-early-stop", "0"],
     "early stop in training at 1e-4": ["--train-early-stop", "1e-4"],
     "sparse updates of the tables": ["--sparse-updates", "True"],

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.console import say
+from nerfloom.base.errors import one_line
 from nerfloom.cameras.cameras import check_pose
-from nerfloom.data.image_files import one_line
 from nerfloom.data.names_on_disk import match_names
 from nerfloom.dataparsers.colmap_files import check_binary, image_names, text_names
 from nerfloom.dataparsers.reading import file_name

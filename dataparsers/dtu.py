@@ -20,9 +20,9 @@ from torch import Tensor
 from nerfloom import DataError, ParsedScene
 from nerfloom.base.arrays import read_small_arrays
 from nerfloom.base.console import say
+from nerfloom.base.errors import one_line
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import MAX_SIDE, check_pose
-from nerfloom.data.image_files import one_line
 from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.captured import captured_scene, has_transforms, image_sizes
 from nerfloom.dataparsers.colmap_model import find_models

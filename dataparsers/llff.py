@@ -11,10 +11,10 @@ from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
 from nerfloom.base.arrays import read_array
+from nerfloom.base.errors import one_line
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import check_pose
 from nerfloom.cameras.ndc import NdcCameras, find_ndc, ndc_box
-from nerfloom.data.image_files import one_line
 from nerfloom.data.names_on_disk import REDUCED
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
 from nerfloom.dataparsers.captured import captured_scene, checked_box, has_transforms

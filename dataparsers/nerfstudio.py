@@ -27,7 +27,7 @@ from nerfloom.dataparsers.companions import companions
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import file_name, number, read_pose, read_times, rigid
+from nerfloom.dataparsers.reading import file_name, number, read_frames, read_pose, read_times, rigid
 
 TRANSFORMS = "transforms.json"
 """File that identifies the format."""
@@ -97,20 +97,14 @@ class Nerfstudio(Captured):
 
 
 def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedImages:
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise DataError(f"{file} lists no frames")
-    labels = [f"{file}: frame {index}" for index in range(len(frames))]
-    for frame, label in zip(frames, labels, strict=True):
-        if not isinstance(frame, dict):
-            raise DataError(f"{label} is {shown(frame)}; it must be an object with 'file_path'")
+    frames, labels = read_frames(content, file, "file_path")
     placed = list(zip(frames, labels, strict=True))
     written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
     paths = on_disk(file.parent, written, quiet=split != "train")
     intrinsics = read_intrinsics(file, content, frames, labels, lambda: image_sizes(paths))
     if intrinsics.warning and split == "train":  # reported once
         say(intrinsics.warning)
-    poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in placed])
+    poses = torch.stack([read_pose(frame, label) for frame, label in placed])
     return PosedImages(
         folder=file.parent,
         paths=paths,

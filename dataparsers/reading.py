@@ -21,29 +21,47 @@ MAX_PATH_LENGTH = 3000
 """Maximum length of a path, bytes; most systems allow 4096."""
 
 
-def read_pose(frame: Any, where: str, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return the camera-to-world matrix (4, 4) of a frame.
+def read_frames(content: dict[str, Any], file: Path, image: str) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the frames that a JSON file lists, and their names in messages.
+
+    Args:
+        content: the file's object.
+        file: the file.
+        image: name of the entry that names a frame's image.
+
+    Raises:
+        DataError: if no frames are listed, or one is not an object.
+    """
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise DataError(f"{file} lists no frames")
+    labels = [f"{file}: frame {index}" for index in range(len(frames))]
+    for frame, label in zip(frames, labels, strict=True):
+        if not isinstance(frame, dict):
+            raise DataError(f"{label} is {shown(frame)}; it must be an object with '{image}'")
+    return frames, labels
+
+
+def read_pose(frame: dict[str, Any], where: str) -> Tensor:
+    """Return the camera-to-world matrix (4, 4) float64 of a frame.
 
     Args:
         frame: the frame's JSON object.
         where: name of the frame in messages.
-        dtype: type of the result.
 
     Raises:
         DataError: if the matrix is missing, of another shape, not finite or not rigid.
     """
-    matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
-    return rigid(matrix, f"{where}: 'transform_matrix'", where, dtype)
+    return rigid(frame.get("transform_matrix"), f"{where}: 'transform_matrix'", where)
 
 
-def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return a rigid motion (4, 4) from three or four rows of four numbers; its rotation may be rounded.
+def rigid(matrix: Any, name: str, where: str) -> Tensor:
+    """Return a rigid motion (4, 4) float64 from three or four rows of four numbers; its rotation may be rounded.
 
     Args:
         matrix: the rows.
         name: name of the matrix, for the message if it has another shape.
         where: name of the pose, for the message if it is invalid.
-        dtype: type of the result.
 
     Raises:
         DataError: if the matrix is of another shape, not finite or not rigid.
@@ -55,8 +73,7 @@ def rigid(matrix: Any, name: str, where: str, dtype: torch.dtype = torch.float64
     if pose.shape in ((3, 4), (4, 4)):
         pose[:3, :3] = nearest_rotation(pose[:3, :3])
     check_pose(pose, where)
-    pose = pose.to(dtype)
-    return pose if pose.shape[0] == 4 else torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=dtype)])
+    return pose if pose.shape[0] == 4 else torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
 def read_times(frames: list[Any], where: list[str]) -> Tensor | None:

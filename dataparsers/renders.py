@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom import DataError
 from nerfloom.base.console import say
 from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
@@ -19,7 +18,7 @@ from nerfloom.data.image_files import image_size
 from nerfloom.data.names_on_disk import on_disk
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.posed_images import PosedImages
-from nerfloom.dataparsers.reading import file_name, read_pose, read_times
+from nerfloom.dataparsers.reading import file_name, read_frames, read_pose, read_times
 
 OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_model", "is_fisheye")
 """Entries that describe a lens beyond its angle of view."""
@@ -50,13 +49,11 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
     """
     file = folder / f"transforms_{split}.json"
     content = read_object(file)
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise DataError(f"{file} lists no frames")
-    labels = [f"{file}: frame {index}" for index in range(len(frames))]
-    names = [_image_name(frame, label) for frame, label in zip(frames, labels, strict=True)]
+    frames, labels = read_frames(content, file, "file_path")
+    placed = list(zip(frames, labels, strict=True))
+    names = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]  # often without suffixes
     paths = on_disk(folder, names, quiet=split != "train" or not is_wanted)
-    poses = torch.stack([read_pose(frame, label, torch.float64) for frame, label in zip(frames, labels, strict=True)])
+    poses = torch.stack([read_pose(frame, label) for frame, label in placed])
     keep = existing_files(paths, split) if is_wanted else _existing(paths)
     size = image_size([paths[index] for index in keep.tolist()])
     frames, plain = [_without_sensor(frame) for frame in frames], _without_sensor(content)
@@ -80,11 +77,6 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
 
 def _existing(paths: Sequence[Path]) -> Tensor:
     return torch.tensor([index for index, path in enumerate(paths) if path.is_file()], dtype=torch.int64)
-
-
-def _image_name(frame: Any, label: str) -> str:
-    """Return the name of a frame's image; Blender writes names without a suffix."""
-    return file_name(frame.get("file_path") if isinstance(frame, dict) else None, "file_path", label)
 
 
 def _without_sensor(source: dict[str, Any]) -> dict[str, Any]:

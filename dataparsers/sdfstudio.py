@@ -27,7 +27,7 @@ from nerfloom.dataparsers.companions import companions
 from nerfloom.dataparsers.placing import Applied, from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages, StatedRegion
 from nerfloom.dataparsers.projections import check_skew
-from nerfloom.dataparsers.reading import file_name, numbers, rigid, side_or_none
+from nerfloom.dataparsers.reading import file_name, numbers, read_frames, rigid, side_or_none
 
 META = "meta_data.json"
 """File that identifies the format."""
@@ -59,15 +59,9 @@ class SdfStudio(Captured):
 
 
 def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedImages:
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise DataError(f"{file} lists no frames")
+    frames, labels = read_frames(content, file, "rgb_path")
     if content.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE"):
         raise DataError(f"{file}: 'camera_model' is {shown(content['camera_model'])}; it must be OPENCV")
-    labels = [f"{file}: frame {index}" for index in range(len(frames))]
-    for frame, label in zip(frames, labels, strict=True):
-        if not isinstance(frame, dict):
-            raise DataError(f"{label} is {shown(frame)}; it must be an object with 'rgb_path'")
     placed = list(zip(frames, labels, strict=True))
     names = [file_name(frame.get("rgb_path"), "rgb_path", label) for frame, label in placed]
     paths = on_disk(file.parent, names, quiet=split != "train")

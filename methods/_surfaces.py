@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, Literal, TypedDict, TypeVar
+from typing import ClassVar, Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -151,6 +151,7 @@ class SurfaceConfig(
 
 
 SurfaceConfigT = TypeVar("SurfaceConfigT", bound=SurfaceConfig)
+FieldT = TypeVar("FieldT", bound=SurfaceField)
 
 
 def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT, list[Decision]]:
@@ -179,19 +180,6 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     return config, made + samples + own
 
 
-class FieldParts(TypedDict):
-    """Arguments of a field's constructor."""
-
-    box: Tensor
-    distance: Distance
-    sharpness: Sharpness
-    width: int
-    color_layers: int
-    color_bias: bool
-    direction_frequencies: int | None
-    appearance: Appearance | None
-
-
 def make_distance(config: SurfaceConfig, box: Tensor) -> Distance:
     """Return a distance that starts as a ball: a small network on a hash grid, or the papers' network.
 
@@ -205,10 +193,13 @@ def make_distance(config: SurfaceConfig, box: Tensor) -> Distance:
     return GridDistance(box, HashGrid.of(config, config.open_levels_until), radius, width)
 
 
-def field_parts(config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] = Sharpness) -> FieldParts:
-    """Return the arguments of a field's constructor.
+def surface_field(
+    kind: type[FieldT], config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] = Sharpness
+) -> FieldT:
+    """Return a field that starts as a ball.
 
     Args:
+        kind: class of the field.
         config: the method's settings, decided.
         scene: properties of the whole scene.
         sharpness: class of the learnt inverse width.
@@ -217,16 +208,16 @@ def field_parts(config: SurfaceConfig, scene: Scene, sharpness: type[Sharpness] 
     if size:
         appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
     distance, large = make_distance(config, box), config.encoding == "frequency"
-    return {
-        "box": box,
-        "distance": distance,
-        "sharpness": sharpness(config.start_sharpness / distance.size, config.sharpness_learning_rate),
-        "width": config.hidden_width,
-        "color_layers": COLOR_LAYERS if large else 1,
-        "color_bias": large,
-        "direction_frequencies": config.direction_frequencies if large else None,
-        "appearance": appearance,
-    }
+    return kind(
+        box,
+        distance,
+        sharpness(config.start_sharpness / distance.size, config.sharpness_learning_rate),
+        config.hidden_width,
+        COLOR_LAYERS if large else 1,
+        color_bias=large,
+        direction_frequencies=config.direction_frequencies if large else None,
+        appearance=appearance,
+    )
 
 
 class SurfaceRenderer(VolumeRenderer):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
 
-from nerfloom import Decision, Field, Method, Sampler, Scene
+from nerfloom import Decision, Field, LearnsMotion, Method, RayModel, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
@@ -19,9 +19,7 @@ from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.grids.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
-from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss, TransparentOpacity
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
-from nerfloom.moving_model import MovingModel
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler, sampler_choice
 from nerfloom.samplers.motion import MotionConfig, slices_choice
 
@@ -105,10 +103,9 @@ class DNeRFConfig(
     Otherwise the first image is treated like the others."""
 
 
-class DNeRF(MovingModel[DNeRFConfig], plain=True):
+class DNeRF(RayModel[DNeRFConfig], LearnsMotion, plain=True):
     """A model of a moving scene; for a scene without times it is the canonical field alone."""
 
-    losses = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES, TransparentOpacity())
     steps_repeat = True
 
 

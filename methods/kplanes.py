@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from nerfloom import Decision, Method, Points, Scene
+from nerfloom import Decision, LearnsMotion, Method, Points, RayModel, Scene
 from nerfloom.base import device as devices
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
@@ -24,8 +24,7 @@ from nerfloom.kernels.grids.planes_layout import MAX_VERTICES
 from nerfloom.kernels.math import truncated_exp
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.term import LossTerm, RenderedBatch
-from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss, TransparentOpacity
-from nerfloom.moving_model import MovingModel
+from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.samplers.choice import SamplingConfig, batch_choice, contracted_box, make_sampler, sampler_choice
 from nerfloom.samplers.motion import MotionConfig, slices_choice, vertices_in_time
 
@@ -164,10 +163,10 @@ class PlaneRegularity(LossTerm):
         return variation, roughness, torch.stack([(1 - plane).abs().mean() for plane in chosen]).mean()
 
 
-class KPlanes(MovingModel[KPlanesConfig], plain=True):
+class KPlanes(RayModel[KPlanesConfig], LearnsMotion, plain=True):
     """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity(), *FEW_IMAGES, TransparentOpacity())
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity(), *FEW_IMAGES)
     steps_repeat = True
 
 

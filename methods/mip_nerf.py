@@ -17,13 +17,9 @@ from nerfloom.encodings.integrated import IntegratedEncoding
 from nerfloom.fields.integrated import IntegratedField
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
+from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
-
-OCCUPANCY_SAMPLES_PER_BATCH = 2**12
-"""Samples per training step with the occupancy grid; the number of samples per ray varies a hundredfold."""
-OCCUPANCY_RATE = 2.0
-"""Factor of the learning rate with the occupancy grid; that of vanilla-nerf, which has as many samples per step."""
 
 
 @dataclass(frozen=True)

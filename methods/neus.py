@@ -17,9 +17,9 @@ from nerfloom.methods._surfaces import (
     SurfaceConfig,
     SurfaceModel,
     decide_surface,
-    field_parts,
     make_sampler,
     renderer,
+    surface_field,
 )
 
 
@@ -45,7 +45,7 @@ class NeuS(SurfaceModel[NeuSConfig], plain=True):
 
 def make_field(config: NeuSConfig, scene: Scene) -> NeuSField:
     """Return a field that starts as a ball."""
-    return NeuSField(**field_parts(config, scene, AnnealedSharpness))
+    return surface_field(NeuSField, config, scene, AnnealedSharpness)
 
 
 METHOD = Method(

@@ -27,7 +27,6 @@ from nerfloom.samplers.inside import make_foreground_sampler
 
 OCCUPANCY_SAMPLES_PER_BATCH = 2**12
 """Samples per training step with the occupancy grid; the number of samples per ray varies a hundredfold."""
-"""Reason for a fixed number of samples, rather than of rays, per training step."""
 OCCUPANCY_RATE = 2.0
 """Factor of the learning rate with the occupancy grid. On Lego after 90 s on two cores, smaller batches and longer
 marching steps (`num_steps`) at twice the rate reached 22.5 dB; 2^13 samples, 512 steps and the paper's rate reached 17

@@ -17,9 +17,9 @@ from nerfloom.methods._surfaces import (
     SurfaceConfig,
     SurfaceModel,
     decide_surface,
-    field_parts,
     make_sampler,
     renderer,
+    surface_field,
 )
 from nerfloom.samplers.background import foreground
 from nerfloom.samplers.error_bounded import EPSILON, ErrorBoundedSampler
@@ -50,7 +50,7 @@ class VolSDF(SurfaceModel[VolSDFConfig], plain=True):
 
 def make_field(config: VolSDFConfig, scene: Scene) -> VolSDFField:
     """Return a field that starts as a ball."""
-    return VolSDFField(**field_parts(config, scene))
+    return surface_field(VolSDFField, config, scene)
 
 
 def sampler(config: VolSDFConfig, scene: Scene) -> Sampler:

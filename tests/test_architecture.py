@@ -154,7 +154,6 @@ LAYERS = (
     ("blocks",),
     ("model",),
     ("ray_model", "gaussian_model", "octree_model"),
-    ("moving_model",),
     ("method",),
     ("registry",),
     ("evaluation",),

@@ -11,7 +11,6 @@ from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.pixels import device_placement
 from nerfloom.data.pixels.batch import PixelBatch, draw_batch, draw_pixels
 from nerfloom.data.pixels.device_placement import on_device
-from nerfloom.data.pixels.error_map import ErrorMap
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.sparse_depth import SparseDepth
 from nerfloom.dataparsers.blender import Blender
@@ -38,12 +37,9 @@ def tensors(value: Any) -> dict[str, torch.Tensor]:
     return found
 
 
-@pytest.mark.parametrize("case", ["plain", "by error", "keypoints", "cut out"])
+@pytest.mark.parametrize("case", ["plain", "keypoints", "cut out"])
 def test_batches_that_are_copied_have_the_same_bits(dataset: Dataset, case: str, monkeypatch: Any) -> None:
-    errors, keypoints = None, 0
-    if case == "by error":
-        errors = ErrorMap(dataset)
-        errors.errors.copy_(torch.rand_like(errors.errors))
+    keypoints = 0
     if case == "keypoints":
         known = SparseDepth(torch.tensor([4, 77, 300]), torch.rand(3) + 1, torch.rand(3))
         dataset, keypoints = replace(dataset, sparse_depth=known), 5
@@ -52,7 +48,7 @@ def test_batches_that_are_copied_have_the_same_bits(dataset: Dataset, case: str,
 
     def drawn() -> PixelBatch:
         torch.manual_seed(7)
-        return draw_batch(dataset, 64, "random", errors, keypoints=keypoints)
+        return draw_batch(dataset, 64, "random", keypoints=keypoints)
 
     here = tensors(drawn())
     monkeypatch.setattr(Dataset, "resident", property(lambda self: False))

@@ -14,11 +14,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from nerfloom.base.config import RayConfig
 from nerfloom.base.device import to_float64
 from nerfloom.kernels import native
 from nerfloom.kernels.adam.adam import sparse_adam_reference
-from nerfloom.registry import load_method
 from tests.training.helpers import TINY, tiny_trainer
 
 
@@ -47,11 +45,7 @@ def taken_away(values: Tensor) -> Tensor:
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
     monkeypatch.setattr(native, "available", lambda: False)
-    for name in (
-        "nerfloom.data.pixels.error_map",
-        "nerfloom.evaluation.metrics",
-        "nerfloom.kernels.histograms.step_functions",
-    ):
+    for name in ("nerfloom.evaluation.metrics", "nerfloom.kernels.histograms.step_functions"):
         monkeypatch.setattr(importlib.import_module(name), "to_float64", taken_away)
 
 
@@ -68,10 +62,8 @@ def test_the_watch_sees_float64() -> None:
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("kind", TINY)
 def test_a_step_of_each_method(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
-    """And pixels drawn by their error, the silhouettes, the schedule, and a picture with its PSNR and SSIM."""
+    """And the silhouettes, the schedule, and a picture with its PSNR and SSIM."""
     settings = {"max_num_iterations": 2, "steps_per_eval_all_images": 1, "max_eval_images": 1}
-    if issubclass(type(load_method(kind.split("+")[0]).config), RayConfig):
-        settings["draw_by_error"] = True
     trainer = tiny_trainer(kind, shared_tiny, tmp_path, True, **settings)
     with Watched():
         trainer.train()

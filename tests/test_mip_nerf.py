@@ -12,6 +12,7 @@ from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
 from nerfloom.fields.sized import SizedDensity, SizedField
 from nerfloom.losses.functions import charbonnier, mean_squared_error, normalised_distortion
 from nerfloom.methods import mip_nerf, mip_nerf_360
+from nerfloom.methods.vanilla_nerf import OCCUPANCY_SAMPLES_PER_BATCH
 from nerfloom.ray_model import RayModel
 from nerfloom.samplers.hierarchical import HierarchicalSampler
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -122,7 +123,7 @@ def test_mip_nerfs_sampler_is_decided_by_the_scene(scene: Scene, asked: str, kin
     assert isinstance(model.sampler, kind)
     assert isinstance(model.field, IntegratedField)
     assert model.field.encoding.contracted == scene.unbounded
-    assert model.samples_per_step == (mip_nerf.OCCUPANCY_SAMPLES_PER_BATCH if asked == "occupancy" else None)
+    assert model.samples_per_step == (OCCUPANCY_SAMPLES_PER_BATCH if asked == "occupancy" else None)
 
 
 def test_the_coarse_level_of_mip_nerf_counts_a_tenth() -> None:

@@ -87,13 +87,13 @@ def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path:
     """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""
     trainer = moving_trainer(name, shared_tiny, tmp_path, max_num_iterations=60)
     field, positions = trainer.model.field, torch.rand(100, 3)
-    small = field.displacement(positions, torch.ones(100)).abs().max()
+    small = field.deformation(positions, torch.ones(100))[0].abs().max()
     before = mean_squared_error(trainer)
     trainer.train()
     assert trainer.state.skipped == 0
     assert mean_squared_error(trainer) < 0.8 * before
-    assert field.displacement(positions, torch.ones(100)).abs().max() > 10 * small
-    fixed = bool((field.displacement(positions, torch.zeros(100)) == 0).all())
+    assert field.deformation(positions, torch.ones(100))[0].abs().max() > 10 * small
+    fixed = bool((field.deformation(positions, torch.zeros(100))[0] == 0).all())
     assert fixed == trainer.config.from_first_image
 
 
@@ -115,7 +115,7 @@ def test_the_first_image_is_like_the_others() -> None:
     for fixed in (False, True):
         field = DeformedField(NeRFField(32, 3, 2), 32, 3, fixed_start=fixed)
         torch.nn.init.normal_(field.after_skip[-1].weight)  # type: ignore[arg-type]
-        at_start, soon = (field.displacement(positions, time.expand(9)) for time in times)
+        at_start, soon = (field.deformation(positions, time.expand(9))[0] for time in times)
         assert soon.norm(dim=-1).min() > 0.1
         assert torch.allclose(at_start, soon, atol=1e-3) != fixed
 
@@ -166,7 +166,7 @@ def test_nothing_is_displaced_at_time_zero() -> None:
     torch.nn.init.normal_(field.after_skip[-1].weight)  # type: ignore[arg-type]
     positions = torch.rand(9, 3)
     times = torch.tensor([0.0, 0.5, 1.0]).repeat(3)
-    moved = field.displacement(positions, times)
+    moved = field.deformation(positions, times)[0]
     assert bool((moved[times == 0] == 0).all())
     assert bool((moved[times > 0] != 0).all())
     sigma, features = field.density(Points(positions, times))

@@ -11,7 +11,6 @@ from nerfloom.base.device import seed_step
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.pixels.batch import PixelBatch, draw_batch, draw_pixels
 from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.data.pixels.error_map import ErrorMap
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.dataparsers.blender import Blender
@@ -30,12 +29,10 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Dataset]:
     return load_dataset(scene, "train"), load_dataset(scene, "train", PixelMemory(0, folder / "cache"))
 
 
-def batch(
-    data: Dataset, step: int, count: int, stream: PixelStream | None, errors: ErrorMap | None = None
-) -> PixelBatch:
+def batch(data: Dataset, step: int, count: int, stream: PixelStream | None) -> PixelBatch:
     seed_step(SEED, step)
     look_up = None if stream is None else partial(stream.look_up, step)
-    return draw_batch(data, count, "random", errors, look_up=look_up)
+    return draw_batch(data, count, "random", look_up=look_up)
 
 
 def assert_same(one: PixelBatch, two: PixelBatch) -> None:
@@ -58,18 +55,13 @@ def test_batches_are_those_from_memory_whatever_their_sizes(both: tuple[Dataset,
         assert_same(batch(here, step, 77, None), batch(there, step, 77, stream))
 
 
-def test_batches_of_some_pixels_only_and_by_error(both: tuple[Dataset, Dataset]) -> None:
+def test_batches_of_some_pixels_only(both: tuple[Dataset, Dataset]) -> None:
     chosen = PixelSet.of_mask(torch.rand(len(both[0].pixels)) < 0.3)
     here, there = (data.drawing(chosen) for data in both)
-    stream, errors = PixelStream(there, SEED), ErrorMap(here)
-    errors.errors.copy_(torch.rand(len(errors.errors)))
+    stream = PixelStream(there, SEED)
     for step in range(30):
-        assert_same(batch(here, step, 90, None), batch(there, step, 90, stream))
-        mine, theirs = batch(here, step, 90, None, errors), batch(there, step, 90, stream, errors)
-        assert_same(mine, theirs)
-        assert mine.weights is not None
-        assert theirs.weights is not None
-        assert torch.equal(mine.weights, theirs.weights)
+        theirs = batch(there, step, 90, stream)
+        assert_same(batch(here, step, 90, None), theirs)
         assert bool(chosen.mask(0, len(here.pixels))[theirs.pixels].all())
 
 
@@ -116,7 +108,7 @@ def test_what_a_step_draws_first_does_not_depend_on_how_many_it_draws(both: tupl
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("changes", [{}, {"draw_by_error": True}, {"silhouette_pixels": False}])
+@pytest.mark.parametrize("changes", [{}, {"robust": True}, {"silhouette_pixels": False}])
 def test_a_run_from_a_file_is_the_run_from_memory(shared_tiny: Path, tmp_path: Path, changes: dict) -> None:
     settings = {"max_num_iterations": 40, "cache_dir": tmp_path / "cache", **changes}
     here = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "here", **settings)

@@ -7,6 +7,7 @@ import torch
 
 from nerfloom.base.device import seed_step
 from nerfloom.data.dataset import Dataset, load_dataset
+from nerfloom.data.pixels.contradicted import ContradictedTiles
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.sources import PixelSource, Request, ViewSource, make_source
 from nerfloom.data.sparse_depth import SparseDepth
@@ -76,7 +77,7 @@ def test_a_source_is_made_as_the_model_asks(images: Dataset) -> None:
 
 
 def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Dataset) -> None:
-    source = PixelSource(images, "black", 0, by_error=True)
+    source = PixelSource(images, "black", 0, contradicted=ContradictedTiles(images, 2.0))
     request = Request(0, 50)
     batch = source.draw(request)
     source.learn(request, batch, batch.rgb + 3)
@@ -87,7 +88,7 @@ def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Data
     changed = source.drawing_from(images.drawing(some))
     assert changed.state() is learnt
     assert bool((changed.draw(Request(1, 200)).pixels % 2 == 0).all())
-    other = PixelSource(images, "black", 0, by_error=True)
+    other = PixelSource(images, "black", 0, contradicted=ContradictedTiles(images, 2.0))
     other.restore(learnt)
     assert torch.equal(other.state(), learnt)
 

@@ -210,13 +210,6 @@ def test_a_source_draws_keypoints_where_they_count(dataset: Dataset, tmp_path: P
     assert source.keypoints == 0  # depth images know more
 
 
-def test_errors_drawn_by_and_keypoints(dataset: Dataset) -> None:
-    batch = PixelSource(dataset, "black", 0, by_error=True, keypoints=0.25).draw(Request(0, 40))
-    assert batch.weights is not None
-    assert len(batch.weights) == len(batch) == 40
-    assert batch.weights[30:].eq(1).all()
-
-
 @pytest.mark.parametrize(
     "kind", ["nerfacto", "vanilla-nerf", "vanilla-nerf+occupancy", "instant-ngp", "kplanes", "tensorf", "dnerf"]
 )

@@ -148,7 +148,7 @@ class TrainConfig:
     # annotations, so they are neither fields nor flags.
     sampler, bounded_sampler, time_slices, robust_factor = "", "occupancy", 1, 2.0
     background_model = "contraction"
-    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = draw_by_error = robust = False
+    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = robust = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
 
@@ -215,8 +215,6 @@ class RayConfig(TrainConfig):
     """Fraction of the budget after which training uses --rays-per-pixel; before, it uses one ray per pixel."""
     samples_per_batch: Auto[int | None] = AUTO
     """Samples per training step; the number of rays is adjusted to reach about this many."""
-    draw_by_error: bool = False
-    """Draw half of the pixels in proportion to their recent error, with weights that keep the mean loss unbiased."""
     depth_loss_mult: Auto[float] = AUTO
     """Weight of the depth loss; 0: none. auto: 0.1 with depth images, 0.001 with points of a reconstruction, else 0."""
     free_space_loss_mult: float = 0.0

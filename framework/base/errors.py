@@ -56,6 +56,11 @@ def is_out_of_memory(error: BaseException) -> bool:
     )
 
 
+def one_line(error: BaseException) -> str:
+    """Return the message of `error` on one line of at most 300 characters, or the name of its type if it has none."""
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
 def nearest(name: str, candidates: Iterable[str]) -> str:
     """Return a hint that names the candidates closest to a misspelt name, or lists all of them.
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, Union
 import yaml
 
 from nerfloom.base.config import AUTO
-from nerfloom.base.errors import ConfigError, nearest, shown
+from nerfloom.base.errors import ConfigError, nearest, one_line, shown
 from nerfloom.base.from_nerfstudio import config_answer
 
 T = TypeVar("T")
@@ -129,8 +129,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     except ConfigError:
         raise
     except Exception as error:  # not only YAMLError: bad text, dates and nesting raise others, `!!float ''` IndexError
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path} is not plain YAML: {reason}") from error
+        raise ConfigError(f"{path} is not plain YAML: {one_line(error)}") from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path} must hold keys and values, such as 'method: instant-ngp'")
     return values

@@ -6,7 +6,7 @@ import math
 import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import run_command
@@ -34,10 +34,6 @@ class BlocksFlags(JobFlags):
 
     method: str = "nerfacto"
     """Method, with its flags in quotes: "zip-nerf --num-levels 8"."""
-    data: Path | None = None
-    """Folder of the data set. Default: the embedded scene."""
-    data_flags: str = ""
-    """Flags of the data format, quoted after an "=": --data-flags="--downscale-factor 2"."""
     max_seconds: float | None = None
     """Seconds of training of each block."""
     max_num_iterations: int | None = None
@@ -56,10 +52,6 @@ class BlocksFlags(JobFlags):
     """Only print the blocks."""
     output_dir: Path | None = None
     """Folder of the runs and of blocks.yml. Default: outputs/blocks-DATA."""
-    num_threads: int | None = None
-    """CPU threads of each run. Default: all cores."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to train on."""
 
     def check(self) -> None:
         """Check the values of the flags.

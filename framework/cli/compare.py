@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.common import check_weights, run_command, take
@@ -28,10 +28,6 @@ class CompareFlags(JobFlags, GeometryFlags):
 
     methods: tuple[str, ...] = ()
     """Methods; quote a method with flags: instant-ngp "vanilla-nerf --sampler occupancy"."""
-    data: Path | None = None
-    """Folder of the data set. Default: the embedded scene."""
-    data_flags: str = ""
-    """Flags of the data format, for all methods, quoted after an "=": --data-flags="--downscale-factor 2"."""
     max_seconds: float | None = None
     """Seconds of training of each method, without evaluation and saving."""
     max_num_iterations: int | None = None
@@ -49,10 +45,6 @@ class CompareFlags(JobFlags, GeometryFlags):
     """File of LPIPS weights with AlexNet (.npz). Default: those of the lpips package, if installed."""
     curve_images: int = 4
     """Number of views in evaluations during training; 0: none."""
-    num_threads: int | None = None
-    """CPU threads of each run. Default: all cores."""
-    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
-    """Device to train on."""
 
 
 def main() -> None:

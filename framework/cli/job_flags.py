@@ -1,4 +1,4 @@
-"""Flags of commands that run jobs: where, and how many at a time."""
+"""Flags of commands that train by jobs: on what data, where, and how many jobs at a time."""
 
 from __future__ import annotations
 
@@ -14,8 +14,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class JobFlags:
-    """Choose where jobs run, and how many at a time."""
+    """Choose the data of jobs, where they run, and how many at a time."""
 
+    data: Path | None = None
+    """Folder of the data set. Default: the embedded scene."""
+    data_flags: str = ""
+    """Flags of the data format, quoted after an "=": --data-flags="--downscale-factor 2"."""
+    num_threads: int | None = None
+    """CPU threads of each run. Default: all cores."""
+    device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    """Device to train on."""
     launcher: Literal["processes", "ray", "slurm"] = "processes"
     """What runs the jobs: processes on this machine, a Ray cluster, or Slurm, for which a script is written. All
     produce the same files."""

@@ -183,8 +183,3 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__
-
-
-def one_line(error: BaseException) -> str:
-    """Return the first line of the message of `error`, or the name of its type."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

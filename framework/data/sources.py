@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -11,7 +12,6 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.config import TrainConfig
-from nerfloom.base.errors import ConfigError
 from nerfloom.base.processes import processes
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.view import View
@@ -29,7 +29,6 @@ from nerfloom.data.pixels.batch import (
     training_background,
 )
 from nerfloom.data.pixels.contradicted import STEPS_PER_LOOK, ContradictedTiles
-from nerfloom.data.pixels.error_map import ErrorMap
 from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.data.sparse_depth import SparseDepth
 
@@ -74,13 +73,15 @@ class BatchSource(ABC):
     def draw(self, request: Request) -> Any:
         """Return a `PixelBatch` or a `ViewBatch` for `request`."""
 
-    @abstractmethod
     def drawing_from(self, dataset: Dataset) -> BatchSource:
         """Return a source of the same kind for a changed data set, with this source's learnt state.
 
         Args:
             dataset: the same images, with a different selection of pixels to draw.
         """
+        source = copy(self)
+        source.dataset = dataset
+        return source
 
     def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:  # noqa: B027, most have nothing to learn
         """Record the errors of a rendered batch.
@@ -104,13 +105,12 @@ class BatchSource(ABC):
 
 
 class PixelSource(BatchSource):
-    """Draws pixels of all images, uniformly or by their errors.
+    """Draws pixels of all images, uniformly.
 
     Args:
         dataset: the images. Pixels in a file are read ahead of the steps that use them.
         background: background of transparent pixels.
         seed: seed of the run.
-        by_error: whether half of the pixels are drawn with a probability proportional to their recent error.
         keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
         clear: (M,) distances from cameras that images show to be empty; None if they are not used.
         num_images: number of images that the pixels of a step come from; None for all.
@@ -122,7 +122,6 @@ class PixelSource(BatchSource):
         dataset: Dataset,
         background: Background,
         seed: int,
-        by_error: bool = False,
         keypoints: float = 0.0,
         clear: Tensor | None = None,
         num_images: int | None = None,
@@ -131,7 +130,6 @@ class PixelSource(BatchSource):
         self.clear, self.num_images, self.contradicted = clear, num_images, contradicted
         self.dataset, self.background, self.seed = dataset, background, seed
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
-        self.errors = ErrorMap(dataset) if by_error else None
         self.stream: PixelStream | None = None
         self.varies = "pixels of a few images are drawn" if num_images is not None else None
         if not dataset.resident:
@@ -141,9 +139,7 @@ class PixelSource(BatchSource):
         offsets = subpixels(request.rays_per_pixel, self.dataset.device)
         look_up, count = self._look_up(request.step), request.num_pixels
         keypoints = round(self.keypoints * count) if request.points else 0
-        batch = draw_batch(
-            self.dataset, count, self.background, self.errors, offsets, look_up, keypoints, self.num_images
-        )
+        batch = draw_batch(self.dataset, count, self.background, offsets, look_up, keypoints, self.num_images)
         if self.contradicted is not None:
             counting = self.contradicted.counting(batch.pixels)
             weights = counting if batch.weights is None else counting * batch.weights
@@ -161,38 +157,22 @@ class PixelSource(BatchSource):
         return partial(self.stream.look_up, step)
 
     def drawing_from(self, dataset: Dataset) -> PixelSource:
-        source = PixelSource(
-            dataset,
-            self.background,
-            self.seed,
-            keypoints=self.keypoints,
-            clear=self.clear,
-            num_images=self.num_images,
-            contradicted=self.contradicted,
-        )
-        source.errors = self.errors
+        source = copy(self)
+        source.dataset, source.stream = dataset, None
         return source
 
     def learn(self, request: Request, batch: PixelBatch, rgb: Tensor) -> None:
-        if self.errors is not None:
-            self.errors.learn(batch.pixels, (rgb - batch.rgb).square().mean(-1))
         if self.contradicted is not None:
             self.contradicted.learn(batch.pixels, rgb - batch.rgb)
             if request.step % STEPS_PER_LOOK == 0:
                 self.contradicted.decide(request.progress)
 
-    @property
-    def _learnt(self) -> Tensor | None:
-        if self.contradicted is not None:
-            return self.contradicted.state
-        return None if self.errors is None else self.errors.errors
-
     def state(self) -> Tensor | None:
-        return self._learnt
+        return None if self.contradicted is None else self.contradicted.state
 
     def restore(self, state: Tensor | None) -> None:
-        if self._learnt is not None and state is not None:
-            self._learnt.copy_(state)
+        if self.contradicted is not None and state is not None:
+            self.contradicted.state.copy_(state)
 
 
 class ViewSource(BatchSource):
@@ -256,9 +236,6 @@ class ViewSource(BatchSource):
             self._order = epoch, torch.randperm(len(self.dataset), generator=generator).tolist()
         return self._order[1][place]
 
-    def drawing_from(self, dataset: Dataset) -> ViewSource:
-        return ViewSource(dataset, self.background, self.seed)
-
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
     """Return the source of a model's training batches.
@@ -267,9 +244,6 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
         kind: kind of the batches: `Model.batches`.
         dataset: the training images, on the device.
         config: the settings of the run.
-
-    Raises:
-        ConfigError: if settings contradict each other.
     """
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
@@ -280,8 +254,4 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
     contradicted = ContradictedTiles(dataset, config.robust_factor) if config.robust else None
-    if contradicted is not None and config.draw_by_error:
-        raise ConfigError("--draw-by-error prefers large errors, and --robust leaves them out: choose one of them")
-    return PixelSource(
-        dataset, background, config.machine.seed, config.draw_by_error, keypoints, clear, num_images, contradicted
-    )
+    return PixelSource(dataset, background, config.machine.seed, keypoints, clear, num_images, contradicted)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import DataError
+from nerfloom.base.errors import DataError, one_line
 from nerfloom.data.ply import read_columns, read_header, vertices
 from nerfloom.evaluation.surfaces import Surface, usable
 
@@ -103,5 +103,4 @@ def _triangles(file: Path, kind: str) -> tuple[Tensor, Tensor]:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except Exception as error:  # trimesh reports damage as whatever comes up
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"cannot read {file} as a mesh: {reason}") from error
+        raise DataError(f"cannot read {file} as a mesh: {one_line(error)}") from error

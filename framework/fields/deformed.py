@@ -60,8 +60,8 @@ class DeformedField(Field):
         nn.init.uniform_(last.weight, -1e-4, 1e-4)  # nothing moves at first
         nn.init.zeros_(last.bias)
 
-    def displacement(self, positions: Tensor, times: Tensor | None) -> Tensor:
-        """Return the displacement (N, 3) from positions at given times to the canonical field, scene units.
+    def deformation(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Return the displacement (N, 3) to the canonical field, scene units, and ambient coordinates (N, K) or None.
 
         Args:
             positions: (N, 3) scene coordinates.
@@ -70,10 +70,6 @@ class DeformedField(Field):
         Raises:
             ValueError: if `times` is None.
         """
-        return self._deformation(positions, times)[0]
-
-    def _deformation(self, positions: Tensor, times: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Return displacement (N, 3) and ambient coordinates (N, K) of `positions`; the latter may be None."""
         if self.contracted is not None:
             positions = 2 * contract_to_unit(positions, self.contracted) - 1
         encoded = (
@@ -88,7 +84,7 @@ class DeformedField(Field):
         return moved_by, outputs[:, 3:].contiguous() if self.ambient else None
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        moved_by, ambient = self._deformation(points.positions, points.times)
+        moved_by, ambient = self.deformation(points.positions, points.times)
         moved = points.positions + moved_by
         return self.canonical.density(replace(points, positions=moved, times=None, ambient=ambient))
 

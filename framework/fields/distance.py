@@ -35,6 +35,8 @@ SHARP = 100.0
 """Sharpness beta of softplus between the layers of the large network, as in the authors' code."""
 FITTED, RIDGE = 2_048, 1e-4
 """Number of places where the large network is fitted to the first ball, and the weight of changes of its parameters."""
+NUM_FEATURES, DEPTH = 15, 8
+"""Number of features that the small network has for the colour, and of hidden layers of the large network."""
 AT_ONCE = 2**14
 """Number of positions at once, without gradients of parameters, whose hidden layers are in memory together."""
 
@@ -98,7 +100,6 @@ class GridDistance(Distance):
         grid: encoding of positions in [0, 1]^3.
         radius: radius of the first ball, as a fraction of half of the box's shortest edge.
         width: features of the hidden layer.
-        num_features: number of features for the colour.
     """
 
     scale: Tensor
@@ -106,10 +107,8 @@ class GridDistance(Distance):
     floor: Tensor
     runs_on_kernels = True
 
-    def __init__(
-        self, box: Tensor, grid: HashGrid, radius: float = 0.5, width: int = 64, num_features: int = 15
-    ) -> None:
-        super().__init__(box, num_features)
+    def __init__(self, box: Tensor, grid: HashGrid, radius: float, width: int) -> None:
+        super().__init__(box, NUM_FEATURES)
         edges = box[1] - box[0]
         self.register_buffer("scale", 1 / edges, persistent=False)
         self.register_buffer("shift", -box[0] / edges, persistent=False)
@@ -118,7 +117,7 @@ class GridDistance(Distance):
             grid.deferred = TableGradient(LOOK_UP, grid.layout)
         self.grid, self.radius = grid, radius * self.size
         self.first = nn.Parameter(torch.empty(width, grid.num_features))
-        self.second = nn.Parameter(torch.empty(1 + num_features, width))
+        self.second = nn.Parameter(torch.empty(1 + NUM_FEATURES, width))
         nn.init.kaiming_uniform_(self.first, nonlinearity="relu")
         nn.init.kaiming_uniform_(self.second, nonlinearity="relu")
         with torch.no_grad():
@@ -174,35 +173,33 @@ class NetworkDistance(Distance):
 
     The first weights are those of SAL (Atzmon and Lipman 2020), by which a network of endless width is the distance of
     a ball. One of 256 features is off by a seventh of the radius, which differs from direction to direction. So the
-    weights of the output are then fitted to the ball by least squares.
+    weights of the output are then fitted to the ball by least squares. Halfway through the hidden layers, the encoded
+    position is concatenated again.
 
     Args:
         box: (2, 3) corners of the box, scene units.
         radius: radius of the first ball, as a fraction of half of the box's shortest edge.
         width: features of a hidden layer, and for the colour.
-        depth: hidden layers. The encoded position is concatenated again before layer depth / 2.
         num_frequencies: number of frequencies of the encoded positions.
 
     Raises:
         ConfigError: if the hidden layers are not wider than the encoded position.
     """
 
-    def __init__(
-        self, box: Tensor, radius: float = 0.5, width: int = 256, depth: int = 8, num_frequencies: int = 6
-    ) -> None:
+    def __init__(self, box: Tensor, radius: float = 0.5, width: int = 256, num_frequencies: int = 6) -> None:
         super().__init__(box, width)
-        self.skip, self.num_frequencies = depth // 2, num_frequencies
+        self.skip, self.num_frequencies = DEPTH // 2, num_frequencies
         inputs = 3 + 6 * num_frequencies
         if width <= inputs:
             raise ConfigError(
                 f"--hidden-width is {width}; it must be more than the {inputs} features of an encoded position "
                 "(--position-frequencies)"
             )
-        require(4.0 * (depth + 1) * width**2, "a network")
-        widths = [width] * depth
+        require(4.0 * (DEPTH + 1) * width**2, "a network")
+        widths = [width] * DEPTH
         widths[self.skip - 1] -= inputs  # which are concatenated
         self.hidden = nn.ModuleList(
-            nn.Linear(before, after) for before, after in zip([inputs, *[width] * (depth - 1)], widths, strict=True)
+            nn.Linear(before, after) for before, after in zip([inputs, *[width] * (DEPTH - 1)], widths, strict=True)
         )
         self.output = nn.Linear(width, 1 + width)
         self._start(inputs, radius)

@@ -10,6 +10,7 @@ from nerfloom.encodings.pixel_aligned import SourceViews
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.math import at_least_float32
 from nerfloom.kernels.table_memory import require
 
 
@@ -86,18 +87,14 @@ class PixelAlignedField(Field):
         for block in self.after:
             hidden = block(hidden)
         raw = self.sigma_head(relu(hidden))[:, 0]
-        return softplus(_precise(raw) - 1) / self.unit, hidden
+        return softplus(at_least_float32(raw) - 1) / self.unit, hidden
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         local = self._views().in_frames(directions, are_points=False)
         hidden = relu(self.color_hidden(relu(features)) + self.color_direction(local)).mean(0)
-        return torch.sigmoid(_precise(self.color_head(hidden)))
+        return torch.sigmoid(at_least_float32(self.color_head(hidden)))
 
     def _views(self) -> SourceViews:
         if self.views is None:
             raise ValueError("this field needs images of the scene: set its views first")
         return self.views
-
-
-def _precise(values: Tensor) -> Tensor:
-    return values if values.dtype == torch.float64 else values.float()

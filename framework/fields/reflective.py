@@ -25,7 +25,7 @@ from nerfloom.geometry.points import Footprint, Points
 from nerfloom.kernels.color import to_srgb
 from nerfloom.kernels.dispatch import derivatives
 from nerfloom.kernels.encodings.integrated_directional import directional_encoding, num_features
-from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.math import at_least_float32, safe_normalize
 from nerfloom.kernels.networks.mlp import Activation
 from nerfloom.kernels.traced.trace import GridDensity
 
@@ -96,7 +96,7 @@ class Reflection(nn.Module):
         reflected = directions - 2 * away * normals
         encoded = directional_encoding(reflected, roughness, self.bands)
         seen = self.network(encoded, -away, outputs[:, NUM_OUTPUTS:].contiguous())
-        specular = torch.sigmoid(outputs[:, TINT]) * _wide(seen)
+        specular = torch.sigmoid(outputs[:, TINT]) * at_least_float32(seen)
         return Light(torch.sigmoid(outputs[:, DIFFUSE] + DIFFUSE_BIAS), specular, roughness, normals)
 
 
@@ -116,7 +116,7 @@ class ReflectiveField(Field):
 
     def predicted_normals(self, features: Tensor) -> Tensor:
         """Return the predicted unit normals (N, 3) of points from their `features` (N, F)."""
-        return safe_normalize(_wide(features[:, NORMALS]))
+        return safe_normalize(at_least_float32(features[:, NORMALS]))
 
     def light(self, features: Tensor, directions: Tensor) -> Light:
         """Return the light of points.
@@ -125,7 +125,7 @@ class ReflectiveField(Field):
             features: (N, F) features of the points, from `density`.
             directions: (N, 3) unit viewing directions.
         """
-        return self.reflection(_wide(features), directions)
+        return self.reflection(at_least_float32(features), directions)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         return self.light(features, directions).rgb
@@ -172,7 +172,7 @@ class ReflectiveGrid(ReflectiveField, BoxField):
 
     def density_normals(self, points: Points) -> Tensor:
         around = (points.positions.detach()[:, None] + self.taps).view(-1, 3)
-        logs = _wide(self.head(self.encode(around, None))[:, 0]).view(-1, len(self.taps), 1)
+        logs = at_least_float32(self.head(self.encode(around, None))[:, 0]).view(-1, len(self.taps), 1)
         return -safe_normalize((logs * self.taps.sign()).sum(1))
 
 
@@ -222,17 +222,12 @@ class ReflectiveNetworks(ReflectiveField):
         self.network = SkippingNetwork(encoding.num_features, width, depth, depth // 2 + 1, outputs)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        outputs = _wide(self.network(self.encoding(points)))
+        outputs = at_least_float32(self.network(self.encoding(points)))
         return softplus(outputs[:, 0] + DENSITY_BIAS), outputs
 
     def density_normals(self, points: Points) -> Tensor:
         with torch.enable_grad(), derivatives(2):
             points = replace(points, positions=points.positions.detach().requires_grad_())
-            outputs = _wide(self.network(self.encoding(points)))
+            outputs = at_least_float32(self.network(self.encoding(points)))
             (slopes,) = torch.autograd.grad(outputs[:, 0].sum(), points.positions, create_graph=True)
         return -safe_normalize(slopes)
-
-
-def _wide(values: Tensor) -> Tensor:
-    """Return `values` in float64 if they have it, and in float32 otherwise."""
-    return values if values.dtype == torch.float64 else values.float()

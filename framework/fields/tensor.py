@@ -5,8 +5,6 @@ Chen et al., "TensoRF: Tensorial Radiance Fields", ECCV 2022.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
@@ -42,8 +40,6 @@ class TensorField(Field):
     """
 
     box: Tensor
-    density_shift: Tensor
-    """() `DENSITY_SHIFT`, or the value of the loaded checkpoint."""
     runs_on_kernels = True
 
     def __init__(
@@ -58,25 +54,15 @@ class TensorField(Field):
         super().__init__()
         self.unbounded = unbounded
         self.register_buffer("box", box.clone())
-        self.register_buffer("density_shift", torch.tensor(DENSITY_SHIFT))
         self.density_factors, self.appearance_factors = density, appearance
         self.basis = torch.nn.Linear(appearance.num_features, num_features, bias=False)
         self.color_head = MLP(num_features + 16, width, width, 3, activation="sigmoid")
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         unit = self._unit(points.positions)
-        return self._sigma(self.density_factors(unit), unit, self.density_shift), unit
-
-    @staticmethod
-    def _sigma(components: Tensor, unit: Tensor, shift: Tensor) -> Tensor:
-        """Return density, the activated sum of `components` (N, K); 0 outside the box, which may have shrunk."""
-        inside = ((unit >= 0) & (unit <= 1)).all(-1)
-        return softplus(components.float().sum(-1) + shift) * DENSITY_SCALE * inside
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        # Checkpoints without this buffer were trained with the authors' shift.
-        state_dict.setdefault(f"{prefix}density_shift", torch.tensor(-10.0))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+        components = self.density_factors(unit)
+        inside = ((unit >= 0) & (unit <= 1)).all(-1)  # the box may have shrunk
+        return softplus(components.float().sum(-1) + DENSITY_SHIFT) * DENSITY_SCALE * inside, unit
 
     def _unit(self, positions: Tensor) -> Tensor:
         return contract_to_unit(positions, self.box) if self.unbounded else to_unit_box(positions, self.box)

@@ -13,6 +13,11 @@ MAX_LOG_DENSITY = 15.0
 """Maximum log-density; larger values are clamped."""
 
 
+def at_least_float32(values: Tensor) -> Tensor:
+    """Convert `values` of types other than float64 to float32."""
+    return values if values.dtype == torch.float64 else values.float()
+
+
 class _TruncatedExp(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -32,7 +37,7 @@ def truncated_exp(x: Tensor) -> Tensor:
     This is Instant-NGP's `trunc_exp`. In half precision exp would overflow for `x` above 11, so types other than
     float64 are converted to float32.
     """
-    return _TruncatedExp.apply(x.float() if x.dtype != torch.float64 else x)
+    return _TruncatedExp.apply(at_least_float32(x))
 
 
 class _SplitDensity(torch.autograd.Function):
@@ -59,7 +64,7 @@ def split_density(features: Tensor) -> tuple[Tensor, Tensor]:
 
     It equals slicing, but computes the sum of the two gradients in one pass.
     """
-    return _SplitDensity.apply(features if features.dtype == torch.float64 else features.float())
+    return _SplitDensity.apply(at_least_float32(features))
 
 
 class _ScaledGradient(torch.autograd.Function):

@@ -33,8 +33,8 @@ def mean_squared_error(prediction: Tensor, target: Tensor, weights: Tensor | Non
     return squares.mean() if weights is None else (squares * weights[:, None]).mean()
 
 
-def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = None, scale: float = 1e-3) -> Tensor:
-    """Return the mean () of weight * sqrt((prediction - target)^2 + scale^2) over all elements; 0 for empty input.
+def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the mean () of weight * sqrt((prediction - target)^2 + 0.001^2) over all elements; 0 for empty input.
 
     mip-NeRF 360 (Barron et al. 2022), section 5: a smooth absolute error, less sensitive to outliers than a squared
     one.
@@ -43,11 +43,10 @@ def charbonnier(prediction: Tensor, target: Tensor, weights: Tensor | None = Non
         prediction: (R, C) predicted values.
         target: (R, C) true values.
         weights: (R,) factor of each row; None for 1.
-        scale: difference below which the error is quadratic rather than absolute.
     """
     if prediction.numel() == 0:
         return prediction.sum()
-    errors = ((prediction - target).square() + scale**2).sqrt()
+    errors = ((prediction - target).square() + 1e-3**2).sqrt()
     return errors.mean() if weights is None else (errors * weights[:, None]).mean()
 
 
@@ -69,22 +68,6 @@ def doubted_error(rgb: Tensor, true: Tensor, doubt: Tensor, least: float, weight
     ratio = doubt / least
     each = (rgb - true).square().mean(-1) / ratio.square() + 2 * least**2 * ratio.log()
     return (each if weights is None else each * weights).mean()
-
-
-def opacity_of_transparent(accumulation: Tensor, alpha: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the mean () over pixels of the rendered opacity where it should be 0; 0 for no pixels.
-
-    The gradient does not vanish with the opacity, as that of a squared error would, so thin fog is removed too.
-
-    Args:
-        accumulation: (P,) rendered opacity.
-        alpha: (P,) opacity of the images' pixels; only pixels with exactly 0 count.
-        weights: (P,) factor of each pixel; None for 1.
-    """
-    if accumulation.numel() == 0:
-        return accumulation.sum()
-    wrong = torch.where(alpha == 0, accumulation, torch.zeros_like(accumulation))
-    return (wrong if weights is None else wrong * weights).mean()
 
 
 def normalised_distortion(weights: Tensor, samples: Samples, scale: float | None = None) -> Tensor:

@@ -18,7 +18,6 @@ from nerfloom.losses.functions import (
     matter_before,
     mean_squared_error,
     normalised_distortion,
-    opacity_of_transparent,
 )
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.renderable import training_poses
@@ -83,14 +82,10 @@ COLOR_ERROR = ColorError()
 
 
 class SamplerLoss(LossTerm):
-    """Loss that trains the sampler itself (`Sampler.loss`), such as the interlevel loss of proposals.
+    """Loss that trains the sampler itself (`Sampler.loss`), such as the interlevel loss of proposals."""
 
-    Args:
-        name: name of the term in logs.
-    """
-
-    def __init__(self, name: str = "interlevel") -> None:
-        super().__init__(name)
+    def __init__(self) -> None:
+        super().__init__("interlevel")
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return model.sampler.learns_from_weights
@@ -214,18 +209,3 @@ class UnseenRoughness(LossTerm):
 
 FEW_IMAGES = MatterNearCameras(), UnseenRoughness()
 """Terms of methods whose settings include `FewImagesConfig`."""
-
-
-class TransparentOpacity(LossTerm):
-    """Opacity of pixels whose alpha marks them as empty at the time of their image."""
-
-    def __init__(self) -> None:
-        super().__init__("empty", "empty_loss_mult")
-
-    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
-        return model.scene.moving and batch.alpha is not None
-
-    def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        batch = shown.batch
-        assert batch.alpha is not None
-        return opacity_of_transparent(shown.pixels.accumulation, batch.alpha, batch.weights)

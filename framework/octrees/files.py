@@ -29,7 +29,7 @@ import torch
 from nerfloom.base.archives import uncompressed_size
 from nerfloom.base.arrays import read_small_arrays
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.errors import DataError
+from nerfloom.base.errors import DataError, one_line
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import MAX_COORDINATE, MAX_SIZE
 from nerfloom.kernels.octree.layout import BRICK, MAX_BRICKS, OctreeLayout, cells_of
@@ -108,9 +108,9 @@ def read_octree(file: Path) -> Octree:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, LookupError, ArithmeticError, TypeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        raise DataError(f"{file} is not an octree, or is damaged: {_short(error)}; copy or bake it again") from error
+        raise DataError(f"{file} is not an octree, or is damaged: {one_line(error)}; copy or bake it again") from error
     except (RuntimeError, NotImplementedError, MemoryError) as error:  # encrypted, compressed in another way, too large
-        raise DataError(f"{file} cannot be read as an octree: {_short(error)}; copy or bake it again") from error
+        raise DataError(f"{file} cannot be read as an octree: {one_line(error)}; copy or bake it again") from error
 
 
 def _arrays(file: Path) -> dict[str, np.ndarray]:
@@ -212,7 +212,3 @@ def _number(arrays: dict[str, np.ndarray], name: str, least: float, most: float)
     if not least <= value <= most:
         raise ValueError(f"its '{name}' is not a number from {least:g} to {most:g}")
     return value
-
-
-def _short(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

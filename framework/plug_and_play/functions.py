@@ -15,6 +15,7 @@ from torch import Tensor
 from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.math import at_least_float32
 
 SigmaFunction = Callable[..., Tensor]
 """Function (positions (N, 3)[, times (N,)]) -> sigma (N,), the density in 1/length, at least 0."""
@@ -137,8 +138,3 @@ def check_rays(rays: Rays) -> None:
             f"the direction of ray {worst} has length {length:.4g}; it must be 1, so that t is a distance: use "
             "torch.nn.functional.normalize(directions, dim=-1)"
         )
-
-
-def at_least_float32(values: Tensor) -> Tensor:
-    """Convert `values` (N, ...) of types other than float64 to float32."""
-    return values if values.dtype == torch.float64 else values.float()

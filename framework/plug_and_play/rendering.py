@@ -11,7 +11,8 @@ from torch import Tensor
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.compositing.alpha import unit_intervals
 from nerfloom.kernels.compositing.density import ray_sum
-from nerfloom.plug_and_play.functions import RgbFunction, at_least_float32, check_rays, evaluate
+from nerfloom.kernels.math import at_least_float32
+from nerfloom.plug_and_play.functions import RgbFunction, check_rays, evaluate
 from nerfloom.rendering.volume import volume_render
 
 

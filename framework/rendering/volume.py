@@ -18,7 +18,7 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.compositing.alpha import composite_alpha
 from nerfloom.kernels.compositing.density import Composited, composite
 from nerfloom.kernels.compositing.thinning import thinned
-from nerfloom.kernels.math import scale_gradient
+from nerfloom.kernels.math import at_least_float32, scale_gradient
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.samplers.proposal import half_edge
@@ -149,7 +149,7 @@ def volume_render(
         background: (R, 3) or (3,) colour in [0, 1] of the background.
         is_alpha: whether `sigma` is an opacity, as in NeuS (Wang et al. 2021, equation 13).
     """
-    sigma, rgb = _at_least_float32(sigma), _at_least_float32(rgb)
+    sigma, rgb = at_least_float32(sigma), at_least_float32(rgb)
     over = composite_alpha if is_alpha else composite
     sums: Composited = over(samples, sigma, rgb, background.to(rgb.dtype), rays.fars)
     return Rendered(
@@ -175,7 +175,3 @@ def mean_distance(moments: Tensor, opacity: Tensor, fars: Tensor) -> Tensor:
     visible = opacity > 1e-6
     mean = moments / torch.where(visible, opacity, torch.ones_like(moments))
     return torch.where(visible, torch.minimum(mean, fars), fars)
-
-
-def _at_least_float32(values: Tensor) -> Tensor:
-    return values if values.dtype == torch.float64 else values.float()

@@ -223,24 +223,13 @@ def make_sampler(
     Raises:
         ConfigError: if the hierarchical sampler is selected and the method has no coarse level.
     """
-    sampler = _sampler(config, scene, make_coarse, proposals, learn_every)
-    sampler.samples_per_step = config.samples_per_batch
-    return sampler
-
-
-def _sampler(
-    config: SamplingConfig,
-    scene: Scene,
-    make_coarse: Callable[[], Field | None] | None,
-    proposals: Sequence[Field] | None,
-    learn_every: int,
-) -> Sampler:
+    sampler: Sampler
     if config.sampler == "proposal":
         count = range(len(config.num_proposal_samples))
         resolutions = tuple(COARSEST_PROPOSAL << level for level in count)
         if proposals is None and scene.moving and config.learns_motion:
             proposals = [_moving_proposal(scene, COARSEST_MOVING << level) for level in count]
-        return ProposalSampler(
+        sampler = ProposalSampler(
             scene.box,
             (*config.num_proposal_samples, config.num_nerf_samples),
             resolutions,
@@ -249,24 +238,27 @@ def _sampler(
             fields=proposals,
             learn_every=learn_every,
         )
-    if str(config.sampler) == "hierarchical":
+    elif str(config.sampler) == "hierarchical":
         if make_coarse is None:
             raise ConfigError("--sampler hierarchical: this method has no coarse field")
-        return HierarchicalSampler(make_coarse(), config.num_coarse_samples, config.num_fine_samples)
-    levels = _levels(config, scene) if scene.unbounded else 1
-    return OccupancySampler(
-        scene.box,
-        config.nested_resolution if scene.unbounded else config.grid_resolution,
-        config.num_steps,
-        config.early_stop,
-        config.train_early_stop,
-        cone=config.cone_angle if scene.unbounded else 0.0,
-        moving=scene.moving,
-        levels=levels,
-        endless=not scene.has_alpha and scene.unbounded,
-        slices=config.time_slices if scene.moving and levels == 1 else 1,
-        eval_step_scale=config.eval_step_scale,
-    )
+        sampler = HierarchicalSampler(make_coarse(), config.num_coarse_samples, config.num_fine_samples)
+    else:
+        levels = _levels(config, scene) if scene.unbounded else 1
+        sampler = OccupancySampler(
+            scene.box,
+            config.nested_resolution if scene.unbounded else config.grid_resolution,
+            config.num_steps,
+            config.early_stop,
+            config.train_early_stop,
+            cone=config.cone_angle if scene.unbounded else 0.0,
+            moving=scene.moving,
+            levels=levels,
+            endless=not scene.has_alpha and scene.unbounded,
+            slices=config.time_slices if scene.moving and levels == 1 else 1,
+            eval_step_scale=config.eval_step_scale,
+        )
+    sampler.samples_per_step = config.samples_per_batch
+    return sampler
 
 
 def _moving_proposal(scene: Scene, resolution: int) -> DensityField:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
+from nerfloom.base.config import AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice
 from nerfloom.data.scene import Scene
 
@@ -22,11 +22,7 @@ TIMES_A_SLICE, MAX_SLICES = 9, 16
 class MotionConfig(RayConfig):
     """Settings of a method that learns motion."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "time_slices": (1, 2**10),
-        "empty_loss_mult": AT_LEAST_0,
-        "transparent_share": (0.001, 1),
-    }
+    RANGES: ClassVar[dict[str, Range]] = {"time_slices": (1, 2**10)}
     """Allowed ranges."""
     smallest_box: bool = True
     """Learn only the part of the box that silhouettes show to be occupied at some time (occupancy)."""
@@ -34,11 +30,6 @@ class MotionConfig(RayConfig):
     """Number of time slices of the occupancy grid. Each has its own cells, so that a ray skips cells that are empty at
     its own time (occupancy). auto: one per nine image times, at most 16, if silhouettes mark empty space; otherwise
     1."""
-    empty_loss_mult: float = 0.0
-    """Weight of the opacity of rays through transparent pixels, which are empty at the time of their image; 0 to
-    disable."""
-    transparent_share: float = 1.0
-    """Fraction of the drawn transparent pixels that is rendered; their weight grows accordingly. 1 renders all."""
     learns_motion = True
 
 

@@ -9,7 +9,6 @@ matter must be seen beside static matter in some images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,6 +16,7 @@ from torch import Tensor
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.motion_bound import MotionBound
 from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.rays import Rays
 from nerfloom.scene.moving_hulls import nearest
 from nerfloom.scene.silhouettes import Silhouettes, held_balls
 
@@ -34,34 +34,6 @@ MAX_RAYS = 2**15
 """Maximum number of rays tested, spread evenly over all images."""
 BALLS = 128
 """Number of balls in a row as long as the box's diagonal."""
-
-
-@dataclass(frozen=True)
-class _Rays:
-    """Rays through opaque pixels beside transparent ones. Each must meet matter."""
-
-    origins: Tensor
-    """(R, 3)."""
-    directions: Tensor
-    """(R, 3)."""
-    enter: Tensor
-    """(R,) distances where the rays enter the box."""
-    leave: Tensor
-    """(R,) distances where the rays leave the box."""
-
-    def __len__(self) -> int:
-        return len(self.enter)
-
-    def __getitem__(self, index: Tensor) -> _Rays:
-        return _Rays(self.origins[index], self.directions[index], self.enter[index], self.leave[index])
-
-    def balls(self, spacing: float) -> tuple[Tensor, Tensor]:
-        """Return centres (N, 3) of balls along the rays, `spacing` apart, and the index (N,) of each ball's ray."""
-        count = int(((self.leave - self.enter) / spacing).ceil().max())
-        positions = self.enter[:, None] + spacing * (torch.arange(count, device=self.enter.device) + 0.5)
-        owners, steps = (positions < self.leave[:, None] + spacing / 2).nonzero().unbind(1)
-        along = positions[owners, steps, None] * self.directions[owners]
-        return (self.origins[owners] + along).contiguous(), owners
 
 
 @torch.no_grad()
@@ -99,17 +71,26 @@ def motion_bound(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> Motion
         speeds = torch.where(too_slow, SPEED_RATIO * speeds, speeds)
 
 
-def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tensor) -> list[_Rays]:
-    """Return the rays of each image that must meet matter."""
+def _rays_to_explain(silhouettes: Silhouettes, images: Sequence[int], box: Tensor) -> list[Rays]:
+    """Return the rays of each image that must meet matter, within the box: through opaque pixels at edges."""
     most, found = max(MAX_RAYS // len(images), 1), []
     cameras: Cameras = silhouettes.dataset.cameras
     for image in images:
         pixels = _edges(silhouettes, image).view(-1).nonzero().squeeze(-1)
         pixels = pixels[:: -(-len(pixels) // most) or 1]
         rays = cameras.pixel_rays(pixels + int(cameras.offsets[image]), 0.0, 1.0)
-        meeting = _Rays(rays.origins, rays.directions, *intersect_box(rays.origins, rays.directions, box))
-        found.append(meeting[meeting.leave > meeting.enter])
+        meeting = Rays(rays.origins, rays.directions, *intersect_box(rays.origins, rays.directions, box))
+        found.append(meeting[meeting.fars > meeting.nears])
     return found
+
+
+def _balls(rays: Rays, spacing: float) -> tuple[Tensor, Tensor]:
+    """Return centres (N, 3) of balls along the rays, `spacing` apart, and the index (N,) of each ball's ray."""
+    count = int(((rays.fars - rays.nears) / spacing).ceil().max())
+    positions = rays.nears[:, None] + spacing * (torch.arange(count, device=rays.nears.device) + 0.5)
+    owners, steps = (positions < rays.fars[:, None] + spacing / 2).nonzero().unbind(1)
+    along = positions[owners, steps, None] * rays.directions[owners]
+    return (rays.origins[owners] + along).contiguous(), owners
 
 
 def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
@@ -125,7 +106,7 @@ def _edges(silhouettes: Silhouettes, image: int) -> Tensor:
 
 
 def _explained(
-    silhouettes: Silhouettes, images: Sequence[int], number: int, rays: _Rays, travelled: Tensor, spacing: float
+    silhouettes: Silhouettes, images: Sequence[int], number: int, rays: Rays, travelled: Tensor, spacing: float
 ) -> Tensor:
     """Return which rays (R,) bool of image `number` can meet matter, given the other images; `travelled` is (M,)."""
     if not len(rays):
@@ -133,7 +114,7 @@ def _explained(
     margins = (travelled - travelled[number]).abs()
     margins[number] = torch.inf
     near = [other for other in nearest(margins) if other != number]
-    centers, owners = rays.balls(spacing)
+    centers, owners = _balls(rays, spacing)
     held = held_balls(silhouettes, [images[i] for i in near], centers, spacing / 2, margins[near].tolist())
     explained = torch.zeros(len(rays), dtype=torch.bool)
     explained[owners[held]] = True

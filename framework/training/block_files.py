@@ -84,6 +84,6 @@ def _source(run: Run, file: Path, device_type: Any, data: Path | None) -> Run:
         machine=dataclasses.replace(run.config.machine, device_type=device_type),
     )
     parser = run.parser
-    if any(field.name == "placement" for field in dataclasses.fields(parser)):  # type: ignore[arg-type]
+    if hasattr(parser, "placement"):
         parser = dataclasses.replace(parser, placement=file.parent / TRANSFORMS)  # type: ignore[type-var]
     return dataclasses.replace(run, config=config, parser=parser, folder=file.parent)

@@ -170,8 +170,7 @@ def block_placements(run: Run, parsed: ParsedScene, blocks: tuple[Block, ...]) -
         parsed: its training images.
         blocks: the blocks.
     """
-    takes = any(field.name == "placement" for field in dataclasses.fields(run.parser))  # type: ignore[arg-type]
-    if not parsed.unbounded or not takes:
+    if not parsed.unbounded or not hasattr(run.parser, "placement"):
         return (None,) * len(blocks)
     whole, positions = parsed.placement, positions_of(parsed)
     rotation, reach = whole.transform[:, :3], float(whole.points(positions).abs().max())

@@ -1,7 +1,7 @@
 """Checkpoints of tensors and plain data, written atomically, so that a killed process leaves no incomplete file.
 
 A file is PyTorch's archive followed by a seal, the archive's SHA-256 hash: PyTorch itself does not check the bytes of
-tensors. Files of `format` 1 have no seal.
+tensors.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from nerfloom.training.run_path import CHECKPOINTS
 
 FOLDER = CHECKPOINTS
 """Name of the checkpoints' folder in a run's folder."""
-UNSEALED, SEALED = 1, 2
-"""Values of a checkpoint's `format`."""
+FORMAT = 2
+"""Value of a checkpoint's `format`."""
 SEAL = b"\nsha256:"
 """Bytes before the hexadecimal hash at the end of the file."""
 PIECE = 2**24
@@ -60,7 +60,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     try:
         folder.mkdir(parents=True, exist_ok=True)
         content = io.BytesIO()  # if torch writes to a full disk, it reports "unexpected pos"
-        torch.save({"format": SEALED, **state}, content)
+        torch.save({"format": FORMAT, **state}, content)
         content.seek(0, os.SEEK_END)
         content.write(SEAL + hashlib.sha256(content.getbuffer()).hexdigest().encode())
         write_atomically(path, lambda file: file.write(content.getbuffer()))
@@ -124,9 +124,9 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     except Exception as error:  # torch raises RuntimeError, UnpicklingError, EOFError, KeyError, OSError and more
         raise CheckpointError(f"{path} is damaged or not a checkpoint of nerfloom") from error
     number = state.get("format") if isinstance(state, dict) else None
-    if not isinstance(number, int) or number not in (UNSEALED, SEALED) or "model" not in state:
-        raise CheckpointError(f"{path} is not a checkpoint of this version of nerfloom (format {SEALED})")
-    if number == SEALED and not sealed:
+    if not isinstance(number, int) or number != FORMAT or "model" not in state:
+        raise CheckpointError(f"{path} is not a checkpoint of this version of nerfloom (format {FORMAT})")
+    if not sealed:
         raise CheckpointError(f"{path} is damaged: its seal is missing")
     return state
 

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError, one_line
 from nerfloom.base.processes import processes
 from nerfloom.base.step_kind import StepKind
 from nerfloom.data.sources import BatchSource
@@ -120,7 +120,7 @@ class CudaRecorder:
                 torch.rand((), device=self.device)
                 torch.cuda.synchronize(self.device)
             except RuntimeError:
-                raise ConfigError(f"capturing a CUDA graph failed ({_one_line(failure)}); use {FLAG} off") from failure
+                raise ConfigError(f"capturing a CUDA graph failed ({one_line(failure)}); use {FLAG} off") from failure
             raise
         finally:
             if collecting:
@@ -223,7 +223,7 @@ class StepGraphs(Generic[T]):
         except ConfigError:
             raise
         except Exception as error:  # torch, CUDA or Triton: each may refuse a capture
-            self._give_up(f"capturing one failed ({_one_line(error)})")
+            self._give_up(f"capturing one failed ({one_line(error)})")
 
     def _test(self, kept: _Kind[T], seed: Callable[[], None], step: Callable[[], T]) -> T:
         """Take a step without and with its graph, and drop the graph if they differ."""
@@ -267,10 +267,6 @@ class StepGraphs(Generic[T]):
         if why not in self._told:
             self._told.add(why)
             say(f"note: steps are not replayed as CUDA graphs, because {why}")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _copies(tensors: Sequence[Tensor]) -> list[Tensor]:

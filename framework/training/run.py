@@ -95,7 +95,7 @@ class Run:
             say(f"warning: {error}; the placement of the data is not checked")
             return parsed
         moved = _moved(parsed, then)
-        if moved >= PLACEMENT_TOLERANCE and any(field.name == "placement" for field in dataclasses.fields(self.parser)):  # type: ignore[arg-type]
+        if moved >= PLACEMENT_TOLERANCE and hasattr(self.parser, "placement"):
             say(
                 f"{self.config.data}: images or settings have changed since {self.folder} was trained; cameras keep "
                 "their placement, but other images may be held out"

@@ -120,9 +120,6 @@ class TaughtPixels(BatchSource):
         values = picture.rgb.reshape(-1, 3), picture.accumulation.reshape(-1), known_depths(picture).reshape(-1)
         return numbers[chosen], tuple(each[chosen] for each in values)
 
-    def drawing_from(self, dataset: Dataset) -> TaughtPixels:
-        return TaughtPixels(self.teacher, dataset, self.background)
-
 
 @dataclass(frozen=True)
 class Shot:
@@ -178,9 +175,6 @@ class TaughtViews(BatchSource):
             picture = self.teacher.picture(view, torch.zeros(3, device=self.dataset.device))
         return Shot(view, picture.rgb.half(), picture.accumulation.half(), known_depths(picture))
 
-    def drawing_from(self, dataset: Dataset) -> TaughtViews:
-        return TaughtViews(self.teacher, dataset, self.background, self.seed)
-
 
 class MixedSource(BatchSource):
     """Draws batches of photographs, and of a teacher in a share of the steps.
@@ -231,7 +225,7 @@ def batch_source(model: Model[Any], dataset: Dataset, config: TrainConfig) -> Ba
         config: the settings of the run.
 
     Raises:
-        ConfigError: if settings contradict each other, or the teacher is missing or cannot teach the model.
+        ConfigError: if the teacher is missing or cannot teach the model.
     """
     photographs = make_source(model.batches, dataset, config)
     if config.teacher is None:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import choose_device
-from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError
+from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError, one_line
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import read_scale
 from nerfloom.data.scene import Scene
@@ -115,7 +115,7 @@ def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, An
     except NerfloomError:
         raise
     except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
-        raise CheckpointError(f"no model can be built with the settings: {_short(error)}") from error
+        raise CheckpointError(f"no model can be built with the settings: {one_line(error)}") from error
     restore_model(model, checkpoint, method.name)
     return model
 
@@ -136,7 +136,7 @@ def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | N
     try:
         model.load_state_dict(checkpoint["model"])
     except (RuntimeError, TypeError, AttributeError, ValueError, LookupError, ArithmeticError, MemoryError) as error:
-        reason = _difference(model.state_dict(), checkpoint["model"]) or _short(error)
+        reason = _difference(model.state_dict(), checkpoint["model"]) or one_line(error)
         raise CheckpointError(f"the checkpoint does not fit the model's settings: {reason}") from error
 
 
@@ -156,8 +156,3 @@ def _difference(expected: dict[str, Any], found: Any) -> str:
 
 def _size(value: Tensor) -> str:
     return "x".join(map(str, value.shape)) or "a number"
-
-
-def _short(error: BaseException) -> str:
-    """Return the message of an error on one line, at most 300 characters."""
-    return (" ".join(str(error).split()) or type(error).__name__)[:300]

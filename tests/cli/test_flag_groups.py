@@ -121,7 +121,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
     belongs = {
         "nerfacto": ["--num-levels", "--camera-learning-rate", "--appearance-embedding-dim"],
         "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
-        "ray": ["--num-rays-per-batch", "--draw-by-error"],
+        "ray": ["--num-rays-per-batch", "--rays-per-pixel"],
         "teacher": ["--teacher", "--teacher-share", "--teacher-until"],
         "optimisation": ["--learning-rate", "--lr-schedule", "--adam-eps"],
         "evaluation and saving": ["--steps-per-save", "--max-eval-images", "--target-psnr", "--load-checkpoint"],
@@ -236,7 +236,7 @@ def test_what_the_data_decide_is_not_called_none() -> None:
         ),
         ("--num-proposal-samples 32 --rays-per-pixel 9", {"num_proposal_samples": (32,), "rays_per_pixel": 9}),
         ("--lr-schedule cosine --sampler occupancy", {"lr_schedule": "cosine", "sampler": "occupancy"}),
-        ("--mixed-precision True --draw-by-error True", {"mixed_precision": True, "draw_by_error": True}),
+        ("--mixed-precision True --robust True", {"mixed_precision": True, "robust": True}),
         ("--contraction False --silhouette-cells False", {"contraction": False, "silhouette_cells": False}),
         ("--contraction auto --num-steps auto --max-seconds None", {"contraction": "auto", "num_steps": "auto"}),
         ("--output-dir a/b --max_seconds 3 --learning-rate=1e-3", {"output_dir": Path("a/b"), "max_seconds": 3.0}),

@@ -80,7 +80,7 @@ BAD = {
     "zero angle": (put("camera_angle_x", 0.0), "'camera_angle_x' is 0.0"),
     "nan angle": (put("camera_angle_x", math.nan), "'camera_angle_x' is nan"),
     "text angle": (put("camera_angle_x", "wide"), "'camera_angle_x' is 'wide'"),
-    "frame is no object": (lambda c: c["frames"].__setitem__(4, 7), "frame 4: 'file_path' is missing"),
+    "frame is no object": (lambda c: c["frames"].__setitem__(4, 7), "frame 4 is 7; it must be an object"),
     "no file": (lambda c: c["frames"][4].pop("file_path"), "frame 4: 'file_path' is missing"),
     "file is a number": (frame(file_path=3), "frame 4: 'file_path' is missing"),
     "no pose": (lambda c: c["frames"][4].pop("transform_matrix"), "frame 4: 'transform_matrix' is not a 4x4 matrix"),

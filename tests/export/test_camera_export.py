@@ -35,7 +35,7 @@ def exported(parser: DataParser, data: Path) -> tuple[PosedFiles, dict[str, Pars
 def given_poses(file: Path) -> dict[str, Tensor]:
     """Name of each image of a transforms file -> its pose as it stands there, float64."""
     frames = read_object(file)["frames"]
-    return {Path(row["file_path"]).stem: read_pose(row, "frame", torch.float64)[:3] for row in frames}
+    return {Path(row["file_path"]).stem: read_pose(row, "frame")[:3] for row in frames}
 
 
 def furthest(found: dict[str, Tensor], given: dict[str, Tensor]) -> float:

@@ -27,11 +27,6 @@ MUTANTS = {
             "depth images of another size are shifted by half a pixel of theirs",
             "truth/test_captures.py::test_a_depth_image_of_another_size_gives_what_is_at_the_pixels_middle"),
     ],
-    "nerfloom.data.pixels.error_map": [
-        Mutant("error-weights-lost", "ErrorMap.choose", "1 / A", "torch.ones_like(A)",
-            "--draw-by-error minimises another loss than was asked for",
-            "test_error_map.py::test_large_errors_are_drawn_more_often_as_stated"),
-    ],
     "nerfloom.data.exr": [
         Mutant("exr-differences-without-offset", "_unpacked", "128", "127",
             "depths of compressed OpenEXR files are other numbers",
@@ -112,7 +107,7 @@ MUTANTS = {
     ],
     "nerfloom.data.sources": [
         Mutant("errors-not-restored", "PixelSource.restore", "A.copy_(state)", "A.fill_(1.0)",
-            "with --draw-by-error a resumed run has other bits",
+            "with --robust a resumed run has other bits",
             "test_sources.py::test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set"),
     ],
     "nerfloom.data.tracks": [

@@ -76,11 +76,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "mip-nerf-360": {"method": "mip-nerf-360", "num_layers": 3, "encoding": "integrated"},
     "zip-nerf": {"method": "zip-nerf", "exposure": True},
     "vanilla-nerf": {"method": "vanilla-nerf", "num_layers": 3, "sampler": "hierarchical"},
-    "dnerf": {"method": "dnerf", "num_layers": 3, "sampler": "hierarchical", "transparent_share": 1.0},
+    "dnerf": {"method": "dnerf", "num_layers": 3, "sampler": "hierarchical"},
     "nerf-plus-plus": {"method": "nerf-plus-plus", "num_layers": 3},
     "tensorf": {"method": "tensorf", "sampler": "proposal", "samples_per_batch": 24 * 8},
     "captures": {"appearance_embedding_dim": 4, "camera_optimizer": "SO3xR3", "lr_warmup_steps": 9},
-    "screws, by error": {"camera_optimizer": "SE3", "draw_by_error": True, "lr_schedule": "exponential"},
+    "screws": {"camera_optimizer": "SE3", "lr_schedule": "exponential"},
     "normals, four rays": {"predict_normals": True, "rays_per_pixel": 4, "train_rays_per_pixel_from": 0.0},
 }
 

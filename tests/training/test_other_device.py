@@ -63,7 +63,7 @@ def test_tensors_of_two_devices_are_refused() -> None:
 
 def test_steps_of_captures_with_bent_lenses_do_not_wait(tmp_path: Path) -> None:
     """A recording of them would fail: how often a lens's inverse is improved is found out before."""
-    here = small(tmp_path, draw_by_error=False)
+    here = small(tmp_path)
     with other_device() as mode:
         trainer = Trainer(here.method, here.config, bent(here.train_set).to(OTHER))
         for _ in range(2):

@@ -16,12 +16,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.operations import Counting, _tensors
 from nerfloom.base.device import StepValue, runs_ahead, seed_step
-from nerfloom.data.pixels.error_map import DECAY, ErrorMap
 from nerfloom.losses.functions import depth_error
 from nerfloom.methods.tensorf import TensoRF
 from nerfloom.scene.covisible_space import CovisibleSpace
 from nerfloom.training.trainer import Trainer
-from tests.training.test_graphs import VARIANTS, idle, small
+from tests.training.test_graphs import VARIANTS, small
 
 NOWHERE = torch.device("meta")
 
@@ -53,7 +52,7 @@ def test_a_step_neither_asks_the_device_nor_brings_it_tensors(
         assert all(tensor.device == NOWHERE for values in (*lists, [lr, found_inf]) for tensor in values)
 
     monkeypatch.setattr(torch, "_fused_adam_", updated)  # likewise
-    here = small(tmp_path, **{**VARIANTS[variant], "draw_by_error": False})  # whose map has as many tiles as a sum
+    here = small(tmp_path, **VARIANTS[variant])
     assert here.train_set.resident
     trainer = Trainer(here.method, here.config, here.train_set.to(NOWHERE))
     assert trainer.device == NOWHERE
@@ -112,19 +111,6 @@ def test_draws_of_a_step_depend_on_seed_step_and_process_alone() -> None:
     for index, one in enumerate(others):
         for other in others[:index]:
             assert abs(float(torch.corrcoef(torch.stack([one, other]))[0, 1])) < 0.15
-
-
-def test_errors_of_tiles_are_learnt_as_by_hand() -> None:
-    """Several pixels of a tile, and errors that are not finite: without a question to the device."""
-    dataset = idle("nerfacto").train_set
-    found = ErrorMap(dataset)
-    width = int(dataset.cameras.widths[0])
-    pixels = torch.tensor([0, 1, width + 3, 8, 16, 17])  # three in the first tile, one in the second, two in the third
-    found.learn(pixels, torch.tensor([0.1, 0.2, 0.6, 0.5, torch.nan, torch.inf]))
-    expected = torch.ones_like(found.errors)
-    expected[0] += (1 - DECAY) * (0.3 - 1)
-    expected[1] += (1 - DECAY) * (0.5 - 1)
-    torch.testing.assert_close(found.errors, expected)
 
 
 def test_depths_that_are_not_known_do_not_count() -> None:

@@ -13,7 +13,6 @@ from nerfloom.cameras.cameras import CENTER
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.depths import ray_distances
-from nerfloom.data.pixels.error_map import ErrorMap
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.argument_checks import check_indices
@@ -47,8 +46,7 @@ class PixelBatch:
     clear: Tensor | None = None
     """(R,) distance from the camera that the pixel's image shows to be empty; None if unknown."""
     weights: Tensor | None = None
-    """(R,) factors of the pixels' losses, with mean 1, if pixels were not drawn uniformly or differ in size; 0 for
-    pixels that do not count."""
+    """(R,) factors of the pixels' losses, with mean 1, if pixels differ in size; 0 for pixels that do not count."""
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -66,23 +64,6 @@ class PixelBatch:
     def rays_per_pixel(self) -> int:
         """Number K of rays per pixel."""
         return max(len(self.rays) // max(len(self), 1), 1)
-
-
-def thinned(batch: PixelBatch, share: float) -> tuple[PixelBatch, Tensor]:
-    """Drop some of a batch's transparent pixels; return the batch and the indices (Q,) int64 of the remaining pixels.
-
-    The weights of the remaining ones grow accordingly, so that the mean of a loss has the same expectation.
-
-    Args:
-        batch: pixels with alpha.
-        share: probability of keeping a pixel with alpha 0.
-    """
-    assert batch.alpha is not None
-    transparent = batch.alpha == 0
-    kept = (~transparent | (torch.rand(len(batch), device=transparent.device) < share)).nonzero().squeeze(-1)
-    left = batch[kept]
-    weights = torch.where(transparent[kept], 1 / share, 1.0) * (len(left) / max(len(batch), 1))
-    return replace(left, weights=weights if left.weights is None else weights * left.weights), kept
 
 
 @dataclass(frozen=True)
@@ -172,7 +153,6 @@ def draw_batch(
     dataset: Dataset,
     count: int,
     background: Background,
-    errors: ErrorMap | None = None,
     subpixels: Tensor = CENTER,
     look_up: LookUp | None = None,
     keypoints: int = 0,
@@ -187,7 +167,6 @@ def draw_batch(
         dataset: the training images.
         count: number of pixels R.
         background: kind of background.
-        errors: error map for drawing in proportion to errors; None for uniform drawing.
         subpixels: (K, 2) positions in a pixel through which its rays pass, as in `Cameras.pixel_rays`.
         look_up: for pixels in a file, a function that returns the stored colours of all drawn pixels, in the order of
             drawing (`PixelStream.look_up`).
@@ -196,31 +175,22 @@ def draw_batch(
     """
     uniform, sparse = count - keypoints, dataset.sparse_depth
     # Pixels are drawn before any other random number, so that `PixelStream` can predict them from the seed.
-    drawn = uniform if errors is None else 2 * uniform
-    flat = draw_pixels(dataset, drawn) if num_images is None else draw_from_images(dataset, drawn, num_images)
+    flat = draw_pixels(dataset, uniform) if num_images is None else draw_from_images(dataset, uniform, num_images)
     stored = None
     if not dataset.resident:
         stored = dataset.stored(flat) if look_up is None else look_up(flat).to(dataset.device)
         flat = flat.to(dataset.device)
-    behind, weights = background_colors(background, count, dataset.device), None
-    if errors is not None:
-        selected, weights = errors.choose(flat, uniform)
-        flat, stored = flat[selected], None if stored is None else stored[selected]
-        weights = torch.cat([weights, weights.new_ones(keypoints)])
+    behind = background_colors(background, count, dataset.device)
     if not keypoints or sparse is None:
-        batch = gather_batch(dataset, flat, behind, subpixels, stored)
-    else:
-        chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
-        if stored is not None:
-            stored = torch.cat([stored, dataset.stored(sparse.pixels[chosen])])
-        batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
-        distances, deviations = (
-            torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)
-        )
-        batch = replace(batch, distances=distances, deviations=deviations)
-    if weights is not None and batch.weights is not None:
-        weights = weights * batch.weights
-    return replace(batch, weights=batch.weights if weights is None else weights)
+        return gather_batch(dataset, flat, behind, subpixels, stored)
+    chosen = torch.randint(len(sparse), (keypoints,), device=dataset.device)
+    if stored is not None:
+        stored = torch.cat([stored, dataset.stored(sparse.pixels[chosen])])
+    batch = gather_batch(dataset, torch.cat([flat, sparse.pixels[chosen]]), behind, subpixels, stored)
+    distances, deviations = (
+        torch.cat([values.new_zeros(uniform), values[chosen]]) for values in (sparse.distances, sparse.deviations)
+    )
+    return replace(batch, distances=distances, deviations=deviations)
 
 
 def gather_batch(

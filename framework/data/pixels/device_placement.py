@@ -6,11 +6,10 @@ import torch
 
 from nerfloom.base.device import free_memory
 from nerfloom.data.dataset import Dataset
+from nerfloom.data.pixels.cache import MB
 
 MAX_MEMORY_SHARE = 0.5
 """Maximum fraction of a device's free memory for images; the rest is for the model and its steps."""
-MB = 1_000_000
-"""Bytes of a megabyte."""
 
 
 def on_device(dataset: Dataset, device: torch.device) -> tuple[Dataset, str | None]:

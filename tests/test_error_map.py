@@ -43,7 +43,7 @@ def test_the_weighted_mean_is_that_of_all_candidates(dataset: Dataset) -> None:
     candidates = torch.randint(len(dataset.pixels), (512,))
     value = torch.rand(len(dataset.pixels), dtype=torch.float64)
     means = []
-    for _ in range(4000):
+    for _ in range(1000):
         pixels, weights = errors.draw(candidates, 128)
         assert weights.max() <= 1 / EVENLY + 1e-5
         means.append((value[pixels] * weights).mean())

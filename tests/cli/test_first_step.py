@@ -117,8 +117,8 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Answer,
     words = [sys.executable, "-c", REFUSED]
     done = subprocess.run(words, input=json.dumps(asked), capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
-    found = [tuple(json.loads(line)) for line in done.stdout.splitlines()]
-    return {mistake: (answer, folders[mistake]) for mistake, answer in zip(PATHS, found, strict=True)}
+    found = zip(PATHS, map(json.loads, done.stdout.splitlines()), strict=True)
+    return {mistake: ((status, said, imported), folders[mistake]) for mistake, (status, said, imported) in found}
 
 
 @pytest.mark.parametrize("mistake", PATHS)

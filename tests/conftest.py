@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 import os
+import shutil
 import signal
 import sys
 import time
@@ -91,9 +92,9 @@ def write_tiny(folder: Path, size: int = 20, counts: tuple[int, int, int] = (10,
 
 
 @pytest.fixture
-def tiny(tmp_path: Path) -> Path:
+def tiny(shared_tiny: Path, tmp_path: Path) -> Path:
     """A fresh tiny data set that a test may damage."""
-    return write_tiny(tmp_path / "ball")
+    return shutil.copytree(shared_tiny, tmp_path / "ball")
 
 
 @pytest.fixture(scope="session")

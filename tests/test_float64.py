@@ -63,7 +63,7 @@ def test_the_watch_sees_float64() -> None:
 @pytest.mark.parametrize("kind", TINY)
 def test_a_step_of_each_method(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     """And the silhouettes, the schedule, and a picture with its PSNR and SSIM."""
-    settings = {"max_num_iterations": 2, "steps_per_eval_all_images": 1, "max_eval_images": 1}
+    settings = {"max_num_iterations": 2, "steps_per_eval_all_images": 2, "max_eval_images": 1}
     trainer = tiny_trainer(kind, shared_tiny, tmp_path, True, **settings)
     with Watched():
         trainer.train()

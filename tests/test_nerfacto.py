@@ -191,7 +191,7 @@ def test_the_mean_appearance_is_what_photographs_have_in_common(
     model, dataset = trainer.model, trainer.train_set
     appearance = appearance_of(model)
     assert appearance is not None
-    for index in range(len(factors)):
+    for index in range(0, len(factors), 3):  # of either light
         start = fit_appearance(model, dataset, dataset.cameras.image_pixels(index).view(-1), torch.zeros(3))
         assert start is not None
         (same,) = (appearance.vectors - start).abs().amax(-1).eq(0).nonzero().squeeze(-1).tolist()

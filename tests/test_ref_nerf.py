@@ -126,12 +126,19 @@ def test_penalties_of_normals_train_the_density(kind: str) -> None:
     assert float(first.grad.abs().sum()) > 0
 
 
+@pytest.fixture(scope="module")
+def mirror(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of a mirror, and its normals."""
+    folder = tmp_path_factory.mktemp("shiny") / "shiny"
+    write_shiny(folder, size=24, num_train=8, num_test=2)
+    return folder / "mirror"
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", KINDS)
-def test_training_on_a_mirror(kind: str, tmp_path: Path) -> None:
+def test_training_on_a_mirror(kind: str, mirror: Path, tmp_path: Path) -> None:
     """The loss falls, pictures have all outputs, and normals are judged against the true ones."""
-    write_shiny(tmp_path / "shiny", size=24, num_train=8, num_test=2)
-    train, test = (load_dataset(Blender().parse(tmp_path / "shiny" / "mirror", s), s) for s in ("train", "test"))
+    train, test = (load_dataset(Blender().parse(mirror, s), s) for s in ("train", "test"))
     trainer = trainer_of(kind, train, max_num_iterations=120)
     before = evaluate(trainer.model, test).results
     for _ in range(120):

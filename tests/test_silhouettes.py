@@ -138,29 +138,47 @@ def flight(
     return replace(wide, pixels=pixels.view(-1, 4), times=times), times
 
 
-@pytest.mark.parametrize("slices", [1, 3, 8])
-def test_a_flying_ball_is_never_outside_the_hull_of_its_time(ball: Dataset, slices: int) -> None:
-    """At all times, those between two images too; and what the hull leaves grows less with the number of slices."""
+RADIUS = 0.25
+"""Of the ball that flies."""
 
-    def place(time: float) -> torch.Tensor:
-        return torch.tensor([0.8 * time - 0.4, 0.25 * math.sin(3 * time), 0.15 - 0.3 * time])
 
-    radius = 0.25
-    seen, times = flight(ball, place, radius)
+def place(time: float) -> torch.Tensor:
+    """Where the ball is that flies."""
+    return torch.tensor([0.8 * time - 0.4, 0.25 * math.sin(3 * time), 0.15 - 0.3 * time])
+
+
+@pytest.fixture(scope="module")
+def flying(ball: Dataset) -> tuple[Silhouettes, torch.Tensor, MotionBound]:
+    """Silhouettes of a ball that flies, their times, and how fast it is."""
+    seen, times = flight(ball, place, RADIUS)
     silhouettes = Silhouettes.of(seen)
     bound = motion_bound(silhouettes, BOX, times)
     assert bound is not None
+    return silhouettes, times, bound
+
+
+@pytest.mark.parametrize("slices", [1, 3, 8])
+def test_a_flying_ball_is_never_outside_the_hull_of_its_time(
+    flying: tuple[Silhouettes, torch.Tensor, MotionBound], slices: int
+) -> None:
+    """At all times, those between two images too; and what the hull leaves grows less with the number of slices."""
+    silhouettes, times, bound = flying
     hull = moving_hulls(silhouettes, BOX, 16, times, bound, slices).view(slices, -1)
+    cells = centers(16)
     for time in torch.linspace(0, 1, 97).tolist():
-        inside = (centers(16) - place(time)).norm(dim=-1) < radius
+        inside = (cells - place(time)).norm(dim=-1) < RADIUS
         assert bool(inside.any())
         assert bool(hull[min(int(time * slices), slices - 1)][inside].all())
-    far = (centers(16) - place(0.0)).norm(dim=-1) > 0.8
+    far = (cells - place(0.0)).norm(dim=-1) > 0.8
     assert hull[0][far].float().mean() < {1: 0.15, 3: 0.05, 8: 0.02}[slices]
+
+
+def test_a_flying_ball_never_leaves_the_smallest_box(flying: tuple[Silhouettes, torch.Tensor, MotionBound]) -> None:
+    silhouettes, times, bound = flying
     box = moving_box(silhouettes, BOX, times, bound)
     for time in torch.linspace(0, 1, 97).tolist():
-        assert bool((box[0] < place(time) - radius).all())
-        assert bool((box[1] > place(time) + radius).all())
+        assert bool((box[0] < place(time) - RADIUS).all())
+        assert bool((box[1] > place(time) + RADIUS).all())
     assert float((box[1] - box[0]).prod()) < 0.4 * float((BOX[1] - BOX[0]).prod())
 
 

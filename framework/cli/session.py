@@ -132,10 +132,11 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
     except LostProcessError as error:
         if trainer.state.step == 0:
             raise
+        ending = "" if trainer.folder is None else f"; {_continue_with(trainer.folder)}"
         if processes().first:
             with handled((signal.SIGTERM,), lambda number, frame: None):  # torchrun sends it after a process has ended
                 trainer.save()
-        raise LostProcessError(f"step {trainer.state.step:,}: {error}; {_continue_with(trainer.folder)}") from error
+        raise LostProcessError(f"step {trainer.state.step:,}: {error}{ending}") from error
 
 
 def _finish(run: Run, trainer: Trainer) -> None:

@@ -48,13 +48,6 @@ def test_errors_are_one_line(arguments: list[str], words: str, tmp_path: Path) -
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_an_unknown_flag_gets_the_nearest() -> None:
-    done = called("ns-train", "instant-ngp", "--max-secnds", "3")
-    assert done.returncode == 2
-    assert "--max-seconds" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 @pytest.mark.parametrize("beside", [[], ["procedural"], ["--train-image-indices", "0", "1"]])
 @pytest.mark.parametrize(
     ("flag", "value", "words"),

@@ -1,6 +1,6 @@
 """The way to the first training step: what it must not import, since each of these takes a second or more."""
 
-import os
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.helpers import TINY_NGP
+from tests.forked import ROOT, Forks
 
 FIRST_STEP = """
 import sys
@@ -43,13 +44,13 @@ SLOW = {
 
 
 @pytest.mark.medium
-def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Path) -> None:
-    """Also with TensorBoard's files: what that alone imports comes after what is imported without."""
+def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
+    """Also with TensorBoard's files: what that alone imports comes after what is imported without.
+
+    Torch is there from the start; of what it imports itself nothing is slow.
+    """
     words = ["instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path, *TINY_NGP]
-    done = subprocess.run(
-        [sys.executable, "-c", FIRST_STEP, *map(str, words)],
-        capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+    done = forks.run(FIRST_STEP, *words)
     assert done.returncode == 0, done.stderr
     without, with_files = (set(line.split()) for line in done.stdout.splitlines())
     for imported in (without, with_files):
@@ -58,19 +59,15 @@ def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Pat
 
 
 REFUSED = """
-import sys
-from importlib.metadata import entry_points
+import json, sys
+from tests.cli.helpers import called
 
-name = sys.argv[0] = sys.argv[1]
-del sys.argv[1]
-(entry,) = entry_points(group="console_scripts", name=name)
-try:
-    entry.load()()
-except SystemExit as end:
-    print(end.code)
-print(*sys.modules)
+for name, words, folder in json.load(sys.stdin):
+    done = called(name, *words, folder=folder)
+    imported = [module for module in ("torch", "numpy") if module in sys.modules]
+    print(json.dumps([done.returncode, done.stderr, imported]))
 """
-"""A program that runs a command, and prints its exit status and what it has imported."""
+"""A program that runs commands, and prints the exit status of each, what it says, and which of two are imported."""
 PATHS = {
     "no data": ("ns-train", ["instant-ngp", "--data", "{0}/capturs"], "Did you mean 'capture'?"),
     "no output": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--output-dir", "{0}/file/x"], "cannot write"),
@@ -91,21 +88,45 @@ PATHS = {
 """Mistake in a path -> the command, its arguments, and words of the answer."""
 
 
-@pytest.mark.parametrize("mistake", PATHS)
-def test_a_wrong_path_is_refused_before_torch_is_imported(mistake: str, tmp_path: Path) -> None:
-    name, words, answer = PATHS[mistake]
-    (tmp_path / "capture").mkdir()
-    (tmp_path / "file").touch()
-    run = tmp_path / "outputs" / "one" / "m" / "t"
+def what_there_is(folder: Path) -> list[str]:
+    """The files and folders below a folder."""
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def with_a_run(folder: Path) -> Path:
+    """Write a folder for data, a file, and a run without a checkpoint, whose data is not there."""
+    (folder / "capture").mkdir()
+    (folder / "file").touch()
+    run = folder / "outputs" / "one" / "m" / "t"
     run.mkdir(parents=True)
-    (run / "config.yml").write_text(f"method: instant-ngp\ndata: {tmp_path / 'moved'}\n")
-    before = sorted(tmp_path.rglob("*"))
-    done = subprocess.run(
-        [sys.executable, "-c", REFUSED, name, *(word.format(tmp_path) for word in words)],
-        capture_output=True, text=True, cwd=tmp_path,
-    )  # fmt: skip
-    code, imported = done.stdout.splitlines()
-    assert answer in done.stderr.splitlines()[-1]
-    assert code in ("1", "2")
-    assert not {"torch", "numpy"} & set(imported.split())
-    assert sorted(tmp_path.rglob("*")) == before
+    (run / "config.yml").write_text(f"method: instant-ngp\ndata: {folder / 'moved'}\n")
+    return folder
+
+
+Answer = tuple[int, str, list[str]]
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Answer, Path]]:
+    """What each mistake is answered with, and in which folder, by one process: what it imports stays imported."""
+    folders = {mistake: with_a_run(tmp_path_factory.mktemp("refused")) for mistake in PATHS}
+    asked = [
+        (name, [word.format(folders[mistake]) for word in words], str(folders[mistake]))
+        for mistake, (name, words, _) in PATHS.items()
+    ]
+    words = [sys.executable, "-c", REFUSED]
+    done = subprocess.run(words, input=json.dumps(asked), capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    found = zip(PATHS, map(json.loads, done.stdout.splitlines()), strict=True)
+    return {mistake: ((status, said, imported), folders[mistake]) for mistake, (status, said, imported) in found}
+
+
+@pytest.mark.parametrize("mistake", PATHS)
+def test_a_wrong_path_is_refused_before_torch_is_imported(
+    mistake: str, answers: dict[str, tuple[Answer, Path]], tmp_path: Path
+) -> None:
+    (status, said, imported), folder = answers[mistake]
+    assert PATHS[mistake][2] in said.splitlines()[-1]
+    assert status in (1, 2)
+    assert imported == []
+    assert what_there_is(folder) == what_there_is(with_a_run(tmp_path))

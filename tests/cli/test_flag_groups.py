@@ -1,6 +1,7 @@
 """The help of `ns-train METHOD` shows flags in groups, which change neither flags nor values nor errors."""
 
 import dataclasses
+import functools
 import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -54,7 +55,9 @@ def boxes(said: str) -> dict[str, list[str]]:
     return found
 
 
+@functools.cache
 def help_of(*words: str, flag: str = "--help-all") -> dict[str, list[str]]:
+    """The flags that a help shows, by their boxes."""
     done = called("ns-train", *words, flag)
     assert done.returncode == 0, done.stderr
     return boxes(done.stdout)

@@ -52,19 +52,24 @@ def test_images_reduced_beforehand_are_reduced_on(capture: Path) -> None:
     assert load_dataset(scene, "train").image(0).shape == (7, 10, 3)
 
 
+def write_alike(folder: Path, width: int, height: int) -> None:
+    """Write images of which the size alone matters; to encode each would take most of the time."""
+    write_images(folder, NAMES[:1], width, height)
+    for name in NAMES[1:]:
+        shutil.copy(folder / NAMES[0], folder / name)
+
+
 @pytest.mark.parametrize(("side", "factor"), [(1600, 1), (1601, 2), pytest.param(3300, 4, marks=pytest.mark.medium)])
 def test_images_are_reduced_to_1600_pixels_unless_told(capture: Path, side: int, factor: int) -> None:
-    write_images(capture / "images", NAMES[:1], side, side * 3 // 4)
-    for name in NAMES[1:]:  # encoding each takes most of the time, and their sizes alone matter here
-        shutil.copy(capture / "images" / NAMES[0], capture / "images" / name)
+    write_alike(capture / "images", side, side * 3 // 4)
     scene = Nerfstudio().parse(capture, "val")
     assert scene.downscale_factor == factor
     assert max(load_dataset(scene, "val").image(0).shape) <= 1600
 
 
 def test_large_images_are_read_from_the_folder_of_reduced_ones(capture: Path) -> None:
-    write_images(capture / "images", NAMES, 1640, 1230)
-    write_images(capture / "images_2", NAMES, 820, 615)
+    write_alike(capture / "images", 1640, 1230)
+    write_alike(capture / "images_2", 820, 615)
     scene = Nerfstudio().parse(capture, "val")
     assert (scene.image_paths[0].parent.name, scene.downscale_factor) == ("images_2", 1)
     assert worst_miss(scene, poses()[[0, 8]]) < EXACT

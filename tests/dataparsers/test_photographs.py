@@ -92,7 +92,7 @@ def nearest(parts: Parts, p: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("share", [0.1, 0.2, 0.4])
+@pytest.mark.parametrize("share", [0.1, pytest.param(0.2, marks=pytest.mark.slow), 0.4])
 def test_distractors_cover_the_wanted_share(share: float) -> None:
     poses = courtyard_poses("train", 24, 1)
     covered = []

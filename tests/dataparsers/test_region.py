@@ -66,7 +66,7 @@ class Shot:
         rows, columns = np.mgrid[: self.size[1], : self.size[0]] + 0.5
         at = np.stack([(columns - self.middle[0]) / self.focal[0], (rows - self.middle[1]) / self.focal[1]], -1)
         plane = at.copy()
-        for _ in range(60):  # p (1 + k1 |p|^2) = at
+        for _ in range(60 if self.k1 else 0):  # p (1 + k1 |p|^2) = at
             plane = at / (1 + self.k1 * (plane**2).sum(-1, keepdims=True))
         local = np.stack([plane[..., 0], -plane[..., 1], -np.ones(rows.shape)], -1)
         rays = local @ pose[:3, :3].T

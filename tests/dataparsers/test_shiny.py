@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,12 +70,19 @@ def test_display_colours_are_those_of_the_standard() -> None:
     assert bool(slope.isfinite().all())
 
 
+@pytest.fixture(scope="module")
+def shiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of all scenes."""
+    folder = tmp_path_factory.mktemp("shiny") / "shiny"
+    write_shiny(folder, size=24, num_train=3, num_test=2)
+    return folder
+
+
 @pytest.mark.medium
-def test_scenes_are_written_and_read_as_shiny_blenders(tmp_path: Path) -> None:
+def test_scenes_are_written_and_read_as_shiny_blenders(shiny: Path) -> None:
     """Normals beside images are not views; read back, they are the surface's within 8 bits."""
-    write_shiny(tmp_path / "shiny", size=24, num_train=3, num_test=2)
-    assert {path.name for path in (tmp_path / "shiny").iterdir()} == set(SCENES)
-    folder = tmp_path / "shiny" / "together"
+    assert {path.name for path in shiny.iterdir()} == set(SCENES)
+    folder = shiny / "together"
     dataset = load_dataset(Blender().parse(folder, "test"), "test")
     assert dataset.names == ("r_000.png", "r_001.png")
     frames = json.loads((folder / "transforms_test.json").read_text())["frames"]
@@ -93,10 +101,9 @@ def test_scenes_are_written_and_read_as_shiny_blenders(tmp_path: Path) -> None:
     assert angle < 2  # a pixel's normal is the mean of nine
 
 
-def test_normals_turn_with_a_scene_that_is_placed(tmp_path: Path) -> None:
+def test_normals_turn_with_a_scene_that_is_placed(shiny: Path, tmp_path: Path) -> None:
     """A folder without normals beside its images has none."""
-    write_shiny(tmp_path / "shiny", size=16, num_train=3, num_test=1)
-    folder = tmp_path / "shiny" / "mirror"
+    folder = shutil.copytree(shiny / "mirror", tmp_path / "mirror")
     parsed = Blender().parse(folder, "test")
     turn = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0]], dtype=torch.float64)
     found = [load_dataset(p, "test").normals_of(0) for p in (parsed, replace(parsed, transform=turn))]
@@ -104,4 +111,4 @@ def test_normals_turn_with_a_scene_that_is_placed(tmp_path: Path) -> None:
     for path in folder.glob("test/*_normal.png"):
         path.unlink()
     assert load_dataset(Blender().parse(folder, "test"), "test").normals_of(0) is None
-    assert iio.imread(folder / "test" / "r_000.png").shape == (16, 16, 4)
+    assert iio.imread(folder / "test" / "r_000.png").shape == (24, 24, 4)

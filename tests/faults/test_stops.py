@@ -16,6 +16,7 @@ from nerfloom.training.progress import StepReport
 from nerfloom.training.run import create_folder, read_run
 from nerfloom.training.trainer import Trainer
 from tests.faults import runs
+from tests.forked import Forks
 from tests.training.helpers import differences, tiny_run, tiny_trainer
 
 
@@ -69,30 +70,43 @@ def test_a_second_ctrl_c_says_what_was_saved(
     assert exit_status(stop.value) == 130
 
 
+STOPPED = """
+import os, sys, threading
+from pathlib import Path
+from tests.patience import until
+
+checkpoints, number = Path(sys.argv[1]), int(sys.argv[2])
+
+def stop():
+    until(lambda: list(checkpoints.glob("step-*.ckpt")))
+    os.kill(os.getpid(), number)
+
+threading.Thread(target=stop, daemon=True).start()
+sys.argv = ["ns-train", *sys.argv[3:]]
+from nerfloom.cli.train import main
+main()
+"""
+"""A program that runs ns-train, and gets a signal when there is a checkpoint."""
+
+
 @pytest.mark.medium
-def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: Path) -> None:
+def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
     """In a process of its own, while it saves all the time."""
     flags, folder = runs.new_run(shared_tiny, tmp_path, 100_000)
-    process = runs.start(*flags)
-    runs.wait_for_checkpoint(process, folder)
-    process.terminate()
-    said = runs.ended(process)
-    assert process.returncode == 143, said
-    assert said.splitlines()[-1] == f"continue with: ns-train --resume {folder}"
+    done = forks.run(STOPPED, folder / FOLDER, int(signal.SIGTERM), *flags)
+    assert done.returncode == 143, done.stderr
+    assert done.stderr.splitlines()[-1] == f"continue with: ns-train --resume {folder}"
 
 
 @pytest.mark.medium
-def test_a_killed_run_ends_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:
+def test_a_killed_run_ends_with_the_same_bits(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
     """Killed in a process of its own, which saves all the time; resumed in this one."""
     settings = {"max_num_iterations": 60, "max_eval_images": 0, "machine": MachineConfig(num_threads=1)}
     tiny_trainer("instant-ngp", shared_tiny, tmp_path / "whole", **settings).train()
     run = tiny_run("instant-ngp", shared_tiny, tmp_path / "killed", seconds_per_save=0.0, **settings)
     create_folder(run)
-    process = runs.start("--resume", run.folder)
-    runs.wait_for_checkpoint(process, run.folder)
-    process.kill()
-    said = runs.ended(process)
-    assert process.returncode == -signal.SIGKILL, said
+    done = forks.run(STOPPED, run.folder / FOLDER, int(signal.SIGKILL), "--resume", run.folder)
+    assert done.returncode == -signal.SIGKILL, done.stderr
     saved = runs.readable_steps(run.folder)
     print(f"killed when {saved} were saved")
     assert 0 < saved[-1] < 60

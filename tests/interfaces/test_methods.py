@@ -1,7 +1,9 @@
 """Methods of new kinds are trained by the unchanged trainer, evaluated and rendered by the unchanged commands."""
 
 import dataclasses
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -40,15 +42,29 @@ def test_each_is_at_most_80_lines(name: str) -> None:
     assert len((HERE / "methods" / f"{name}.py").read_text().splitlines()) <= 80
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Trains a method by the command, once; returns the run's folder."""
+    output = tmp_path_factory.mktemp("out")
+
+    @functools.cache
+    def train(name: str) -> Path:
+        done = called(
+            "ns-train", name, *FLAGS[name].split(), "--vis", "none", "--output-dir", output,
+            "--timestamp", "t", "--experiment-name", "e", *SCENE.split(),
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return output / "e" / name / "t"
+
+    return train
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("name", METHODS)
-def test_each_is_trained_evaluated_and_rendered_by_the_commands(name: str, tmp_path: Path) -> None:
-    done = called(
-        "ns-train", name, *FLAGS[name].split(), "--vis", "none", "--output-dir", tmp_path,
-        "--timestamp", "t", "--experiment-name", "e", *SCENE.split(),
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    folder = tmp_path / "e" / name / "t"
+def test_each_is_trained_evaluated_and_rendered_by_the_commands(
+    name: str, trained: Callable[[str], Path], tmp_path: Path
+) -> None:
+    folder = trained(name)
     results = json.loads((folder / "eval.json").read_text())["results"]
     assert results["psnr"] > {"discs": 13}.get(name, 14), results
     assert called("ns-eval", folder, "--output-path", tmp_path / "again.json").returncode == 0
@@ -72,14 +88,9 @@ def test_each_keeps_what_every_method_must(name: str) -> None:
 
 
 @pytest.mark.medium
-def test_an_output_of_ones_own_is_shown_wherever_pictures_are(tmp_path: Path) -> None:
+def test_an_output_of_ones_own_is_shown_wherever_pictures_are(trained: Callable[[str], Path], tmp_path: Path) -> None:
     """In the files of an evaluation, in a video beside the colours, in the viewer's list, and in Python."""
-    done = called(
-        "ns-train", "doubtful", *FLAGS["doubtful"].split(), "--vis", "none", "--output-dir", tmp_path,
-        "--timestamp", "t", "--experiment-name", "e", *SCENE.split(),
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    folder = tmp_path / "e" / "doubtful" / "t"
+    folder = trained("doubtful")
     (shown, *_) = sorted((folder / "pictures").glob("*_uncertainty.png"))
     assert np.ptp(imageio.imread(shown)) > 50  # it differs between matter and nothing
     flags = ["--num-frames", "2", "--rendered-output-names", "rgb", "uncertainty", str(folder)]

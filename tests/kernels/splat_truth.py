@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
 from nerfloom.geometry.lenses import Distortion
 from nerfloom.kernels.native import torch_on_one_thread
@@ -104,21 +103,32 @@ def real_harmonics(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(values, -1)
 
 
+def jacobians(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Return the derivatives (N, 2, K) of a function from (N, K) to (N, 2), row by row, at points (N, K)."""
+    follows = at.requires_grad and torch.is_grad_enabled()
+    with torch.enable_grad():
+        given = at if follows else at.detach().requires_grad_()
+        sums = function(given).sum(0)
+        slopes = [torch.autograd.grad(each, given, create_graph=follows, retain_graph=True)[0] for each in sums]
+    return torch.stack(slopes, 1)
+
+
 def bent_by_fisheye(at: Tensor) -> Tensor:
-    """Return where OpenCV's fisheye lens shows a point (2,) of the image plane at depth 1."""
+    """Return where OpenCV's fisheye lens shows points (N, 2) of the image plane at depth 1."""
     k1, k2, k3, k4 = LENSES["fisheye"]
-    angle = torch.atan2(at.norm(), torch.ones_like(at[0]))
-    return at / at.norm() * (angle + k1 * angle**3 + k2 * angle**5 + k3 * angle**7 + k4 * angle**9)
+    radius = at.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(radius, torch.ones_like(radius))
+    return at / radius * (angle + k1 * angle**3 + k2 * angle**5 + k3 * angle**7 + k4 * angle**9)
 
 
 def bent(at: Tensor) -> Tensor:
-    """Return where OpenCV's lens shows a point (2,) of the image plane."""
+    """Return where OpenCV's lens shows points (N, 2) of the image plane."""
     k1, k2, p1, p2, k3, k4, k5, k6, _ = LENSES["opencv"]
-    x, y = at.unbind()
+    x, y = at.unbind(-1)
     r2 = x**2 + y**2
     scale = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    tangential = torch.stack([2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y])
-    return at * scale + tangential
+    tangential = torch.stack([2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y], -1)
+    return at * scale[:, None] + tangential
 
 
 def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projection:
@@ -142,11 +152,11 @@ def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projec
 
     low, high = (-BOUND * size - middle) / focal, ((1 + BOUND) * size - middle) / focal
     bounded = p if fisheye else torch.cat([plane.clamp(low, high) * p[:, 2:], p[:, 2:]], -1)
-    jacobian = vmap(jacrev(lambda at: at[:2] / at[2]))(bounded)
+    jacobian = jacobians(lambda at: at[:, :2] / at[:, 2:], bounded)
     if view.lens is not None:
         lens = bent_by_fisheye if fisheye else bent
-        jacobian = vmap(jacrev(lens))(plane).detach() @ jacobian
-        plane = vmap(lens)(plane)
+        jacobian = jacobians(lens, plane).detach() @ jacobian
+        plane = lens(plane)
     jacobian = focal[:, None] * jacobian
     axes = turned(rotations[indices, None], torch.eye(3).double()).transpose(1, 2)
     in_space = axes @ torch.diag_embed((2 * log_scales[indices]).exp()) @ axes.transpose(1, 2)

@@ -43,7 +43,8 @@ def test_gradcheck() -> None:
     positions = torch.rand(3, 3, dtype=torch.float64, requires_grad=True)
     table = torch.randn(layout.num_entries, 2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x, t: hash_grid(x, t, layout), (positions, table))
-    assert torch.autograd.gradgradcheck(lambda x, t: hash_grid_reference(x, t, layout), (positions, table))
+    reference = lambda x, t: hash_grid_reference(x, t, layout)  # noqa: E731
+    assert torch.autograd.gradgradcheck(reference, (positions, table), fast_mode=True)
 
 
 def test_a_dense_level_reproduces_a_linear_function() -> None:

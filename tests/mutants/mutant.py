@@ -54,6 +54,13 @@ class Mutant:
         Raises: NotPlantable.
         """
         tree = ast.parse(source)
+        return ast.fix_missing_locations(_Replaced(*self.change(tree)).visit(tree))
+
+    def change(self, tree: ast.Module) -> tuple[ast.AST, ast.AST]:
+        """Return the node of the module's syntax tree that is exchanged, and what stands in its place.
+
+        Raises: NotPlantable.
+        """
         old, new = _pattern(self.old), _pattern(self.new)
         if isinstance(old, ast.Expr) and isinstance(new, ast.Expr):
             old, new = old.value, new.value
@@ -74,7 +81,7 @@ class Mutant:
         changed = ast.copy_location(_Filled(bound).visit(new), node)
         if ast.dump(changed) == ast.dump(node):
             raise NotPlantable(f"{self.name}: it changes nothing")
-        return ast.fix_missing_locations(_Replaced(node, changed).visit(tree))
+        return node, changed
 
     @property
     def where(self) -> str:

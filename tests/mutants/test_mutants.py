@@ -1,6 +1,7 @@
 """A mutant is one change of one function, planted at import; all that are listed fit the source as it is."""
 
 import ast
+import functools
 import importlib
 import subprocess
 import sys
@@ -95,13 +96,15 @@ def test_what_does_not_fit_is_named(change: Mutant, words: str) -> None:
 def test_all_that_are_listed_fit_the_source_and_name_a_test() -> None:
     mutants = all_mutants()
     assert [name for name, count in Counter(one.name for one in mutants).items() if count > 1] == []
+    parsed = functools.cache(lambda module: ast.parse(source_of(module).read_text("utf-8")))
+    text = functools.cache(lambda file: (ROOT / "tests" / file).read_text("utf-8"))
     faults = []
     for one in mutants:
         file, _, name = one.test.partition("::")
-        if f"def {name}(" not in (ROOT / "tests" / file).read_text("utf-8"):
+        if f"def {name}(" not in text(file):
             faults.append(f"{one.name}: there is no test {one.test}")
         try:
-            one.tree(source_of(one.module).read_text("utf-8"))
+            one.change(parsed(one.module))
         except NotPlantable as error:
             faults.append(str(error))
     assert faults == []

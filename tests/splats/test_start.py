@@ -29,7 +29,8 @@ def test_distances_to_neighbours(count: int) -> None:
     points = torch.randn(count, 3) * torch.tensor([1.0, 3.0, 0.02])
     found = neighbour_distance(points)
     some = torch.randperm(count)[:500]
-    true = torch.cdist(points[some].double(), points.double()).sort(1).values[:, 1:4].mean(1)
+    apart = torch.cdist(points[some].double(), points.double())
+    true = apart.topk(min(count, 4), largest=False).values[:, 1:].mean(1)
     assert bool((found[some] >= true * (1 - 1e-4)).all())
     assert float((found[some].double() / true).mean()) < 1.15
 

@@ -85,9 +85,18 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "variant", [pytest.param(name, marks=[] if name == "captures" else pytest.mark.medium) for name in VARIANTS]
-)
+COVERED = ("vanilla-nerf", "mip-nerf")
+"""Their parts are others' too: frequencies and two passes those of dnerf and nerf-plus-plus, cones of mip-nerf-360."""
+
+
+def mark_of(variant: str) -> list[Any]:
+    """How long a variant takes; one of them is in the fast set."""
+    if variant == "captures":
+        return []
+    return [pytest.mark.slow if variant in COVERED else pytest.mark.medium]
+
+
+@pytest.mark.parametrize("variant", [pytest.param(name, marks=mark_of(name)) for name in VARIANTS])
 def test_repeated_steps_learn_what_steps_learn(
     variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
 ) -> None:
@@ -129,6 +138,8 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     """Across updates of the grid, which are not recorded, changes of the room that samples are given, and growth."""
     ahead(monkeypatch)
     sizes: dict[str, Any] = {"samples_per_batch": 2**11, "num_steps": 64, "grid_resolution": 32}
+    if method == "kplanes":
+        sizes |= {"num_scales": 2, "features_per_scale": 8, "grid_resolution": 16 if moving else 32}
     if method == "tensorf":
         sizes |= {"max_num_iterations": 100, "upsample_at": (0.22,), "first_voxels": 8**3, "last_voxels": 16**3}
     usual, repeating = (small(tmp_path / name, method, moving, **sizes) for name in ("usual", "repeating"))

@@ -11,7 +11,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.evaluator import measure_view
 from nerfloom.training.trainer import Trainer
 from tests.other_device import OTHER, There, other_device
-from tests.training.test_graphs import VARIANTS, small
+from tests.training.test_graphs import COVERED, VARIANTS, small
 
 STRIDE = 16
 """Interval of the compared rows and columns of a picture."""
@@ -39,7 +39,7 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in COVERED else c for c in CASES])
 def test_every_method_trains_and_renders_there(case: str, tmp_path: Path) -> None:
     here = small(tmp_path, **CASES[case])
     with other_device():

@@ -122,9 +122,14 @@ def test_large_gradients_are_averaged_as_small_ones_are(monkeypatch: pytest.Monk
         torch.testing.assert_close(parameter.grad, 2 * gradient)
 
 
+@pytest.fixture(scope="module")
+def whole(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What this process alone finds of the whole batches."""
+    return several.parts(shared_tiny, tmp_path_factory.mktemp("whole"))
+
+
 @pytest.mark.medium
-def test_the_mean_gradient_is_that_of_the_whole_batch(two: Two, shared_tiny: Path, tmp_path: Path) -> None:
-    whole = several.parts(shared_tiny, tmp_path)
+def test_the_mean_gradient_is_that_of_the_whole_batch(two: Two, whole: dict[str, Any]) -> None:
     for found in two.found:
         assert found["parts"]["gradients"].keys() == whole["gradients"].keys()
         for name, gradient in whole["gradients"].items():
@@ -133,8 +138,7 @@ def test_the_mean_gradient_is_that_of_the_whole_batch(two: Two, shared_tiny: Pat
             assert float(error) < 1e-5
 
 
-def test_two_processes_learn_as_one_with_both_batches(two: Two, shared_tiny: Path, tmp_path: Path) -> None:
-    whole = several.parts(shared_tiny, tmp_path)
+def test_two_processes_learn_as_one_with_both_batches(two: Two, whole: dict[str, Any]) -> None:
     halves = [found["parts"] for found in two.found]
     means = [sum(losses) / COUNT for losses in zip(*(half["losses"] for half in halves), strict=True)]
     print("losses of one and of two:", [(f"{a:.6f}", f"{b:.6f}") for a, b in zip(whole["losses"], means, strict=True)])

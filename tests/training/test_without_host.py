@@ -20,7 +20,7 @@ from nerfloom.losses.functions import depth_error
 from nerfloom.methods.tensorf import TensoRF
 from nerfloom.scene.covisible_space import CovisibleSpace
 from nerfloom.training.trainer import Trainer
-from tests.training.test_graphs import VARIANTS, small
+from tests.training.test_graphs import VARIANTS, mark_of, small
 
 NOWHERE = torch.device("meta")
 
@@ -40,9 +40,7 @@ class Arrivals(TorchDispatchMode):
         return out
 
 
-@pytest.mark.parametrize(
-    "variant", [pytest.param(name, marks=[] if name == "captures" else pytest.mark.medium) for name in VARIANTS]
-)
+@pytest.mark.parametrize("variant", [pytest.param(name, marks=mark_of(name)) for name in VARIANTS])
 def test_a_step_neither_asks_the_device_nor_brings_it_tensors(
     variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -28,8 +28,17 @@ def hash_grid_tangent_reference(points: Tensor, table: Tensor, layout: HashGridL
 
     `points`, `table`, `layout` and the result are as there.
     """
-    encode = lambda positions: hash_grid_reference(positions, table, layout)  # noqa: E731
-    return torch.cat(torch.func.jvp(encode, (points[:, :3],), (points[:, 3:],)), dim=-1)
+    # The gradient of weighted features is linear in the weights: its derivatives by them, along a direction, are those
+    # of the features. The first use of PyTorch's forward mode would load decompositions, which takes seconds.
+    learns = torch.is_grad_enabled() and (points.requires_grad or table.requires_grad)
+    with torch.enable_grad():
+        positions = points[:, :3] if points.requires_grad else points[:, :3].detach().requires_grad_()
+        features = hash_grid_reference(positions, table, layout)
+        weights = torch.zeros_like(features, requires_grad=True)
+        (slope,) = torch.autograd.grad(features, positions, weights, create_graph=True)
+        (along,) = torch.autograd.grad(slope, weights, points[:, 3:], create_graph=learns)
+    result = torch.cat([features, along], dim=-1)
+    return result if learns else result.detach()
 
 
 def hash_grid_tangent(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:

@@ -14,8 +14,12 @@ from tests.kernels.triton.test_march import in_float64, on_device
 
 
 @pytest.mark.parametrize(
-    ("resolution", "share", "slices"), [(5, 0.3, 1), (5, 0.3, 2), (33, 0.05, 1), (8, 1.0, 1), (8, 0.0, 2)]
-)
+    ("resolution", "share", "slices"),
+    [
+        pytest.param(5, 0.3, 1, marks=pytest.mark.slow), (5, 0.3, 2), (33, 0.05, 1), (8, 1.0, 1),
+        pytest.param(8, 0.0, 2, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_slots_have_the_references_candidates(resolution: int, share: float, slices: int) -> None:
     """Rounding decides about steps whose middle lies on a cell's face: one in a hundred, and one."""
     rays, grid = random_rays(33), occupancy(resolution, share)

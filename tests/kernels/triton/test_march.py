@@ -24,7 +24,8 @@ def in_float64(rays: Rays, grid: Occupancy) -> tuple[Rays, Occupancy]:
 
 
 @pytest.mark.parametrize(
-    ("resolution", "share", "cone"), [(5, 0.3, 0.0), (33, 0.2, 1 / 64), (8, 1.0, 1 / 64), (8, 0.0, 0.0)]
+    ("resolution", "share", "cone"),
+    [(5, 0.3, 0.0), (33, 0.2, 1 / 64), pytest.param(8, 1.0, 1 / 64, marks=pytest.mark.slow), (8, 0.0, 0.0)],
 )
 def test_samples(resolution: int, share: float, cone: float) -> None:
     """Rounding decides about steps whose middle lies on a cell's face: one in a hundred, and one."""
@@ -58,7 +59,9 @@ def test_each_ray_marches_through_the_slice_of_its_time() -> None:
     assert int(truth.sum()) > 50
 
 
-@pytest.mark.parametrize(("share", "cone"), [(0.02, 1 / 16), (0.3, 1 / 16), (0.3, 0.0)])
+@pytest.mark.parametrize(
+    ("share", "cone"), [(0.02, 1 / 16), (0.3, 1 / 16), pytest.param(0.3, 0.0, marks=pytest.mark.slow)]
+)
 def test_samples_in_nested_boxes(share: float, cone: float) -> None:
     """Three boxes; rays start inside and outside the largest."""
     rays, single = random_rays(33), occupancy(8, share)

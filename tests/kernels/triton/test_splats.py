@@ -162,7 +162,7 @@ def test_extremes_of_blending() -> None:
     compare(blended(16, 16, 4, median=True), given, "records", tolerance=1e-4)  # what is left is 1e-4 at most
 
 
-@pytest.mark.parametrize("size", [(37, 41), (60, 20)])
+@pytest.mark.parametrize("size", [(37, 41), pytest.param((60, 20), marks=pytest.mark.slow)])
 def test_growth_is_by_the_pixels_absolute_gradients(size: tuple[int, int]) -> None:
     """As on the other backends: tests/kernels/test_growth.py."""
     from nerfloom.kernels.splats.blend_triton import blend as triton_blend

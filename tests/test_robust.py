@@ -21,6 +21,7 @@ from nerfloom.data.pixels.contradicted import (
 )
 from nerfloom.data.pixels.tiles import Tiles
 from nerfloom.data.sources import BatchSource, Request, make_source
+from nerfloom.losses.functions import mean_squared_error
 from nerfloom.registry import load_method
 from nerfloom.stress.scenes import ball_views
 from nerfloom.training.step import forward
@@ -198,3 +199,9 @@ def test_a_factor_below_one_is_refused() -> None:
     config = load_method("instant-ngp").config
     with pytest.raises(ConfigError, match="--robust-factor is 0; it must be from 1"):
         dataclasses.replace(config, robust_factor=0)
+
+
+def test_a_weighted_loss_against_its_definition() -> None:
+    prediction, target, weights = torch.rand(5, 3), torch.rand(5, 3), torch.rand(5)
+    by_hand = sum(weights[i].item() * (prediction[i, c] - target[i, c]).item() ** 2 for i in range(5) for c in range(3))
+    assert mean_squared_error(prediction, target, weights).item() == pytest.approx(by_hand / 15, rel=1e-5)

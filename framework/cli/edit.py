@@ -75,7 +75,7 @@ class EditFlags(RegionFlags, OpenFlags):
         given: list[tuple[str, str, dict[str, Any] | None]] = [
             # Floaters are in front of surfaces, which a crop may remove.
             ("drop-floaters", "drop_floaters", {} if self.drop_floaters else None),
-            ("crop-box", "crop_box", None if box is None else asdict(box)),
+            ("crop-box", "crop_box", None if box is None else {"low": box.low, "high": box.high}),
             ("crop-sphere", "crop_sphere", None if sphere is None else asdict(sphere)),
             ("region", "crop_region", None if self.region is None else {"file": str(self.region)}),
             ("min-opacity", "drop_faint", _only("min_opacity", self.min_opacity)),

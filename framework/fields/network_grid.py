@@ -155,7 +155,7 @@ class NetworkGrid(Field):
         return self.color_head(self.owners(features), features[:, 1:], encoded).float()
 
     def owners(self, features: Tensor) -> Tensor:
-        """Return the cell (N,) int64 of each row of features (N, F) from `density`."""
+        """Return the cell (N,) int64 of each row of `features` (N, F) from `density`."""
         return features[:, 0].detach().long()
 
 

@@ -124,7 +124,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
     belongs = {
         "nerfacto": ["--num-levels", "--camera-learning-rate", "--appearance-embedding-dim"],
         "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
-        "ray": ["--num-rays-per-batch", "--rays-per-pixel"],
+        "ray": ["--num-rays-per-batch", "--train-rays-per-pixel-from"],
         "teacher": ["--teacher", "--teacher-share", "--teacher-until"],
         "optimisation": ["--learning-rate", "--lr-schedule", "--adam-eps"],
         "evaluation and saving": ["--steps-per-save", "--max-eval-images", "--target-psnr", "--load-checkpoint"],

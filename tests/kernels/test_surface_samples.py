@@ -124,7 +124,7 @@ def test_the_first_shape_is_the_union_of_a_ball_and_a_half_space() -> None:
     network = torch.zeros(len(positions), OUTPUTS + 3, dtype=torch.float64)
     away = positions - shape.centre
     ball = (away.square().sum(-1) + shape.rounding**2).sqrt() - shape.radius
-    height = 0.6 * positions[:, 1] + 0.8 * positions[:, 2] + 10
+    height = (positions * shape.floor[:3]).sum(-1) - shape.floor[3]
     distances, gradients = first_distance(network, positions, shape)
     torch.testing.assert_close(distances, torch.minimum(ball, height))
     on_floor = height < ball

@@ -1,6 +1,7 @@
 """From a network's output to a density, and what an occupancy grid makes of densities."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -82,7 +83,8 @@ def test_density_and_features_split_as_by_slicing(count: int, stride: int, uses:
 @pytest.mark.parametrize("x", [-30.0, 10.0, 12.0, 89.0, 6e4])
 def test_a_softplus_density_is_float32_and_finite(x: float, dtype: torch.dtype) -> None:
     components = torch.tensor([[x, 0.0]], dtype=dtype, requires_grad=True)
-    sigma = TensorField._sigma(components, torch.full((1, 3), 0.5), torch.tensor(DENSITY_SHIFT))
+    field = SimpleNamespace(_unit=lambda positions: positions, density_factors=lambda unit: components)
+    sigma, _ = TensorField.density(field, Points(torch.full((1, 3), 0.5)))  # type: ignore[arg-type]
     (slope,) = torch.autograd.grad(sigma.sum(), components)
     shifted = components[0, 0].item() + DENSITY_SHIFT
     truth = DENSITY_SCALE * (max(shifted, 0.0) + math.log1p(math.exp(-abs(shifted))))

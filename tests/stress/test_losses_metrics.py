@@ -99,12 +99,6 @@ def test_losses_of_no_rays_are_zero_and_harmless() -> None:
     assert nothing.grad.shape == (0, 3)
 
 
-def test_a_weighted_loss_against_its_definition() -> None:
-    prediction, target, weights = torch.rand(5, 3), torch.rand(5, 3), torch.rand(5)
-    by_hand = sum(weights[i].item() * (prediction[i, c] - target[i, c]).item() ** 2 for i in range(5) for c in range(3))
-    assert mean_squared_error(prediction, target, weights).item() == pytest.approx(by_hand / 15, rel=1e-5)
-
-
 @pytest.mark.entry(8)
 @pytest.mark.parametrize("known", [[0.0, 0.0], [0.0, 2.0], [1e-30, 1e30]])
 def test_depths_that_are_unknown_or_beyond_all_measure(known: list[float]) -> None:

@@ -174,7 +174,7 @@ def test_a_split_that_cannot_be_read_is_reported(tiny: Path, capsys: pytest.Capt
 def test_a_folder_with_a_run_is_not_taken_twice(shared_tiny: Path, tmp_path: Path) -> None:
     run = tiny_run("instant-ngp", shared_tiny, tmp_path / "run")
     create_folder(run)
-    with pytest.raises(ConfigError, match="'ns-train --resume"):
+    with pytest.raises(ConfigError, match="ns-train --resume /"):
         create_folder(run)
 
 

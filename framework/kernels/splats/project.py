@@ -93,7 +93,7 @@ class SplatCamera:
 
     @property
     def all_around(self) -> bool:
-        """Whether points beside and behind the camera may be shown."""
+        """True if points beside and behind the camera may be shown."""
         return self.unscented and self.model in ALL_AROUND
 
     @property

@@ -41,7 +41,7 @@ MUTANTS = {
             "blocks/test_composed.py::test_two_blocks_of_one_colour_each_are_blended_exactly"),
     ],
     "nerfloom.blocks.merge": [
-        Mutant("doubled-borders", "merged", "part[in_cell(A, B, C)]", "part",
+        Mutant("doubled-borders", "of_cell", "part[in_cell(A, B, C)]", "part",
             "what two blocks have learned is drawn twice",
             "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],

@@ -30,11 +30,11 @@ def list_methods() -> dict[str, str]:
 
 
 def load(path: str | Path, data: str | Path | None = None, device: Device = "auto") -> Opened:
-    """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians or of levels of them, or an octree.
 
     Args:
         path: folder of the run, its config.yml, a folder above it (for its newest run), a blocks.yml or its folder, a
-            file of Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree).
+            file of Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels (.levels), or an octree (.octree).
         data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -50,7 +50,9 @@ def export_levels(loaded: Loaded, path: Path, settings: LevelsSettings, regions:
 
 def _parts(model: HasGaussians, moment: float | None, placement: Placement, most: int) -> Iterator[Gaussians]:
     """Yield the Gaussians of a model at a moment in the frame of the input, on the CPU, at most `most` at a time."""
-    whole = model.gaussian_parts(moment) if isinstance(model, HasGaussianParts) else [model.gaussians(moment)]
+    whole: Iterable[Gaussians] = (
+        model.gaussian_parts(moment) if isinstance(model, HasGaussianParts) else [model.gaussians(moment)]
+    )
     for given in whole:
         for part in given.sliced(most):
             yield in_input(part.map(lambda values: values.detach().cpu()), placement)

@@ -101,7 +101,7 @@ def splits(points: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
     axes, values = np.zeros(2**depth - 1, np.int64), np.zeros(2**depth - 1, np.float32)
     cells = [points]
     for index in range(len(axes)):
-        cell = cells[index]
+        cell, cells[index] = cells[index], points[:0]  # which is not needed below
         if len(cell):
             axes[index] = np.ptp(cell, axis=0).argmax()
             values[index] = np.median(cell[:, axes[index]])

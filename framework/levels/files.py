@@ -116,7 +116,8 @@ class LevelsFile:
             raise DataError(f"cannot read {self.path}: {error.strerror or error}") from error
         if len(content) < length or zlib.crc32(content) != self.checksums[index]:
             raise DataError(f"{self.path}: chunk {index} is damaged; copy or export the file again")
-        columns, place = {}, 0
+        columns: dict[str, Tensor] = {}
+        place = 0
         for name, width in _widths(self.degree).items():
             kind = _kind(name, self.bits)
             end = place + count * width * kind.itemsize
@@ -306,7 +307,7 @@ def _for_half(gaussians: Gaussians) -> Gaussians:
 
 def _integers(header: dict[str, Any], name: str, count: int | None) -> np.ndarray:
     """Return integers (count,) int64 of a header."""
-    values = np.array(header.get(name))
+    values = _array(header, name, None)
     if values.ndim != 1 or values.dtype.kind != "i" or (count is not None and len(values) != count):
         raise ValueError(f"its '{name}' must be a list of integers, one for each node")
     return values.astype(np.int64)
@@ -314,7 +315,14 @@ def _integers(header: dict[str, Any], name: str, count: int | None) -> np.ndarra
 
 def _floats(header: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return finite numbers of a shape, float64, of a header."""
-    values = np.array(header.get(name), np.float64)
+    values = _array(header, name, np.float64)
     if values.shape != shape or not np.isfinite(values).all():
         raise ValueError(f"its '{name}' must be finite numbers {shape}")
     return values
+
+
+def _array(header: dict[str, Any], name: str, kind: type | None) -> np.ndarray:
+    try:
+        return np.array(header.get(name), kind)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"its '{name}' must be numbers") from error

@@ -45,6 +45,26 @@ MUTANTS = {
             "what two blocks have learned is drawn twice",
             "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],
+    "nerfloom.levels.cut": [
+        Mutant("levels-twice", "cut_of", "seen & (lower <= error) & (error < upper)", "seen & (lower <= error)",
+            "what is near is drawn with its merged Gaussians too",
+            "levels/test_cut.py::test_the_cut_is_that_of_a_walk_from_the_root"),
+    ],
+    "nerfloom.levels.drawn": [
+        Mutant("levels-depth-in-units-of-the-file", "DrawnLevels.render_view",
+            "{'depth': picture.depth / A, 'median_depth': picture.median_depth / A}",
+            "{'depth': picture.depth, 'median_depth': picture.median_depth}",
+            "depths of levels are in the unit of the file instead of the scene's",
+            "levels/test_drawn.py::test_frames_of_file_and_scene_may_differ"),
+    ],
+    "nerfloom.levels.merging": [
+        Mutant("levels-weights-without-size", "merged", "torch.sigmoid(A) * grouped(B)", "torch.sigmoid(A)",
+            "small Gaussians count as much as large ones where they are merged",
+            "levels/test_merging.py::test_weights_are_opacity_times_surface"),
+        Mutant("levels-no-spread", "merged", "mean(A + B)", "mean(A)",
+            "merged Gaussians leave gaps between them",
+            "levels/test_merging.py::test_two_side_by_side_are_longer_and_fainter"),
+    ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",
             "exports stay in the unit of the input after a true length was given",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Opened(Loaded):
-    """A loaded run, file of Gaussians or octree, with what `ns-render` and `ns-export` write."""
+    """A loaded run, file of Gaussians or of levels of them, or octree, with what `ns-render` and `ns-export` write."""
 
     @classmethod
     def of(cls, loaded: Loaded) -> Opened:
@@ -47,7 +47,7 @@ class Opened(Loaded):
         """Write points, a mesh, Gaussians, cameras, cells or a page to a file, as `ns-export` does.
 
         Args:
-            kind: pointcloud, marching-cubes, tsdf, gaussian-splat, cameras, occupancy or web.
+            kind: pointcloud, marching-cubes, tsdf, gaussian-splat, levels, cameras, occupancy or web.
             file: file to write; its suffix is the format, such as .ply, .glb, .spz or .html.
             regions: what is in all of these is kept, in the frame and unit of exports; none for everything.
             settings: flags of `ns-export` by name, with underscores, as in `max_megabytes=5`.

@@ -38,11 +38,11 @@ def load(
     up: Axis | None = None,
     checkpoint: str | Path | None = None,
 ) -> Opened:
-    """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians or of levels of them, or an octree.
 
     Args:
         path: folder of the run, its config.yml, a folder above it (for its newest run), a blocks.yml or its folder, a
-            file of Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree).
+            file of Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels (.levels), or an octree (.octree).
         data: new location of the run's data, if it has moved; optional data for a file.
         device: device of the model.
         up: up axis of a file of Gaussians without data: x, y, z, -x, -y or -z; None for z.

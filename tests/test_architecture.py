@@ -151,6 +151,7 @@ LAYERS = (
     ("plug_and_play",),
     ("losses",),
     ("splats", "octrees"),
+    ("levels",),
     ("blocks",),
     ("model",),
     ("ray_model", "gaussian_model", "octree_model"),

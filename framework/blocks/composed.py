@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from torch import Tensor
 from nerfloom.blocks.blend import blended, near_shares, visible_shares
 from nerfloom.blocks.block import TrainedBlock
 from nerfloom.blocks.colors import recolored, recolored_gaussians
-from nerfloom.blocks.merge import merged
+from nerfloom.blocks.merge import merged, of_cell
 from nerfloom.cameras.moved import moved_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
@@ -129,14 +129,22 @@ class GaussianBlocks(Blocks):
 
     def gaussians(self, time: float | None = None) -> Gaussians:
         """Return the Gaussians of all blocks at a `time`, in the composed scene, on the CPU (`merge.merged`)."""
-        parts = []
-        for number, block in enumerate(self.blocks):
-            model, placement = self.opened(number)
-            assert isinstance(model, HasGaussians)
-            own = model.gaussians(time).map(lambda values: values.detach().cpu())
-            own = transformed(own, *placement.similarity_to(self.placement))
-            parts.append(recolored_gaussians(own, block.color))
+        parts = [self._of_block(number, time) for number in range(len(self.blocks))]
         return merged(parts, self.placement.points(self._centers))
+
+    def gaussian_parts(self, time: float | None = None) -> Iterator[Gaussians]:
+        """Yield the Gaussians that `gaussians` returns at a `time`, block by block, with few blocks in memory."""
+        centers = self.placement.points(self._centers)
+        for number in range(len(self.blocks)):
+            yield of_cell(self._of_block(number, time), centers, number)
+
+    def _of_block(self, number: int, time: float | None) -> Gaussians:
+        """Return all Gaussians of a block in the composed scene, in the matched colours, on the CPU."""
+        model, placement = self.opened(number)
+        assert isinstance(model, HasGaussians)
+        own = model.gaussians(time).map(lambda values: values.detach().cpu())
+        own = transformed(own, *placement.similarity_to(self.placement))
+        return recolored_gaussians(own, self.blocks[number].color)
 
     def look(self) -> Look:
         """Return the settings of drawing, which are those of the first block."""

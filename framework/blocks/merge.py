@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -24,11 +25,21 @@ def merged(parts: Sequence[Gaussians], centers: Tensor) -> Gaussians:
     width = max(part.harmonics.shape[2] for part in parts)
     kept = []
     for number, part in enumerate(parts):
-        own = part[in_cell(part.means, centers, number)]
-        columns = {name: getattr(own, name) for name in COLUMNS}
-        columns["harmonics"] = pad(own.harmonics, (0, width - own.harmonics.shape[2]))
-        kept.append(Gaussians.of(columns))
+        own = of_cell(part, centers, number)
+        kept.append(replace(own, harmonics=pad(own.harmonics, (0, width - own.harmonics.shape[2]))))
     return Gaussians.joined(kept)
+
+
+def of_cell(part: Gaussians, centers: Tensor, number: int) -> Gaussians:
+    """Return the Gaussians of a block that it keeps in `merged`, without columns that a method added.
+
+    Args:
+        part: the Gaussians of the block.
+        centers: (B, 3) centres of all blocks in the same frame.
+        number: index of the block.
+    """
+    own = part[in_cell(part.means, centers, number)]
+    return Gaussians.of({name: getattr(own, name) for name in COLUMNS})
 
 
 def in_cell(points: Tensor, centers: Tensor, number: int) -> Tensor:

@@ -7,6 +7,7 @@ from typing import Any
 from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
 from nerfloom.cli.export_flags import (
     CameraFlags,
+    LevelsFlags,
     MarchingCubesFlags,
     OccupancyFlags,
     PointFlags,
@@ -24,6 +25,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   marching-cubes  mesh.ply, .obj or .glb: a mesh of where a field is dense; for objects, closed; not of Gaussians
   pointcloud      point_cloud.ply: points on surfaces, with colours and normals
   gaussian-splat  splat.ply, .spz, .sog or .glb: the Gaussians of a run, for other programs
+  levels          scene.levels: the Gaussians of a large scene in levels of detail; a picture loads what it needs
   web             scene.html: one file that shows the scene in any browser with WebGL 2, from disk, offline
   cameras         nerfstudio/transforms.json and colmap/sparse/0: the cameras of all photographs, refined if the run
                   refined them; transforms_train.json: the training cameras, in nerfstudio's format
@@ -31,8 +33,8 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
 
   ns-export tsdf RUN_FOLDER --output-dir exports
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat and web need no data,
-others --data DIR.
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat, levels and web need no
+data, others --data DIR.
 
   ns-export web splat.ply --output-dir exports
 
@@ -52,12 +54,10 @@ def _command(arguments: list[str]) -> None:
     name, (kind, file), rest = chosen
     words, named = with_format(f"ns-export {name}", with_run(rest, ("--bounding-box-min", "--bounding-box-max")))
     flags = read_flags(kind, f"ns-export {name}", words, takes=OPENS)
-    found, regions = flags.check(), flags.regions()
+    found = flags.check()
     path = flags.output_dir / file.format_map(vars(flags))
     make_room(path)
-    from nerfloom.export.kinds import export
-
-    export(flags.load(found, named), name, path, flags, regions)
+    flags.write(name, found, named, path)
 
 
 KINDS: dict[str, tuple[type[Any], str]] = {
@@ -65,6 +65,7 @@ KINDS: dict[str, tuple[type[Any], str]] = {
     "marching-cubes": (MarchingCubesFlags, "mesh.{format}"),
     "tsdf": (TsdfFlags, "mesh.{format}"),
     "gaussian-splat": (SplatFlags, "splat.{format}"),
+    "levels": (LevelsFlags, "scene.levels"),
     "cameras": (CameraFlags, "transforms_train.json"),
     "occupancy": (OccupancyFlags, "occupancy.npz"),
     "web": (WebFlags, "scene.html"),

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from nerfloom.base.errors import ConfigError
 from nerfloom.cli.region_flags import RegionFlags
 from nerfloom.cli.run_flags import RunFlags
 from nerfloom.export.settings import (
     CameraSettings,
+    LevelsSettings,
     MarchingCubesSettings,
     MeshSettings,
     OccupancySettings,
@@ -21,6 +23,7 @@ from nerfloom.export.settings import (
 
 if TYPE_CHECKING:
     from nerfloom.geometry.regions import Region
+    from nerfloom.training.file_data import DataFormat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +36,24 @@ class ExportFlags(RunFlags):
     def regions(self) -> list[Region]:
         """Return the regions that are kept; none for everything."""
         return []
+
+    def write(self, name: str, found: Path, data_format: DataFormat | None, path: Path) -> None:
+        """Load the run or the file that `check` has found, and write an export of it.
+
+        Args:
+            name: kind of export.
+            found: the result of `check`.
+            data_format: data format for a file, with its flags; None to detect it.
+            path: file to write.
+
+        Raises:
+            ConfigError, CheckpointError, DataError: if the run or the file cannot be used or exported.
+            OSError: if the file cannot be written.
+        """
+        from nerfloom.export.kinds import export
+
+        regions = self.regions()  # before anything is loaded
+        export(self.load(found, data_format), name, path, self, regions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +78,26 @@ class SplatFlags(SplatSettings, RegionFlags, ExportFlags):
     format: Literal["ply", "spz", "sog", "glb"] = "ply"
     """ply: 32 bits per number, supported by every program; spz: 8 to 24 bits, compressed to about a tenth; sog: images
     in a zip file, for PlayCanvas; glb: glTF with KHR_gaussian_splatting, y up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelsFlags(LevelsSettings, RegionFlags, ExportFlags):
+    """Write scene.levels: Gaussians in chunks, with fewer and larger ones for what is far away.
+
+    Commands open it like a file of Gaussians, and load the chunks that a view needs. A binary PLY file may be larger
+    than memory.
+    """
+
+    def write(self, name: str, found: Path, data_format: DataFormat | None, path: Path) -> None:
+        from nerfloom.export.run_levels import export_file_levels
+        from nerfloom.splats.files import is_splat_file
+
+        if not is_splat_file(found):
+            super().write(name, found, data_format, path)
+            return
+        if self.data is not None or data_format is not None or self.up is not None:
+            raise ConfigError("a file of Gaussians keeps its frame as levels: leave out --data, --up and the format")
+        export_file_levels(found, path, self, self.regions())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Flags of every command that opens a trained run, a scene in blocks, a file of Gaussians, or an octree."""
+"""Flags of all commands that open a trained run, a scene in blocks, a file of Gaussians or of levels, or an octree."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class OpenFlags:
 
     load_config: Path
     """RUN_FOLDER, its config.yml, a folder above (its newest run), a blocks.yml of ns-blocks or its folder, a file of
-    Gaussians (.ply, .spz, .sog, .splat, .ksplat), or an octree (.octree). The flag's name may be omitted."""
+    Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels of them (.levels), or an octree (.octree). The flag's
+    name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
     data: Path | None = None
@@ -45,6 +46,11 @@ class RunFlags(OpenFlags):
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
+    level_error: float | None = None
+    """Of a .levels file: largest standard deviation of a merged Gaussian, pixels; 0: merge none. Default: 1."""
+    memory_limit: float | None = None
+    """Of a .levels file: memory for Gaussians, MB (1e6 bytes). Too little makes the level error larger. Default:
+    2000."""
     eval_rendering: Literal["volume", "surface"] | None = None
     """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
     the surface. Default: the run's setting."""
@@ -63,4 +69,5 @@ class RunFlags(OpenFlags):
         from nerfloom.training.load import load
 
         given = self.load_checkpoint, self.device_type, self.data, data_format, self.up
-        return load(found, *given, eval_rendering=self.eval_rendering, **settings)
+        detail = {"level_error": self.level_error, "memory_limit": self.memory_limit}
+        return load(found, *given, **detail, eval_rendering=self.eval_rendering, **settings)

@@ -10,6 +10,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, nearest
 from nerfloom.export.settings import (
     CameraSettings,
+    LevelsSettings,
     MarchingCubesSettings,
     OccupancySettings,
     PointSettings,
@@ -118,6 +119,12 @@ def _gaussians(loaded: Loaded, path: Path, settings: SplatSettings, regions: Seq
     export_gaussians(loaded, path, settings, regions)
 
 
+def _levels(loaded: Loaded, path: Path, settings: LevelsSettings, regions: Sequence[Region]) -> None:
+    from nerfloom.export.run_levels import export_levels
+
+    export_levels(loaded, path, settings, regions)
+
+
 def _cameras(loaded: Loaded, path: Path, settings: CameraSettings, _: Sequence[Region]) -> None:
     from nerfloom.export.run_cameras import export_cameras
 
@@ -142,6 +149,7 @@ KINDS: dict[str, Kind] = {
     "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set),
     "tsdf": Kind(TsdfSettings, MESHES, _fused),
     "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, is_cropped=True),
+    "levels": Kind(LevelsSettings, (".levels",), _levels, is_cropped=True),
     "cameras": Kind(CameraSettings, (".json",), _cameras),
     "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
     "web": Kind(WebSettings, (".html",), _page, is_cropped=True),

@@ -54,6 +54,20 @@ class SplatSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LevelsSettings:
+    """Gaussians in a tree of levels of detail, for scenes that are larger than memory."""
+
+    chunk_size: int = 50_000
+    """Maximum number of Gaussians in a chunk, 16 to 1,048,576. A picture loads whole chunks."""
+    bits: Literal[16, 32] = 32
+    """Bits of each number but positions, which have 32. 16 halves the file and the time to read it."""
+    build_memory: float = 2000.0
+    """Maximum memory for building, MB (1e6 bytes), besides that of a run that is loaded."""
+    time: float | None = None
+    """Time of a moving scene, 0 to 1. Default: 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class WebSettings:
     """A page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field."""
 

@@ -19,7 +19,7 @@ from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
-from nerfloom.splats.rasteriser import RASTERISER, Rasteriser
+from nerfloom.splats.rasteriser import RASTERISER, Projected, Rasteriser
 
 DRAWN = ("pinhole", "opencv", "fisheye", "equirectangular")
 """Camera models that Gaussians can be drawn with."""
@@ -160,7 +160,20 @@ def draw_view(
         background: (3,) colour behind everything.
         far: depth of empty pixels, scene units.
     """
-    shown = rasteriser.project(gaussians, camera)
+    return picture_of(rasteriser.project(gaussians, camera), camera, stride, background, far, rasteriser)
+
+
+@torch.no_grad()
+def picture_of(
+    shown: Projected, camera: SplatCamera, stride: int, background: Tensor, far: float,
+    rasteriser: Rasteriser = RASTERISER,
+) -> Picture:  # fmt: skip
+    """Draw a picture with depth, opacity and normals of projected Gaussians.
+
+    Args:
+        shown: the Gaussians on the whole image.
+        camera, stride, background, far: as in `draw_view`.
+    """
     image, through, median = rasteriser.draw(shown, camera, background, CHANNELS["normals"], median=True)
     assert median is not None
     opacity = 1 - through

@@ -13,12 +13,13 @@ from nerfloom.splats.gaussians import Gaussians, Splats
 from nerfloom.splats.gltf import encoded_glb
 from nerfloom.splats.ksplat import read_ksplat
 from nerfloom.splats.look import ELSEWHERE, OURS, Look
-from nerfloom.splats.ply import read_ply, write_ply
+from nerfloom.splats.ply import read_ply, stream_ply, write_ply
 from nerfloom.splats.sog import META, read_sog
 from nerfloom.splats.sog_writing import encoded_sog, write_sog
 from nerfloom.splats.splat import read_splat
 from nerfloom.splats.spz import read_spz
 from nerfloom.splats.spz_container import MAGIC, SpzVersion
+from nerfloom.splats.stream import GaussianStream
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Format:
     """Writes a file; None if the format is not written."""
     program: str = ""
     """Name of the format, or of its program, for messages."""
+    stream: Callable[[Path], GaussianStream] | None = None
+    """Reads a file part by part; None if it is read as a whole."""
 
 
 def _write_ply(file: Path, order: Order) -> Written:
@@ -82,7 +85,7 @@ def _write_glb(file: Path, order: Order) -> Written:
 
 
 FORMATS = (
-    Format(".ply", (b"ply",), read_ply, _write_ply),
+    Format(".ply", (b"ply",), read_ply, _write_ply, stream=stream_ply),
     Format(".spz", (b"\x1f\x8b", MAGIC), read_spz, _write_spz),
     Format(".sog", (b"PK\x03\x04",), read_sog, _write_sog),
     Format(META, (), read_sog, _write_sog),
@@ -115,6 +118,24 @@ def read_gaussians(file: Path) -> Splats:
         DataError: if the file cannot be read, is of no such format, or is damaged.
         ConfigError: if a package is missing, which SPZ of version 4 needs.
     """
+    return _reader(file)[1](file)
+
+
+def stream_gaussians(file: Path) -> GaussianStream:
+    """Return the Gaussians of a file, to be read part by part. A binary PLY file is never in memory as a whole.
+
+    Args:
+        file: path of the file, as in `read_gaussians`.
+
+    Raises:
+        DataError, ConfigError: as `read_gaussians`; of a PLY file, parts may raise them.
+    """
+    found, read = _reader(file)
+    return GaussianStream.of(read(file)) if found.stream is None else found.stream(file)
+
+
+def _reader(file: Path) -> tuple[Format, Callable[[Path], Splats]]:
+    """Return the format of a file, by its content or its name, and what reads it."""
     try:
         with file.open("rb") as stream:
             start = stream.read(4)
@@ -122,7 +143,7 @@ def read_gaussians(file: Path) -> Splats:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
     found = next((each for each in FORMATS if each.starts and start.startswith(each.starts)), _named(file))
     if found is not None and found.read is not None and (not found.starts or start.startswith(found.starts)):
-        return found.read(file)
+        return found, found.read
     program = "" if found is None else found.program
     what = f"of {program}'s format" if program else "no file of Gaussians, or its beginning is damaged"
     raise DataError(f"{file} is {what}; Gaussians are read from {_listed(READ, 'and')} files: convert it to PLY")

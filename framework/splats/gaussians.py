@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -99,6 +99,16 @@ class Gaussians:
         values = (each.unsqueeze(-1).flatten(1) for each in self.columns.values())
         return torch.stack([each.isfinite().all(1) for each in values]).all(0)
 
+    def drawable(self) -> Tensor:
+        """Return (N,) whether a Gaussian can be drawn: finite, with finite sizes and a rotation that is not zero."""
+        lengths = self.rotations.norm(dim=-1)
+        return self.finite() & self.log_scales.exp().isfinite().all(-1) & lengths.isfinite() & (lengths > 0)
+
+    def sliced(self, most: int) -> Iterator[Gaussians]:
+        """Yield the Gaussians in their order, in slices of at most `most`."""
+        for first in range(0, len(self), most):
+            yield self[first : first + most]
+
 
 class Splats(NamedTuple):
     """Gaussians and their settings of drawing, as stored in a file."""
@@ -122,6 +132,18 @@ class HasGaussians(Protocol):
 
     def look(self) -> Look:
         """Return the settings of drawing."""
+
+
+@runtime_checkable
+class HasGaussianParts(HasGaussians, Protocol):
+    """A model whose Gaussians are in several parts, not all of them in memory."""
+
+    def gaussian_parts(self, time: float | None = None) -> Iterator[Gaussians]:
+        """Yield the Gaussians of `HasGaussians.gaussians` part by part, on the CPU. Degrees of harmonics may differ.
+
+        Args:
+            time: in [0, 1]; None for a still scene.
+        """
 
 
 @runtime_checkable

@@ -20,8 +20,9 @@ constant (Sloan 2008, with the Condon-Shortley phase). So coefficients are store
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +31,12 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
-from nerfloom.data.ply import PlyElement, header_text, read_columns, read_header, vertices, write_columns
+from nerfloom.data.ply import PlyElement, PlyHeader, header_text, read_columns, read_header, vertices, write_columns
+from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.splats.compressed_ply import is_compressed, read_compressed
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
 from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
+from nerfloom.splats.stream import GaussianStream
 
 MAX_LOGIT = 16.0
 """Finite logit for an opacity of 1; -MAX_LOGIT for 0. Other programs write infinite logits."""
@@ -111,13 +114,48 @@ def read_ply(file: Path) -> Splats:
     if is_compressed(header):
         return Splats(usable(read_compressed(file, header), file), look_of(header.comments, file))
     vertex = vertices(file, header)
-    filters = [name for name in vertex.names if name.lower() == FILTER]
     gaussians = _stored(file, vertex)
-    look = look_of(header.comments, file, MIP_SPLATTING if filters else ELSEWHERE)
-    if filters:
-        say(f"{file}: Mip-Splatting's filter becomes a part of sizes and opacities")
-        gaussians = smoothed(gaussians, _together(read_columns(file, vertex, filters[:1]))[:, 0])
+    look = _described(file, header, vertex)
     return Splats(usable(gaussians, file), look)
+
+
+def stream_ply(file: Path) -> GaussianStream:
+    """Return the Gaussians of a PLY file as `read_ply` does, in parts that are read when they are needed.
+
+    Gaussians that are not finite are not removed. A file that is ascii or compressed is read as a whole.
+
+    Args:
+        file: path of the PLY file.
+
+    Raises:
+        DataError: as `read_ply`; if the file is truncated, its parts raise it.
+    """
+    header = read_header(file)
+    if is_compressed(header) or vertices(file, header).order == "ascii":
+        return GaussianStream.of(read_ply(file))
+    vertex = vertices(file, header)
+    return GaussianStream(partial(_parts, file, vertex), _described(file, header, vertex))
+
+
+def _parts(file: Path, vertex: PlyElement, most: int) -> Iterator[Gaussians]:
+    """Yield the Gaussians in the vertices of a binary file, at most `most` at a time."""
+    row = vertex.row().itemsize
+    for first in range(0, vertex.count, most):
+        yield _stored(file, replace(vertex, count=min(most, vertex.count - first), start=vertex.start + first * row))
+
+
+def _described(file: Path, header: PlyHeader, vertex: PlyElement) -> Look:
+    """Return the settings of drawing, and say what reading the vertices of a file changes."""
+    if sum(name.startswith("f_rest_") for name in vertex.names) > 3 * DEGREES[MAX_DEGREE]:
+        say(f"{file}: harmonics above degree {MAX_DEGREE} are left out")
+    if _filters(vertex):
+        say(f"{file}: Mip-Splatting's filter becomes a part of sizes and opacities")
+    return look_of(header.comments, file, MIP_SPLATTING if _filters(vertex) else ELSEWHERE)
+
+
+def _filters(vertex: PlyElement) -> list[str]:
+    """Return the name of the property with Mip-Splatting's filter, if there is one."""
+    return [name for name in vertex.names if name.lower() == FILTER][:1]
 
 
 def smoothed(gaussians: Gaussians, filters: Tensor) -> Gaussians:
@@ -139,7 +177,7 @@ def smoothed(gaussians: Gaussians, filters: Tensor) -> Gaussians:
 
 
 def _stored(file: Path, vertex: PlyElement) -> Gaussians:
-    """Return the Gaussians in the vertices of a file."""
+    """Return the Gaussians in the vertices of a file, with their filter applied."""
     names = set(vertex.names)
     needed = (*_DC, "opacity", *_SCALES, *_ROTATIONS)
     missing = [name for name in needed if name not in names]
@@ -158,17 +196,16 @@ def _stored(file: Path, vertex: PlyElement) -> Gaussians:
             " f_rest_(n-1), n = 0, 9, 24, 45 or 72: export it again"
         )
     terms = TERMS[count]
-    wanted = min(terms, (MAX_DEGREE + 1) ** 2 - 1)
-    if wanted < terms:
-        say(f"{file}: harmonics above degree {MAX_DEGREE} are left out")
+    wanted = min(terms, DEGREES[MAX_DEGREE])
     kept = [f"f_rest_{channel * terms + term}" for channel in range(3) for term in range(wanted)]
-    named = ["x", "y", "z", *_DC, *kept, "opacity", *_SCALES, *_ROTATIONS]
+    filters = _filters(vertex)
+    named = ["x", "y", "z", *_DC, *kept, "opacity", *_SCALES, *_ROTATIONS, *filters]
     columns = dict(zip(named, read_columns(file, vertex, named), strict=True))
 
     def together(names: Sequence[str], kind: type = np.float32) -> Tensor:
         return _together([columns[name] for name in names], kind)
 
-    return Gaussians(
+    gaussians = Gaussians(
         means=together("xyz", np.float64 if dict(vertex.columns)["x"] == "f8" else np.float32),
         log_scales=together(_SCALES),
         rotations=together(_ROTATIONS),
@@ -176,6 +213,7 @@ def _stored(file: Path, vertex: PlyElement) -> Gaussians:
         colors=together(_DC),
         harmonics=together(kept).reshape(vertex.count, 3, wanted),
     )
+    return smoothed(gaussians, together(filters)[:, 0]) if filters else gaussians
 
 
 def _together(columns: Sequence[np.ndarray], kind: type = np.float32) -> Tensor:
@@ -201,8 +239,7 @@ def usable(gaussians: Gaussians, file: Path) -> Gaussians:
     Raises:
         DataError: if none can be rendered.
     """
-    lengths = gaussians.rotations.norm(dim=-1)
-    good = gaussians.finite() & gaussians.log_scales.exp().isfinite().all(-1) & lengths.isfinite() & (lengths > 0)
+    good = gaussians.drawable()
     if not bool(good.any()):
         what = f"none of its {len(gaussians):,} Gaussians is finite" if len(gaussians) else "it holds no Gaussians"
         raise DataError(f"{file}: {what}; export it again")

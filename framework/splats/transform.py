@@ -63,22 +63,23 @@ def transformed_in_float64(gaussians: Gaussians, rotation: Tensor, scale: float,
 
 
 def quaternion(rotation: Tensor) -> Tensor:
-    """Return the unit quaternion (4,) w, x, y, z of a rotation matrix, with w >= 0.
+    """Return the unit quaternions (..., 4) w, x, y, z of rotation matrices, with w >= 0.
 
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which needs no cases.
+    Each is the eigenvector of the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which needs no cases.
 
     Args:
-        rotation: (3, 3), float64.
+        rotation: (..., 3, 3), float64.
     """
-    a = rotation
-    symmetric = torch.stack([
-        torch.stack([a[0, 0] + a[1, 1] + a[2, 2], a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]]),
-        torch.stack([a[2, 1] - a[1, 2], a[0, 0] - a[1, 1] - a[2, 2], a[1, 0] + a[0, 1], a[2, 0] + a[0, 2]]),
-        torch.stack([a[0, 2] - a[2, 0], a[1, 0] + a[0, 1], a[1, 1] - a[0, 0] - a[2, 2], a[2, 1] + a[1, 2]]),
-        torch.stack([a[1, 0] - a[0, 1], a[2, 0] + a[0, 2], a[2, 1] + a[1, 2], a[2, 2] - a[0, 0] - a[1, 1]]),
-    ])  # fmt: skip
-    vector = torch.linalg.eigh(symmetric).eigenvectors[:, -1]
-    return -vector if bool(vector[0] < 0) else vector
+    a = rotation.movedim((-2, -1), (0, 1))
+    rows = (
+        (a[0, 0] + a[1, 1] + a[2, 2], a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]),
+        (a[2, 1] - a[1, 2], a[0, 0] - a[1, 1] - a[2, 2], a[1, 0] + a[0, 1], a[2, 0] + a[0, 2]),
+        (a[0, 2] - a[2, 0], a[1, 0] + a[0, 1], a[1, 1] - a[0, 0] - a[2, 2], a[2, 1] + a[1, 2]),
+        (a[1, 0] - a[0, 1], a[2, 0] + a[0, 2], a[2, 1] + a[1, 2], a[2, 2] - a[0, 0] - a[1, 1]),
+    )
+    symmetric = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    vector = torch.linalg.eigh(symmetric).eigenvectors[..., -1]
+    return torch.where(vector[..., :1] < 0, -vector, vector)
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Loading of a run, a folder of runs, a scene in blocks, a file of Gaussians, or an octree."""
+"""Loading of a run, a folder of runs, a scene in blocks, a file of Gaussians or of levels of them, or an octree."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Any
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.blocks.files import is_blocks_file
+from nerfloom.levels.files import is_levels_file
+from nerfloom.levels.settings import DetailSettings
 from nerfloom.octrees.files import is_octree_file
 from nerfloom.splats.files import is_splat_file
 from nerfloom.splats.placement import Axis
 from nerfloom.training.block_files import load_blocks
 from nerfloom.training.file_data import DataFormat
+from nerfloom.training.level_files import load_levels
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.octree_files import load_octree
 from nerfloom.training.splat_files import load_splats
@@ -25,18 +28,23 @@ def load(
     data: Path | None = None,
     data_format: DataFormat | None = None,
     up: Axis | None = None,
+    level_error: float | None = None,
+    memory_limit: float | None = None,
     **settings: Any,
 ) -> Loaded:
-    """Load a trained run, a scene in blocks, a file of Gaussians, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians or of levels of them, or an octree.
 
     Args:
         path: the run's folder, its config.yml, a folder above it (for its newest run), a blocks.yml, a file of
-            Gaussians (.ply, .spz, .sog, .splat, .ksplat) in the frame of the input, or an octree (.octree).
+            Gaussians (.ply, .spz, .sog, .splat, .ksplat) in the frame of the input, or one of levels of them (.levels),
+            or an octree (.octree).
         checkpoint: checkpoint of a run; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.
         data: folder of the data, if a run's has moved; optional data for a file.
         data_format: data format for a file, with its flags; None to detect it.
         up: up axis of a file of Gaussians without data; None for z.
+        level_error: largest error of a file of levels, pixels; None for the default.
+        memory_limit: memory for the Gaussians of a file of levels, MB; None for the default.
         settings: changed settings of a run, by name, as in `rays_per_pixel=4`; None for the run's own value.
 
     Raises:
@@ -44,6 +52,12 @@ def load(
         CheckpointError: if there is no readable checkpoint, or it does not fit the settings.
         DataError: if the file or the data cannot be read.
     """
+    detail = {"level_error": level_error, "memory_limit": memory_limit}
+    if is_levels_file(path):
+        _refuse("levels of detail", {"load_checkpoint": checkpoint, **settings})
+        given = {name: value for name, value in detail.items() if value is not None}
+        return load_levels(path, data, data_format, device_type, up, DetailSettings(**given))
+    _refuse("what has no levels of detail (.levels)", detail)
     is_octree = is_octree_file(path)
     if not is_octree and not is_splat_file(path):
         if data_format is not None:

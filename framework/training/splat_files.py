@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
-from nerfloom.cameras.scale import read_scale
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.scale import Scale, read_scale
 from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.parsed_scene import ParsedScene
+from nerfloom.data.scene import Scene
 from nerfloom.geometry.local_origin import local_origin, rounding
 from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.files import read_gaussians
@@ -22,6 +25,7 @@ from nerfloom.splats.placement import Axis, placed_gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.training.file_data import DataFormat, scene_of, source_of
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.run import Run
 
 METHOD = "gaussian-splatting"
 """Method of such files, whichever program wrote them."""
@@ -46,39 +50,81 @@ def load_splats(
     """
     gaussians, look = read_gaussians(file)
     say(f"{file}: {look.words()}")
-    machine, offset, scale = MachineConfig(device_type=device_type), read_offset(file), read_scale(file)
+    machine, scale = MachineConfig(device_type=device_type), read_scale(file)
+    at = place(file, gaussians, read_offset(file), scale, data, data_format, machine, up)
+    placed = transformed(gaussians, *at.frame.similarity())
+    device = choose_device(machine)
+    model = DrawnGaussians(placed.map(lambda values: values.to(device)), look, at.scene.to(device))
+    return Loaded(model, at.placement, METHOD, file, file, source=at.source, scale=scale)
+
+
+class Place(NamedTuple):
+    """The place of a file's Gaussians in a scene."""
+
+    frame: Placement
+    """Placement of the file's coordinates in the scene."""
+    placement: Placement
+    """Placement of the input, in the unit of the file."""
+    scene: Scene
+    """The scene."""
+    source: Run | None
+    """Holds the data; None without."""
+
+
+def place(
+    file: Path,
+    gaussians: Gaussians,
+    offset: Tensor,
+    scale: Scale,
+    data: Path | None,
+    data_format: DataFormat | None,
+    machine: MachineConfig,
+    up: Axis | None,
+) -> Place:
+    """Return the place of a file's Gaussians in the scene of its data, or without data in one made from them.
+
+    Args:
+        file: the file.
+        gaussians: its Gaussians, or fewer that stand for them, in the frame of the file.
+        offset: (3,) float64 origin of the file's coordinates in the frame of the input.
+        scale: unit of the file.
+        data: folder of the photographs; None without.
+        data_format: format of the data, with its flags; None to detect it.
+        machine: device of the model.
+        up: up axis in the frame of the file, for a file without data; None for z.
+
+    Raises:
+        ConfigError: if the data do not fit.
+        DataError: if the data cannot be read, or are elsewhere.
+    """
     if data is None and data_format is None:
-        source, (about, scene) = None, placed_gaussians(gaussians, up or "z")
+        frame, scene = placed_gaussians(gaussians, up or "z")
         if up is None:
             say("without photographs, z is assumed to point up (else: --up=-y, as in many captures, or --data DIR)")
-        placed = transformed(gaussians, *about.similarity())
-        placement = about.about(-offset)
-    elif up is not None:
+        return Place(frame, frame.about(-offset), scene, None)
+    if up is not None:
         raise ConfigError("--up has no effect with --data, which determines the up direction; leave it out")
-    else:
-        source = source_of(METHOD, file, data, data_format, machine)
-        parsed = source.parse("train")
-        scene, placement = scene_of(parsed, source.config), scale.placed(parsed.placement)
-        placed = transformed(gaussians, *placement.about(offset).similarity())
-        _check_place(file, gaussians, placed, parsed)
-    device = choose_device(machine)
-    model = DrawnGaussians(placed.map(lambda values: values.to(device)), look, scene.to(device))
-    return Loaded(model, placement, METHOD, file, file, source=source, scale=scale)
+    source = source_of(METHOD, file, data, data_format, machine)
+    parsed = source.parse("train")
+    scene, placement = scene_of(parsed, source.config), scale.placed(parsed.placement)
+    frame = placement.about(offset)
+    _check_place(file, gaussians, frame, parsed)
+    return Place(frame, placement, scene, source)
 
 
-def _check_place(file: Path, given: Gaussians, placed: Gaussians, parsed: ParsedScene) -> None:
+def _check_place(file: Path, given: Gaussians, frame: Placement, parsed: ParsedScene) -> None:
     """Check that cameras can see the Gaussians, and warn if the file has rounded their centres.
 
     Args:
         file: path of the file.
         given: the Gaussians in the frame of the file.
-        placed: the Gaussians in the frame of the scene.
+        frame: placement of this frame in the scene.
         parsed: the training images.
 
     Raises:
         DataError: if they are beyond the end of the scene.
     """
-    middle = placed.means.double().median(0).values
+    middle = frame.points(given.means).median(0).values
     away = float((parsed.cameras.camera_to_worlds[:, :, 3].double() - middle).norm(dim=-1).min())
     beside = offset_file(file).name
     if not away < parsed.far:

@@ -52,6 +52,7 @@ from nerfloom.export.mesh_files import write_mesh
 from nerfloom.geometry.rays import Rays
 from nerfloom.geometry.regions import Box, read_region, write_region
 from nerfloom.kernels.octree.packed import trace_packed
+from nerfloom.levels.files import read_levels
 from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import bundler, metashape, opensfm, polycam, realitycapture, record3d
 from nerfloom.processing.capture import Capture
@@ -81,6 +82,7 @@ from tests.exr_files import NONE, RLE, ZIP, ZIPS, write_exr
 from tests.fuzz.reader import Reader, require
 from tests.fuzz.sense import check_cameras, check_dataset, check_scene
 from tests.images import noise
+from tests.levels.made import built, cloud
 from tests.octrees.balls import ball
 from tests.processing.programs import write_bundler, write_metashape, write_odm, write_realitycapture
 from tests.splats.foreign_files import write_compressed, write_ksplat, write_splat
@@ -240,6 +242,23 @@ def read_octrees(folder: Path, scratch: Path) -> None:
         rays = Rays(torch.randn(count, 3), directions, fars=torch.full((count,), 100.0))
         light = trace_packed(octree.layout, octree.leaves, rays, torch.ones(3))
         require(bool(light.opacity.isfinite().all()), "light that is not finite")
+
+
+def write_levels(folder: Path) -> None:
+    for bits in (16, 32):
+        built(folder / f"{bits}.levels", cloud(40), 16, bits)  # type: ignore[arg-type]
+
+
+def read_some_levels(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.levels")):
+        levels = read_levels(file)
+        nodes = levels.nodes
+        require(bool((nodes.counts > 0).all()), "chunks without Gaussians")
+        require(bool((nodes.low <= nodes.high).all() and nodes.high.isfinite().all()), "boxes that are nowhere")
+        require(bool(levels.origin.isfinite().all()), "an origin that is nowhere")
+        require(MIN_BLUR <= levels.look.blur <= MAX_BLUR, "Gaussians that are drawn as none can be")
+        for index in range(len(nodes)):
+            require(len(levels.read(index)) == int(nodes.counts[index]), "a chunk of another size")
 
 
 def write_path(folder: Path) -> None:
@@ -562,6 +581,9 @@ READERS: dict[str, Reader] = {
         read_splats,
         ("splat*", "sog/*"),
         ("version", "count", "mins", "codebook", "files", "bands", "model"),
+    ),
+    "levels": Reader(
+        write_levels, read_some_levels, ("*.levels",), ("count", "parent", "look", "degree", "bits", "origin", "crc32")
     ),
     "octree": Reader(write_octrees, read_octrees, ("*.octree",)),
     "camera-path": Reader(write_path, read_path, ("camera_path.json",), ("crop", "camera_type", "aspect", "seconds")),

@@ -41,7 +41,7 @@ MUTANTS = {
             "blocks/test_composed.py::test_two_blocks_of_one_colour_each_are_blended_exactly"),
     ],
     "nerfloom.blocks.merge": [
-        Mutant("doubled-borders", "merged", "part[in_cell(A, B, C)]", "part",
+        Mutant("doubled-borders", "of_cell", "part[in_cell(A, B, C)]", "part",
             "what two blocks have learned is drawn twice",
             "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],
@@ -54,6 +54,26 @@ MUTANTS = {
         Mutant("crop-stays-behind", "Request.moved", "crop.box.moved(A, B, C)", "crop.box",
             "the second run is cropped in another place than the first",
             "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
+    ],
+    "nerfloom.levels.cut": [
+        Mutant("levels-twice", "cut_of", "seen & (lower <= error) & (error < upper)", "seen & (lower <= error)",
+            "what is near is drawn with its merged Gaussians too",
+            "levels/test_cut.py::test_the_cut_is_that_of_a_walk_from_the_root"),
+    ],
+    "nerfloom.levels.drawn": [
+        Mutant("levels-depth-in-units-of-the-file", "DrawnLevels.render_view",
+            "{'depth': picture.depth / A, 'median_depth': picture.median_depth / A}",
+            "{'depth': picture.depth, 'median_depth': picture.median_depth}",
+            "depths of levels are in the unit of the file instead of the scene's",
+            "levels/test_drawn.py::test_frames_of_file_and_scene_may_differ"),
+    ],
+    "nerfloom.levels.merging": [
+        Mutant("levels-weights-without-size", "merged", "torch.sigmoid(A) * grouped(B)", "torch.sigmoid(A)",
+            "small Gaussians count as much as large ones where they are merged",
+            "levels/test_merging.py::test_weights_are_opacity_times_surface"),
+        Mutant("levels-no-spread", "merged", "mean(A + B)", "mean(A)",
+            "merged Gaussians leave gaps between them",
+            "levels/test_merging.py::test_two_side_by_side_are_longer_and_fainter"),
     ],
     "nerfloom.cameras.scale": [
         Mutant("scale-not-applied", "Scale.placed", "placement.after(A, B)", "placement",

@@ -142,7 +142,7 @@ MUTANTS = {
     ],
     "nerfloom.training.splat_files": [
         Mutant("splats-where-they-were", "load_splats",
-            "transformed(A, *placement.about(offset).similarity())", "A",
+            "transformed(A, *at.frame.similarity())", "A",
             "a PLY file is drawn in the frame of the input, past the cameras",
             "splats/test_splat_files.py::test_paths_through_a_file"),
         Mutant("splats-mode-of-a-file-unused", "load_splats", "DrawnGaussians(A, look, B)",

@@ -69,6 +69,7 @@ class Checker:
             "nerfloom.cli.session.start": begin,
             "nerfloom.cli.session.resume": begin,
             "nerfloom.training.load.load": begin,
+            "nerfloom.export.run_levels.export_file_levels": begin,
             "nerfloom.cli.evaluate_geometry.read_reference": lambda flags: None,
             "nerfloom.processing.kinds._check_input": begin,
             "nerfloom.cli.compare.compare": begin,

@@ -84,6 +84,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Path:
             settings = {"max_num_iterations": 60, **TINY.get(method, {})}
             nerfloom.train(method, data="path/to/lego", vis="none", experiment_name="all", timestamp="TIME", **settings)
         execute(["ns-export", "gaussian-splat", "outputs/all/gaussian-splatting/TIME", "--output-dir", "exports"])
+        execute(["ns-export", "levels", "exports/splat.ply", "--output-dir", "exports"])
         words = "--output-path exports/scene.octree --resolution 16 --fine-tune-seconds 0"
         execute(["ns-bake", "outputs/all/instant-ngp/TIME", *words.split()])
     finally:

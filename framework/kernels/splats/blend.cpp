@@ -125,11 +125,9 @@ struct Shape {
     Shape(const float* g, const Offsets& offset)
         : u(g[U_X] * offset.x + g[U_Y] * offset.y), v(g[V_Y] * offset.y), u_x(g[U_X]), u_y(g[U_Y]), v_y(g[V_Y]),
           cut(g[CUT]), opacity(g[OPACITY]) {}
-    // u^2 + v^2 at a block whose first pixel's centre is at (dx, dy) from the Gaussian's.
-    Floats squared(float dx, float dy) const {
-        const Floats a = u + (u_x * dx + u_y * dy), b = v + v_y * dy;
-        return a * a + b * b;
-    }
+    // u and v at a block whose first pixel's centre is at (dx, dy) from the Gaussian's.
+    Floats u_at(float dx, float dy) const { return u + (u_x * dx + u_y * dy); }
+    Floats v_at(float dy) const { return v + v_y * dy; }
 };
 
 constexpr float LOG2_E = 1.44269504f;
@@ -194,7 +192,8 @@ void forward_tile(const Tile& tile, const float* records, const int32_t* ids, in
         const Shape shape(g, offset);
         for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
             const int b = first_of(rest);
-            const Floats q = shape.squared(x + b / ROWS * ACROSS, y + b % ROWS * DOWN), before = through[b];
+            const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
+            const Floats u = shape.u_at(block_x, block_y), v = shape.v_at(block_y), q = u * u + v * v, before = through[b];
             const Ints inside = (q < shape.cut) & (before >= OPAQUE);
             const Floats alpha = smaller(shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E), splat(MAX_ALPHA));
             const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
@@ -254,8 +253,10 @@ inline void sum_lanes(const Floats* v, float* out) {
 #endif
 }
 
-// Slots of the sums over a Gaussian's pixels that have no name among the record's.
-enum Sums { SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY, SUM_G, ABSOLUTE_X, ABSOLUTE_Y };
+// Slots of the sums over a Gaussian's pixels that have no name among the record's: of the exponent's gradient, of its
+// products with u and v, and of the magnitudes of the centre's gradients, which splat_gather multiplies by 2 U_X and 2.
+// u and v are of the order of 1, so that thin Gaussians lose no digits, as they would in moments of the offsets.
+enum Sums { SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_G, ABSOLUTE_X, ABSOLUTE_Y };
 
 template <int CHANNELS>
 void backward_tile(const Tile& tile, const float* records, const int32_t* ids, const int32_t* slots, int64_t entries,
@@ -279,12 +280,10 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
         const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
         const Shape shape(g, offset);
         Floats sums[RECORD] = {};
-        // Rows of the inverse covariance, for the absolute gradient of the centre.
-        const float xx = 2 * g[U_X] * g[U_X], xy = 2 * g[U_X] * g[U_Y], yy = 2 * (g[U_Y] * g[U_Y] + g[V_Y] * g[V_Y]);
         for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
             const int b = first_of(rest);
             const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
-            const Floats q = shape.squared(block_x, block_y), before = through[b];
+            const Floats u = shape.u_at(block_x, block_y), v = shape.v_at(block_y), q = u * u + v * v, before = through[b];
             const Ints inside = (q < shape.cut) & (before >= OPAQUE);
             const Floats raw = shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E);
             const Floats alpha = smaller(raw, splat(MAX_ALPHA));
@@ -299,13 +298,11 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
             // The gradient of the exponent: alpha times the gradient of alpha, 0 if alpha is clipped.
             const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
             const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
-            const Floats dx = offset.x + block_x, dy = offset.y + block_y;
-            const Floats by_x = of_exponent * dx, by_y = of_exponent * dy;
+            const Floats by_u = of_exponent * u, by_v = of_exponent * v;
             sums[SUM_G] += of_exponent;
-            sums[SUM_X] += by_x, sums[SUM_Y] += by_y;
-            sums[SUM_XX] += by_x * dx, sums[SUM_XY] += by_x * dy, sums[SUM_YY] += by_y * dy;
-            const Floats of_x = xx * by_x + xy * by_y, of_y = xy * by_x + yy * by_y;
-            sums[ABSOLUTE_X] += magnitude(of_x), sums[ABSOLUTE_Y] += magnitude(of_y);
+            sums[SUM_U] += by_u, sums[SUM_V] += by_v;
+            sums[SUM_UU] += by_u * u, sums[SUM_UV] += by_u * v, sums[SUM_VV] += by_v * v;
+            sums[ABSOLUTE_X] += magnitude(by_u), sums[ABSOLUTE_Y] += magnitude(shape.u_y * by_u + shape.v_y * by_v);
             if (!lets_through(after)) alive &= ~only(b);
         }
         sum_lanes(sums, parts + int64_t(slots[n]) * RECORD);
@@ -375,20 +372,25 @@ EXPORT int splat_gather(const float* records, int64_t count, const int32_t* firs
         for_each(threads, count, 1024, [&](int64_t g) {
             const int64_t begin = firsts[g], end = firsts[g + 1];
             if (begin < 0 || end < begin || end > entries) bad_index(end, entries, "slots");
+            float* out = gradient + g * RECORD;
+            if (begin == end) {  // it may have no shape
+                std::memset(out, 0, RECORD * sizeof(float));
+                return;
+            }
             float s[RECORD] = {};
             for (int64_t slot = begin; slot < end; slot++)
                 for (int k = 0; k < RECORD; k++) s[k] += parts[slot * RECORD + k];
             const float* r = records + g * RECORD;
-            float* out = gradient + g * RECORD;
             std::memcpy(out, s, sizeof s);
-            const float by_u = r[U_X] * s[SUM_X] + r[U_Y] * s[SUM_Y];
-            out[X] = 2 * r[U_X] * by_u;
-            out[Y] = 2 * (r[U_Y] * by_u + r[V_Y] * r[V_Y] * s[SUM_Y]);
-            out[U_X] = -2 * (r[U_X] * s[SUM_XX] + r[U_Y] * s[SUM_XY]);
-            out[U_Y] = -2 * (r[U_X] * s[SUM_XY] + r[U_Y] * s[SUM_YY]);
-            out[V_Y] = -2 * r[V_Y] * s[SUM_YY];
+            // Offsets from the centre are dy = v / V_Y, dx = (u - U_Y dy) / U_X. Where U_X underflows, u is 0 as well.
+            const float per_u = r[U_X] != 0 ? 1 / r[U_X] : 0, per_v = r[V_Y] != 0 ? 1 / r[V_Y] : 0;
+            out[X] = 2 * r[U_X] * s[SUM_U];
+            out[Y] = 2 * (r[U_Y] * s[SUM_U] + r[V_Y] * s[SUM_V]);
+            out[U_X] = -2 * per_u * (s[SUM_UU] - r[U_Y] * per_v * s[SUM_UV]);
+            out[U_Y] = -2 * per_v * s[SUM_UV];
+            out[V_Y] = -2 * per_v * s[SUM_VV];
             out[OPACITY] = r[OPACITY] > 0 ? s[SUM_G] / r[OPACITY] : 0;
-            out[CUT] = s[ABSOLUTE_X], out[REACH_X] = s[ABSOLUTE_Y], out[REACH_Y] = 0;
+            out[CUT] = 2 * std::abs(r[U_X]) * s[ABSOLUTE_X], out[REACH_X] = 2 * s[ABSOLUTE_Y], out[REACH_Y] = 0;
         });
     });
 }

@@ -1,15 +1,19 @@
 // Blending the Gaussians of each tile from front to back, forward and backward. See ../splat_blend.py.
 //
 // A tile of TILE x TILE pixels consists of blocks of LANES pixels, 4 across: a vector holds a block. For each Gaussian
-// of the tile's list, only the blocks that its box meets are evaluated.
+// of the tile's list, only the blocks that its ellipse meets are evaluated. They are found for TOGETHER entries before
+// these are blended: the loop over an entry's blocks then depends on memory alone, so that the processor goes on to the
+// next entries while it waits for square roots and quotients. The backward pass takes the blocks of the forward pass.
 #include "splats/splat.h"
 
-#include <vector>
+#include <algorithm>
 
 namespace {
 
 constexpr int ACROSS = 4, DOWN = LANES / ACROSS;  // pixels of a block
 constexpr int COLUMNS = TILE / ACROSS, ROWS = TILE / DOWN, BLOCKS = COLUMNS * ROWS;
+constexpr int64_t TOGETHER = 32;
+constexpr int64_t AHEAD = 8;  // entries whose memory is fetched before it is used
 
 #if defined(__AVX512F__)
 // 2^x for x in [-126, 0], to 2 units in the last place: 2^(k / 16) of the nearest sixteenth from a table in a register,
@@ -64,13 +68,14 @@ inline uint64_t bits(Ints mask) {
 #endif
 }
 
-// Whether a pixel of a block lets light through.
+// Whether a pixel of a block lets light through, which is usual.
 inline bool lets_through(Floats through) {
 #if defined(__AVX512F__)
-    return _mm512_cmp_ps_mask((__m512)through, _mm512_set1_ps(OPAQUE), _CMP_GE_OQ) != 0;
+    const bool some = _mm512_cmp_ps_mask((__m512)through, _mm512_set1_ps(OPAQUE), _CMP_GE_OQ) != 0;
 #else
-    return bits(through >= OPAQUE) != 0;
+    const bool some = bits(through >= OPAQUE) != 0;
 #endif
+    return __builtin_expect_with_probability(some, true, 0.999);  // as a branch, which no later entry waits for
 }
 
 // Blocks of a tile: bit TILE c + r is set for the block in column c whose first row of pixels is r.
@@ -82,53 +87,25 @@ constexpr Blocks FIRST_ROWS = ~Blocks(0) / ((Blocks(1) << DOWN) - 1);
 inline int first_of(Blocks blocks) { return __builtin_ctzll(blocks) / DOWN; }
 inline Blocks only(int b) { return Blocks(1) << (b * DOWN); }
 
-struct Offsets {  // of a block's pixels from its first
-    Floats x, y;
+// Offsets of a tile's pixels from its first.
+struct Offsets {
+    Floats x[BLOCKS], y[BLOCKS];
     Offsets() {
-        float across[LANES], down[LANES];
-        for (int i = 0; i < LANES; i++) across[i] = float(i % ACROSS), down[i] = float(i / ACROSS);
-        x = load(across), y = load(down);
-    }
-};
-
-// The blocks where a Gaussian reaches the centre of a pixel, and perhaps neighbouring ones.
-struct Reach {
-    Floats rows[TILE / LANES];  // of the tile's pixels
-    Reach() {
-        float numbers[TILE];
-        for (int i = 0; i < TILE; i++) numbers[i] = float(i);
-        for (int v = 0; v < TILE / LANES; v++) rows[v] = load(numbers + v * LANES);
-    }
-    // x, y: the tile's first pixel's centre, from the Gaussian's.
-    Blocks blocks(const float* g, float x, float y) const {
-        const float width = 1 / g[U_X], lean = g[U_Y] * width;
-        Blocks met = 0;
-        for (int v = 0; v < TILE / LANES; v++) {
-            // A row meets the ellipse from `first` to `last`, which are counted in pixels from the tile's first.
-            const Floats dy = rows[v] + y, of_v = g[V_Y] * dy, rest = g[CUT] - of_v * of_v;
-            const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
-            const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
-            const Floats first = middle - half, last = middle + half;
-            for (int c = 0; c < COLUMNS; c++)
-                met |= bits((rest > 0.0f) & (first <= float(c * ACROSS + ACROSS - 1)) & (last >= float(c * ACROSS)))
-                       << (c * TILE + v * LANES);
+        for (int b = 0; b < BLOCKS; b++) {
+            float across[LANES], down[LANES];
+            for (int i = 0; i < LANES; i++) {
+                across[i] = float(b / ROWS * ACROSS + i % ACROSS);
+                down[i] = float(b % ROWS * DOWN + i / ACROSS);
+            }
+            x[b] = load(across), y[b] = load(down);
         }
-        for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
-        return met & FIRST_ROWS;
     }
 };
 
-// What one Gaussian is at the pixels of a tile.
-struct Shape {
-    Floats u, v;  // at the offsets within a block, less its first pixel's
-    float u_x, u_y, v_y, cut, opacity;
-    Shape(const float* g, const Offsets& offset)
-        : u(g[U_X] * offset.x + g[U_Y] * offset.y), v(g[V_Y] * offset.y), u_x(g[U_X]), u_y(g[U_Y]), v_y(g[V_Y]),
-          cut(g[CUT]), opacity(g[OPACITY]) {}
-    // u and v at a block whose first pixel's centre is at (dx, dy) from the Gaussian's.
-    Floats u_at(float dx, float dy) const { return u + (u_x * dx + u_y * dy); }
-    Floats v_at(float dy) const { return v + v_y * dy; }
-};
+const Offsets& offsets_in_tile() {
+    static const Offsets offsets;
+    return offsets;
+}
 
 constexpr float LOG2_E = 1.44269504f;
 
@@ -178,29 +155,78 @@ struct Tile {
     }
 };
 
+// The blocks where a Gaussian reaches the centre of a pixel, and perhaps neighbouring ones.
+struct Reach {
+    Floats rows[TILE / LANES];  // of the tile's pixels
+    Reach() {
+        float numbers[TILE];
+        for (int i = 0; i < TILE; i++) numbers[i] = float(i);
+        for (int v = 0; v < TILE / LANES; v++) rows[v] = load(numbers + v * LANES);
+    }
+    Blocks blocks(const Tile& tile, const float* g) const {
+        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y], width = 1 / g[U_X], lean = g[U_Y] * width;
+        Blocks met = 0;
+        for (int v = 0; v < TILE / LANES; v++) {
+            // A row meets the ellipse from `first` to `last`, which are counted in pixels from the tile's first.
+            const Floats dy = rows[v] + y, of_v = g[V_Y] * dy, rest = g[CUT] - of_v * of_v;
+            const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
+            const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
+            const Floats first = middle - half, last = middle + half;
+            for (int c = 0; c < COLUMNS; c++)
+                met |= bits((rest > 0.0f) & (first <= float(c * ACROSS + ACROSS - 1)) & (last >= float(c * ACROSS)))
+                       << (c * TILE + v * LANES);
+        }
+        for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
+        return met & FIRST_ROWS;
+    }
+};
+
+// What one Gaussian is at the pixels of a tile.
+struct Shape {
+    float x, y;  // of the tile's first pixel's centre, from the Gaussian's
+    float u_x, u_y, v_y, cut, opacity;
+    Shape(const Tile& tile, const float* g)
+        : x(tile.left + 0.5f - g[X]), y(tile.top + 0.5f - g[Y]), u_x(g[U_X]), u_y(g[U_Y]), v_y(g[V_Y]), cut(g[CUT]),
+          opacity(g[OPACITY]) {}
+    // Where the offset from the tile's first pixel is (across, down).
+    Floats u(Floats across, Floats down) const { return u_x * (across + x) + u_y * (down + y); }
+    Floats v(Floats down) const { return v_y * (down + y); }
+    // Of u^2 + v^2.
+    Floats alpha(Floats q) const { return opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E); }
+};
+
+// Unless `blended` is null, it gets the blocks of each entry that is used.
 template <int CHANNELS>
 void forward_tile(const Tile& tile, const float* records, const int32_t* ids, int64_t entries, const float* background,
-                  float* image, float* through_image, float* median_image, int32_t* used) {
+                  float* image, float* through_image, float* median_image, Blocks* blended, int32_t* used) {
     alignas(64) Floats sum[CHANNELS][BLOCKS] = {}, through[BLOCKS], median[BLOCKS] = {};
-    const Offsets offset;
+    const Offsets& offset = offsets_in_tile();
     const Reach reach;
-    Blocks alive = tile.clear(through);
+    Blocks alive = tile.clear(through), met[TOGETHER];
     int64_t n = 0;
-    for (; n < entries && alive; n++) {
-        const float* g = records + int64_t(ids[n]) * RECORD;
-        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
-        const Shape shape(g, offset);
-        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
-            const int b = first_of(rest);
-            const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
-            const Floats u = shape.u_at(block_x, block_y), v = shape.v_at(block_y), q = u * u + v * v, before = through[b];
-            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
-            const Floats alpha = smaller(shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E), splat(MAX_ALPHA));
-            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
-            for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
-            if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
-            through[b] = after;
-            if (!lets_through(after)) alive &= ~only(b);
+    while (n < entries && alive) {
+        const int64_t first = n, end = std::min(entries, first + TOGETHER);
+        for (int64_t i = first; i < end; i++) {
+            if (i + AHEAD < entries) __builtin_prefetch(records + int64_t(ids[i + AHEAD]) * RECORD);
+            met[i - first] = reach.blocks(tile, records + int64_t(ids[i]) * RECORD);
+        }
+        for (; n < end && alive; n++) {
+            const float* g = records + int64_t(ids[n]) * RECORD;
+            const Shape shape(tile, g);
+            Blocks rest = met[n - first] & alive;
+            if (blended) blended[n] = rest;
+            for (; rest; rest &= rest - 1) {
+                const int b = first_of(rest);
+                const Floats u = shape.u(offset.x[b], offset.y[b]), v = shape.v(offset.y[b]);
+                const Floats q = u * u + v * v, before = through[b];
+                const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+                const Floats alpha = smaller(shape.alpha(q), splat(MAX_ALPHA));
+                const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+                for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
+                if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
+                through[b] = after;
+                if (!lets_through(after)) alive &= ~only(b);
+            }
         }
     }
     *used = int32_t(n);
@@ -260,11 +286,13 @@ enum Sums { SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_G, ABSOLUTE_X, ABSOLUTE_Y 
 
 template <int CHANNELS>
 void backward_tile(const Tile& tile, const float* records, const int32_t* ids, const int32_t* slots, int64_t entries,
-                   int64_t used, const float* image, const float* through_image, const float* image_grad,
-                   const float* through_grad, float* parts) {
+                   const Blocks* blended, int64_t used, const float* image, const float* through_image,
+                   const float* image_grad, const float* through_grad, float* parts) {
+    const auto clear = [&](int64_t n) { std::memset(parts + int64_t(slots[n]) * RECORD, 0, RECORD * sizeof(float)); };
+    for (int64_t n = used; n < entries; n++) clear(n);
+    if (used == 0) return;
     alignas(64) Floats of_image[CHANNELS][BLOCKS], shown[CHANNELS][BLOCKS], through[BLOCKS], behind[BLOCKS], last[BLOCKS];
-    const Offsets offset;
-    const Reach reach;
+    const Offsets& offset = offsets_in_tile();
     if (through_grad) {
         tile.read<1>(through_image, &last), tile.read<1>(through_grad, &behind);
         for (int b = 0; b < BLOCKS; b++) behind[b] *= last[b];
@@ -274,27 +302,33 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
     tile.read<CHANNELS>(image, shown), tile.read<CHANNELS>(image_grad, of_image);
     for (int c = 0; c < CHANNELS; c++)
         for (int b = 0; b < BLOCKS; b++) behind[b] += shown[c][b] * of_image[c][b];
-    Blocks alive = tile.clear(through);
+    tile.clear(through);
     for (int64_t n = 0; n < used; n++) {
+        if (n + AHEAD < used) {
+            __builtin_prefetch(records + int64_t(ids[n + AHEAD]) * RECORD);
+            __builtin_prefetch(parts + int64_t(slots[n + AHEAD]) * RECORD, 1);
+        }
+        if (!blended[n]) {
+            clear(n);
+            continue;
+        }
         const float* g = records + int64_t(ids[n]) * RECORD;
-        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
-        const Shape shape(g, offset);
+        const Shape shape(tile, g);
         Floats sums[RECORD] = {};
-        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
+        for (Blocks rest = blended[n]; rest; rest &= rest - 1) {
             const int b = first_of(rest);
-            const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
-            const Floats u = shape.u_at(block_x, block_y), v = shape.v_at(block_y), q = u * u + v * v, before = through[b];
+            const Floats u = shape.u(offset.x[b], offset.y[b]), v = shape.v(offset.y[b]);
+            const Floats q = u * u + v * v, before = through[b];
             const Ints inside = (q < shape.cut) & (before >= OPAQUE);
-            const Floats raw = shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E);
-            const Floats alpha = smaller(raw, splat(MAX_ALPHA));
-            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+            const Floats raw = shape.alpha(q), alpha = smaller(raw, splat(MAX_ALPHA));
+            const Floats weight = inside ? alpha * before : splat(0);
             Floats own = splat(0);
             for (int c = 0; c < CHANNELS; c++) {
                 own += g[RED + c] * of_image[c][b];
                 sums[RED + c] += weight * of_image[c][b];
             }
             behind[b] -= weight * own;
-            through[b] = after;
+            through[b] = before - weight;
             // The gradient of the exponent: alpha times the gradient of alpha, 0 if alpha is clipped.
             const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
             const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
@@ -303,11 +337,9 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
             sums[SUM_U] += by_u, sums[SUM_V] += by_v;
             sums[SUM_UU] += by_u * u, sums[SUM_UV] += by_u * v, sums[SUM_VV] += by_v * v;
             sums[ABSOLUTE_X] += magnitude(by_u), sums[ABSOLUTE_Y] += magnitude(shape.u_y * by_u + shape.v_y * by_v);
-            if (!lets_through(after)) alive &= ~only(b);
         }
         sum_lanes(sums, parts + int64_t(slots[n]) * RECORD);
     }
-    for (int64_t n = used; n < entries; n++) std::memset(parts + int64_t(slots[n]) * RECORD, 0, RECORD * sizeof(float));
 }
 
 void check_tile(const int32_t* offsets, int64_t tile, int64_t entries, const int32_t* ids, int64_t count) {
@@ -320,18 +352,19 @@ void check_tile(const int32_t* offsets, int64_t tile, int64_t entries, const int
 
 // The image (height, width, channels): colours over the background (3), then, of 4 channels, the sum of weight times
 // distance, and of 7 the sum of the normals. The transmittance (height, width). If median is not null, the distance at
-// which half of the light is gone, or 0. How many entries of each tile's list were used.
+// which half of the light is gone, or 0. How many entries of each tile's list were used and, if blended (entries) is not
+// null, in which blocks of the tile.
 EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids, int64_t entries,
                        int width, int height, int channels, const float* background, float* image, float* through,
-                       float* median, int32_t* used, int threads) {
+                       float* median, uint64_t* blended, int32_t* used, int threads) {
     return guarded([&] {
         const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
         for_chunks(threads, int64_t(columns) * rows, [&](int64_t t, int) {
             check_tile(offsets, t, entries, ids, count);
             const Tile tile(t, columns, width, height);
             const auto run = [&](auto forward) {
-                forward(tile, records, ids + offsets[t], offsets[t + 1] - offsets[t], background, image, through, median,
-                        used + t);
+                forward(tile, records, ids + offsets[t], offsets[t + 1] - offsets[t], background, image, through,
+                        median, blended ? blended + offsets[t] : nullptr, used + t);
             };
             if (channels == 3) run(forward_tile<3>);
             else if (channels == 4) run(forward_tile<4>);
@@ -344,8 +377,9 @@ EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offse
 // From the gradients of image and transmittance (the latter may be null) the sums of each entry, by slot.
 EXPORT int splat_blend_backward(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids,
                                 const int32_t* slots, int64_t entries, int width, int height, int channels,
-                                const float* image, const float* through, const int32_t* used, const float* image_grad,
-                                const float* through_grad, float* parts, int threads) {
+                                const float* image, const float* through, const uint64_t* blended,
+                                const int32_t* used, const float* image_grad, const float* through_grad, float* parts,
+                                int threads) {
     return guarded([&] {
         const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
         for_chunks(threads, int64_t(columns) * rows, [&](int64_t t, int) {
@@ -354,8 +388,8 @@ EXPORT int splat_blend_backward(const float* records, int64_t count, const int32
             if (used[t] > offsets[t + 1] - offsets[t]) bad_index(used[t], offsets[t + 1] - offsets[t], "entries used");
             const Tile tile(t, columns, width, height);
             const auto run = [&](auto backward) {
-                backward(tile, records, ids + offsets[t], slots + offsets[t], offsets[t + 1] - offsets[t], used[t],
-                         image, through, image_grad, through_grad, parts);
+                backward(tile, records, ids + offsets[t], slots + offsets[t], offsets[t + 1] - offsets[t],
+                         blended + offsets[t], used[t], image, through, image_grad, through_grad, parts);
             };
             if (channels == 3) run(backward_tile<3>);
             else if (channels == 4) run(backward_tile<4>);

@@ -51,13 +51,28 @@ inline Floats power_of_two(Floats x) {
 }
 #endif
 
-// The lanes of a mask that are set, as bits.
-inline uint64_t bits(Ints mask) {
-#if defined(__AVX512DQ__)
-    return _mm512_movepi32_mask((__m512i)mask);
-#elif defined(__AVX512F__)
-    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask);
-#elif defined(__AVX__)
+// The lanes where a comparison holds, among those of `within`. AVX-512 has registers of bits for them; compilers make
+// vectors of whole lanes of comparisons that are combined.
+#if defined(__AVX512F__)
+typedef __mmask16 Mask;
+constexpr Mask EVERYWHERE = 0xffff;
+inline Mask less(Floats a, Floats b, Mask within = EVERYWHERE) {
+    return _mm512_mask_cmp_ps_mask(within, (__m512)a, (__m512)b, _CMP_LT_OQ);
+}
+inline Mask at_most(Floats a, Floats b, Mask within = EVERYWHERE) {
+    return _mm512_mask_cmp_ps_mask(within, (__m512)a, (__m512)b, _CMP_LE_OQ);
+}
+inline Floats where(Mask mask, Floats value) { return (Floats)_mm512_maskz_mov_ps(mask, (__m512)value); }
+inline uint64_t bits(Mask mask) { return mask; }
+#else
+typedef Ints Mask;
+inline Mask less(Floats a, Floats b) { return a < b; }
+inline Mask less(Floats a, Floats b, Mask within) { return (a < b) & within; }
+inline Mask at_most(Floats a, Floats b) { return a <= b; }
+inline Mask at_most(Floats a, Floats b, Mask within) { return (a <= b) & within; }
+inline Floats where(Mask mask, Floats value) { return mask ? value : splat(0); }
+inline uint64_t bits(Mask mask) {
+#if defined(__AVX__)
     return uint32_t(_mm256_movemask_ps((__m256)mask));
 #elif defined(__SSE2__)
     return uint32_t(_mm_movemask_ps((__m128)mask));
@@ -67,15 +82,11 @@ inline uint64_t bits(Ints mask) {
     return set;
 #endif
 }
-
-// Whether a pixel of a block lets light through, which is usual.
-inline bool lets_through(Floats through) {
-#if defined(__AVX512F__)
-    const bool some = _mm512_cmp_ps_mask((__m512)through, _mm512_set1_ps(OPAQUE), _CMP_GE_OQ) != 0;
-#else
-    const bool some = bits(through >= OPAQUE) != 0;
 #endif
-    return __builtin_expect_with_probability(some, true, 0.999);  // as a branch, which no later entry waits for
+
+// Whether a pixel of a block lets light through, which is usual: as a branch, so that no later entry waits for it.
+inline bool lets_through(Floats through) {
+    return __builtin_expect_with_probability(bits(at_most(splat(OPAQUE), through)) != 0, true, 0.999);
 }
 
 // Blocks of a tile: bit TILE c + r is set for the block in column c whose first row of pixels is r.
@@ -150,7 +161,7 @@ struct Tile {
         std::memcpy(through, lanes, sizeof lanes);
         Blocks alive = 0;
         for (int b = 0; b < BLOCKS; b++)
-            if (bits(through[b] > 0.0f)) alive |= only(b);
+            if (bits(less(splat(0), through[b]))) alive |= only(b);
         return alive;
     }
 };
@@ -172,9 +183,11 @@ struct Reach {
             const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
             const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
             const Floats first = middle - half, last = middle + half;
-            for (int c = 0; c < COLUMNS; c++)
-                met |= bits((rest > 0.0f) & (first <= float(c * ACROSS + ACROSS - 1)) & (last >= float(c * ACROSS)))
-                       << (c * TILE + v * LANES);
+            const Mask rows_met = less(splat(0), rest);
+            for (int c = 0; c < COLUMNS; c++) {
+                const Mask begun = at_most(first, splat(c * ACROSS + ACROSS - 1), rows_met);
+                met |= bits(at_most(splat(c * ACROSS), last, begun)) << (c * TILE + v * LANES);
+            }
         }
         for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
         return met & FIRST_ROWS;
@@ -219,9 +232,9 @@ void forward_tile(const Tile& tile, const float* records, const int32_t* ids, in
                 const int b = first_of(rest);
                 const Floats u = shape.u(offset.x[b], offset.y[b]), v = shape.v(offset.y[b]);
                 const Floats q = u * u + v * v, before = through[b];
-                const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+                const Mask inside = at_most(splat(OPAQUE), before, less(q, splat(shape.cut)));
                 const Floats alpha = smaller(shape.alpha(q), splat(MAX_ALPHA));
-                const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+                const Floats weight = where(inside, alpha * before), after = before - weight;
                 for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
                 if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
                 through[b] = after;
@@ -319,9 +332,9 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
             const int b = first_of(rest);
             const Floats u = shape.u(offset.x[b], offset.y[b]), v = shape.v(offset.y[b]);
             const Floats q = u * u + v * v, before = through[b];
-            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
+            const Mask inside = at_most(splat(OPAQUE), before, less(q, splat(shape.cut)));
             const Floats raw = shape.alpha(q), alpha = smaller(raw, splat(MAX_ALPHA));
-            const Floats weight = inside ? alpha * before : splat(0);
+            const Floats weight = where(inside, alpha * before);
             Floats own = splat(0);
             for (int c = 0; c < CHANNELS; c++) {
                 own += g[RED + c] * of_image[c][b];
@@ -331,7 +344,7 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
             through[b] = before - weight;
             // The gradient of the exponent: alpha times the gradient of alpha, 0 if alpha is clipped.
             const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
-            const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
+            const Floats of_exponent = where(less(raw, splat(MAX_ALPHA), inside), of_alpha * alpha);
             const Floats by_u = of_exponent * u, by_v = of_exponent * v;
             sums[SUM_G] += of_exponent;
             sums[SUM_U] += by_u, sums[SUM_V] += by_v;

@@ -1,15 +1,25 @@
 """Batches: each ray goes through the pixel whose colour it has."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from scipy import stats
+from torch import Tensor
 
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.data.dataset import Dataset, load_dataset
-from nerfloom.data.pixels.batch import composite, draw_batch, draw_from_images, gather_colors, gather_colors_reference
+from nerfloom.data.pixels.batch import (
+    composite,
+    draw_batch,
+    draw_from_images,
+    gather_colors,
+    gather_colors_reference,
+    view_colors,
+    view_colors_reference,
+)
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.dataparsers.blender import Blender
 from tests.kernels.compiled import needs_kernels
@@ -119,6 +129,25 @@ def test_compiled_and_torch_gather_the_same_colours(dataset: Dataset, channels: 
     for mine, theirs in zip(one, two, strict=True):
         torch.testing.assert_close(mine, theirs)
     assert (one[1] is None) == (channels == 3)
+
+
+@pytest.mark.parametrize("form", [pytest.param(view_colors, marks=needs_kernels), view_colors_reference])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_whole_image_is_composited_pixel_by_pixel(
+    form: Callable[..., tuple[Tensor, Tensor | None]], channels: int
+) -> None:
+    """All values of a byte, in an image larger than a thread's share."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.randint(256, (97, 190, channels), generator=generator).to(torch.uint8)
+    pixels[0, :128] = torch.arange(256).to(torch.uint8).view(128, 2).repeat(1, 2)[:, :channels]
+    behind = torch.tensor([0.25, 0.0, 1.0])
+    rgb, alpha = form(pixels.transpose(0, 1).contiguous().transpose(0, 1), behind)
+    shades = pixels.double() / 255
+    cover = shades[..., 3:] if channels == 4 else torch.ones(97, 190, 1, dtype=torch.double)
+    torch.testing.assert_close(rgb.double(), shades[..., :3] * cover + behind.double() * (1 - cover), atol=1e-6, rtol=0)
+    assert (alpha is None) == (channels == 3)
+    if alpha is not None:
+        torch.testing.assert_close(alpha.double(), cover[..., 0], atol=1e-7, rtol=0)
 
 
 def test_only_pixels_worth_drawing_are_drawn(dataset: Dataset) -> None:

@@ -23,10 +23,10 @@ from nerfloom.data.pixels.batch import (
     PixelBatch,
     ViewBatch,
     background_colors,
-    composite,
     draw_batch,
     known_distances,
     training_background,
+    view_colors,
 )
 from nerfloom.data.pixels.contradicted import STEPS_PER_LOOK, ContradictedTiles
 from nerfloom.data.pixels.stream import PixelStream
@@ -198,16 +198,15 @@ class ViewSource(BatchSource):
         dataset = self.dataset
         index = self._index(request.step)
         behind = background_colors(self.background, 1, dataset.device)[0]
-        rgba = dataset.image(index).float().div_(255)
-        alpha = rgba[..., 3] if rgba.shape[-1] == 4 else None
+        rgb, alpha = view_colors(dataset.image(index), behind)
         if index not in self._views:
             self._views[index] = View.of(dataset.cameras, index, dataset.times)
         view = self._views[index]
         kept = None
         if dataset.kept is not None:
             first, last = dataset.cameras.ends[index : index + 2]
-            kept = dataset.kept.mask(first, last).view(rgba.shape[:2])
-        return ViewBatch(index, view, composite(rgba, behind), behind, alpha, kept, self._distances(index))
+            kept = dataset.kept.mask(first, last).view(rgb.shape[:2])
+        return ViewBatch(index, view, rgb, behind, alpha, kept, self._distances(index))
 
     def _distances(self, index: int) -> Tensor | None:
         dataset = self.dataset

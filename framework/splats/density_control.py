@@ -43,19 +43,20 @@ class GradientMean(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("sums", torch.zeros(0, 2))
-        self._watched: Tensor | None = None
+        self._watched: tuple[Tensor, list[Tensor]] | None = None  # records, and their gradient after the backward pass
         self._longer_side = 1
 
     def watch(self, records: Tensor, camera: SplatCamera) -> None:
-        """Retain the gradient of an image's records; does nothing if they require none.
+        """Keep the gradient of an image's records; does nothing if they require none.
 
         Args:
             records: (N, RECORD) Gaussians on the image.
             camera: of the image.
         """
         if records.requires_grad:
-            records.retain_grad()
-            self._watched, self._longer_side = records, max(camera.width, camera.height)
+            gradients: list[Tensor] = []
+            records.register_hook(gradients.append)  # `retain_grad` would copy them
+            self._watched, self._longer_side = (records.detach(), gradients), max(camera.width, camera.height)
 
     @torch.no_grad()
     def add(self, finite: bool | Tensor = True) -> None:
@@ -64,12 +65,13 @@ class GradientMean(nn.Module):
         Args:
             finite: whether the step counts, possibly () bool on the device; nothing is added if it does not.
         """
-        records, self._watched = self._watched, None
-        if records is None or records.grad is None:
+        watched, self._watched = self._watched, None
+        if watched is None or not watched[1]:
             return
+        records, gradient = watched[0], watched[1][-1]
         if len(self.sums) != len(records):
             self.sums = records.new_zeros(len(records), 2)
-        sizes, shown = image_gradients(records.grad, self._longer_side), records[:, Record.OPACITY] > 0
+        sizes, shown = image_gradients(gradient, self._longer_side), records[:, Record.OPACITY] > 0
         if isinstance(finite, Tensor):
             sizes, shown = torch.where(finite, sizes, 0), shown & finite
         self.sums[:, 0] += sizes

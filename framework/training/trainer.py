@@ -291,7 +291,7 @@ class Trainer:
         batch, result = self._drawn_and_taken(request)
         self.source.learn(request, batch, result.loss.rgb)
         errors, weights = result.squared_errors, getattr(batch, "weights", None)
-        mse = errors.mean() if weights is None else (errors * weights).sum() / weights.sum().clamp(min=1e-6)
+        mse = errors.mean() if weights is None else (errors.mean(-1) * weights).sum() / weights.sum().clamp(min=1e-6)
         finite = result.finite if isinstance(result.finite, Tensor) else torch.full_like(mse, result.finite)
         num_rays = len(batch) * getattr(batch, "rays_per_pixel", 1)  # about as many in each process
         per_ray = result.loss.num_samples / max(num_rays, 1)

@@ -55,7 +55,7 @@ def truth(entries: int, features: int, steps: int) -> torch.Tensor:
     return torch.stack([p.detach() for p in singles])
 
 
-@pytest.mark.parametrize("features", [1, 2, 3, 4, 8, 16, 32, 48])
+@pytest.mark.parametrize("features", [1, 2, 3, 4, 5, 8, 16, 32, 45, 48])
 @pytest.mark.parametrize("update", [sparse_adam, sparse_adam_reference, MASKED])
 def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> None:
     entries, steps = 301, 60
@@ -73,7 +73,7 @@ def test_each_entry_sees_adam_on_its_own_gradients(update, features: int) -> Non
 
 
 @needs_kernels
-@pytest.mark.parametrize("features", [1, 2, 4, 16, 48])
+@pytest.mark.parametrize("features", [1, 2, 3, 4, 16, 45, 48])
 def test_compiled_equals_reference_far_into_a_run(features: int) -> None:
     """Counts beyond the table of corrections, a size that is not a multiple of a vector, tiny gradients, signed
     zeros."""
@@ -93,7 +93,7 @@ def test_compiled_equals_reference_far_into_a_run(features: int) -> None:
 
 
 @needs_kernels
-@pytest.mark.parametrize("features", [1, 2, 4, 8])
+@pytest.mark.parametrize("features", [1, 2, 3, 4, 8, 45])
 def test_an_entry_moves_alike_whatever_its_neighbours(features: int) -> None:
     """Entries in another order get the same bits: settled ones beside fresh ones, used ones beside unused ones."""
     entries = 512  # whole vectors
@@ -111,14 +111,15 @@ def test_an_entry_moves_alike_whatever_its_neighbours(features: int) -> None:
 
 
 @needs_kernels
-def test_threads_give_the_same_bits() -> None:
+@pytest.mark.parametrize("features", [2, 3, 45])
+def test_threads_give_the_same_bits(features: int) -> None:
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            state = tables(20_000, 2)
+            state = tables(20_000, features)
             for step in range(3):
-                sparse_adam(state[0], gradients(20_000, 2, step), *state[1:], 1e-2, BETAS, EPS)
+                sparse_adam(state[0], gradients(20_000, features, step), *state[1:], 1e-2, BETAS, EPS)
             found.append(state)
     finally:
         torch.set_num_threads(before)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import CAMERA_RAYS, Cameras, subpixels
 from nerfloom.cameras.rigid_motion import RIGID_MOTIONS
-from nerfloom.data.pixels.batch import GATHER_COLORS
+from nerfloom.data.pixels.batch import GATHER_COLORS, VIEW_COLORS
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums
 from nerfloom.geometry.rays import Rays, Samples
@@ -232,6 +232,7 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
     PHOTOMETRIC: lambda: (rand(13, 15, 3), rand(13, 15, 3), 0.2),
     SIMILARITY: lambda: (rand(13, 15, 3), rand(13, 15, 3), rand(3, 5) < 0.5, True),
     GATHER_COLORS: lambda: (torch.randint(256, (60, 4), dtype=torch.uint8), torch.randint(60, (9,)), rand(9, 3)),
+    VIEW_COLORS: lambda: (torch.randint(256, (7, 9, 4), dtype=torch.uint8), rand(3)),
     RIGID_MOTIONS: lambda: (torch.randn(9, 6), True),
     CAMERA_RAYS: lambda: (cameras(), torch.arange(0, 72, 5), 0.0, 1.0, None, subpixels(4)),
 }

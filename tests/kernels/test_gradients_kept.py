@@ -13,7 +13,7 @@ from torch import Tensor
 
 import nerfloom
 from nerfloom.cameras.cameras import Cameras, subpixels
-from nerfloom.data.pixels.batch import gather_colors, gather_colors_reference
+from nerfloom.data.pixels.batch import gather_colors, gather_colors_reference, view_colors, view_colors_reference
 from nerfloom.fields.base import Field
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points
@@ -448,6 +448,12 @@ OPERATIONS = {
         lambda behind: gather_colors_reference(COLORS, torch.arange(9), behind)[0],
         lambda: {"behind": rand(9, 3)},
         ("gather_colors",),
+    ),
+    "colours of a view": Operation(
+        lambda behind: view_colors(COLORS[None], behind)[0],
+        lambda behind: view_colors_reference(COLORS[None], behind)[0],
+        lambda: {"behind": rand(3)},
+        ("view_colors",),
     ),
 }  # fmt: skip
 COLORS = torch.randint(256, (9, 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels.native import SOURCES
-from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y, blend
+from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y, OPAQUE, blend
 from nerfloom.kernels.splats.project import Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import tile_lists
 from tests.kernels.compiled import needs_kernels, relative_error
@@ -92,6 +92,22 @@ def test_harmonics_of_each_degree(degree: int, harmonics: int) -> None:
     (gradient,) = torch.autograd.grad(drawn(ours, camera(20, 18), degree=degree).image.sum(), ours[5])
     assert not gradient[..., used:].any()
     assert bool(gradient[..., : min(used, harmonics)].any()) == bool(min(used, harmonics))
+
+
+@needs_kernels
+@pytest.mark.parametrize("count", [31, 32, 33, 150])
+def test_lists_that_end_before_and_behind_what_is_opaque(count: int) -> None:
+    """Blocks of pixels are found for 32 entries of a list at a time, and end one by one where no light is left."""
+    torch.manual_seed(11)
+    given, view = scene(count), camera(37, 21)
+    given[1] += 2
+    given[3] += 2
+    found = compared(given, view)
+    assert found.worst() < 1e-3, found
+    assert found.image < BOUND
+    assert found.share > 0.5
+    if count == 150:
+        assert float(drawn(given, view).transmittance.amin()) < OPAQUE
 
 
 @needs_kernels

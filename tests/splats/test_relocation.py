@@ -72,3 +72,15 @@ def test_gradients_are_those_of_the_images_since_the_last_change() -> None:
     assert float(found[0]) == 0
     assert float(found[2]) == pytest.approx(2 * float(found[1]))
     assert not bool(strategy.gradients.take(3).any())
+
+
+def test_only_the_image_that_is_watched_last_counts() -> None:
+    strategy, seen = Relocation(), splat_camera(camera(), 0.1)
+    first, second = (torch.ones(3, RECORD, requires_grad=True) * 1.0 for _ in range(2))
+    for shown in (first, second):
+        strategy.watch(shown, seen)
+    (5 * first + second * torch.tensor([0.0, 1.0, 2.0])[:, None]).sum().backward()
+    strategy.after_every_step(True)
+    found = strategy.gradients.take(3)
+    assert float(found[0]) == 0
+    assert float(found[2]) == pytest.approx(2 * float(found[1]))

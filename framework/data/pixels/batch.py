@@ -279,3 +279,41 @@ def _compiled(pixels: Tensor, flat: Tensor, behind: Tensor) -> tuple[Tensor, Ten
 
 
 _gather_colors = native.Function("gather_colors", "pqpqipppi")
+
+
+def view_colors_reference(pixels: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Compute `view_colors` of `pixels` and `behind` in PyTorch, on any device."""
+    rgba = pixels.float() / 255
+    return composite(rgba, behind), rgba[..., 3] if rgba.shape[-1] == 4 else None
+
+
+def view_colors(pixels: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Return the colours of a whole image over one background colour.
+
+    Args:
+        pixels: (H, W, 3 or 4) uint8 stored pixels; the fourth channel is straight alpha.
+        behind: (3,) background colour.
+
+    Returns:
+        Colours (H, W, 3), and opacities (H, W), or None for three channels.
+    """
+    return VIEW_COLORS((behind,), pixels, behind)
+
+
+VIEW_COLORS = Operation("view_colors", view_colors_reference)
+
+
+@VIEW_COLORS.implementation(CPP, order=0)
+def _compiled_view(pixels: Tensor, behind: Tensor) -> tuple[Tensor, Tensor | None]:
+    pixels, behind = pixels.contiguous(), behind.contiguous()  # kept until the kernel has read them
+    height, width, channels = pixels.shape
+    rgb, alpha = torch.empty(height, width, 3), torch.empty(height, width) if channels == 4 else None
+    _view_colors(
+        native.pointer(pixels, "the image", (height, width, channels), torch.uint8), height * width, channels,
+        native.pointer(behind, "the background", (3,)), rgb.data_ptr(), None if alpha is None else alpha.data_ptr(),
+        native.threads(),
+    )  # fmt: skip
+    return rgb, alpha
+
+
+_view_colors = native.Function("view_colors", "pqipppi")

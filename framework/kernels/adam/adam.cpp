@@ -41,6 +41,7 @@ EXPORT int adam_sparse(float* values, float* mean, float* square, float* grad, f
         const adam::Settings s(rate, beta1, beta2, eps);
         const auto run = features == 1   ? update_all<1>
                          : features == 2 ? update_all<2>
+                         : features == 3 ? update_all<3>
                          : features == 4 ? update_all<4>
                          : features == 8 ? update_all<8>
                                          : update_all<0>;

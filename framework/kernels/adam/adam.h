@@ -157,7 +157,36 @@ inline Ints update(float* values, float* mean, float* square, float* grad, float
     return any;
 }
 
-// A single entry, if fewer than LANES values are left or an entry has an odd number of features.
+// Vector V of the values of LANES entries, F of each, if all values of an entry are alike.
+template <int F, size_t V, typename Vector, size_t... I>
+inline Vector of_entries(Vector x, std::index_sequence<I...>) {
+#if defined(__clang__)
+    return __builtin_shufflevector(x, x, int((V * LANES + I) / F)...);
+#else
+    return __builtin_shuffle(x, Ints{int32_t((V * LANES + I) / F)...});
+#endif
+}
+
+// LANES entries of F values, which are F vectors; settled entries are not counted. Returns which had a gradient.
+template <int F, size_t... V>
+inline Ints update_entries(float* values, float* mean, float* square, float* grad, float* seen, const Settings& s,
+                           std::index_sequence<V...>) {
+    const auto lanes = std::make_index_sequence<LANES>();
+    const Ints any = each<Ints>(lanes, [&](size_t e) {
+        uint32_t bits[F], all = 0;
+        std::memcpy(bits, grad + e * F, sizeof bits);
+        for (int i = 0; i < F; i++) all |= bits[i];
+        return -int32_t((all & 0x7fffffff) != 0);
+    });
+    Floats unbias1 = splat(1), unbias2 = splat(1);
+    if (!all_settled<1>(seen, s)) count<1>(any, seen, unbias1, unbias2, s);
+    (move(values + V * LANES, mean + V * LANES, square + V * LANES, grad + V * LANES, of_entries<F, V>(any, lanes),
+          of_entries<F, V>(unbias1, lanes), of_entries<F, V>(unbias2, lanes), s),
+     ...);
+    return any;
+}
+
+// A single entry, if it has fewer than LANES values and is not among whole vectors of entries.
 inline int update_entry(float* values, float* mean, float* square, float* grad, float* seen, int features,
                         const Settings& s) {
     bool any = false;
@@ -174,16 +203,21 @@ inline int update_entry(float* values, float* mean, float* square, float* grad, 
     return 1;
 }
 
-// A single entry of whole vectors.
+// A single entry of LANES values or more. The last vector may begin within the one before it; a value moves once.
 inline int update_row(float* values, float* mean, float* square, float* grad, float* seen, int features,
                       const Settings& s) {
-    bool none = true;
-    for (int i = 0; i < features; i += LANES) none &= all_zero(grad + i);
+    const int last = features - LANES;
+    bool none = all_zero(grad + last);
+    for (int i = 0; i < last; i += LANES) none &= all_zero(grad + i);
     if (none) return 0;
     const size_t k = s.index(seen[0] += 1);
     const float unbias1 = s.unbias1[k], unbias2 = s.unbias2[k];
-    for (int i = 0; i < features; i += LANES)
-        move(values + i, mean + i, square + i, grad + i, Ints{} - 1, unbias1, unbias2, s);
+    int i = 0;
+    for (; i <= last; i += LANES) move(values + i, mean + i, square + i, grad + i, Ints{} - 1, unbias1, unbias2, s);
+    if (i < features) {
+        const Ints lane = each<Ints>(std::make_index_sequence<LANES>(), [](size_t of) { return int32_t(of); });
+        move(values + last, mean + last, square + last, grad + last, lane >= i - last, unbias1, unbias2, s);
+    }
     return 1;
 }
 
@@ -192,17 +226,28 @@ template <int F>
 int64_t update_range(float* values, float* mean, float* square, float* grad, float* seen, int64_t begin, int64_t end,
                      int features, const Settings& s) {
     int64_t touched = 0, e = begin;
-    if constexpr (F > 0 && F <= LANES) {
-        Ints updates{};  // of each lane
+    Ints updates{};  // of each lane
+    if constexpr (F > 0 && LANES % F == 0) {
         for (; e + LANES / F <= end; e += LANES / F) {
             const int64_t i = e * F;
             if (!all_zero(grad + i)) updates -= update<F>(values + i, mean + i, square + i, grad + i, seen + e, s);
         }
         for (int lane = 0; lane < LANES; lane += F) touched += updates[lane];
-    }
-    for (; F == 0 && features % LANES == 0 && e < end; e++) {
-        const int64_t i = e * features;
-        touched += update_row(values + i, mean + i, square + i, grad + i, seen + e, features, s);
+    } else if constexpr (F > 0) {
+        for (; e + LANES <= end; e += LANES) {
+            const int64_t i = e * F;
+            bool none = true;
+            for (int v = 0; v < F; v++) none &= all_zero(grad + i + v * LANES);
+            if (!none)
+                updates -= update_entries<F>(values + i, mean + i, square + i, grad + i, seen + e, s,
+                                             std::make_index_sequence<F>());
+        }
+        for (int lane = 0; lane < LANES; lane++) touched += updates[lane];
+    } else if (features >= LANES) {
+        for (; e < end; e++) {
+            const int64_t i = e * features;
+            touched += update_row(values + i, mean + i, square + i, grad + i, seen + e, features, s);
+        }
     }
     for (; e < end; e++) {
         const int64_t i = e * features;

@@ -77,3 +77,19 @@ EXPORT int gather_colors(const int64_t* flat, int64_t count, const uint8_t* pixe
         });
     });
 }
+
+// An image (count, channels) uint8 over one background (3). Writes the colours and, of 4 channels, the opacities.
+EXPORT int view_colors(const uint8_t* pixels, int64_t count, int channels, const float* background, float* rgb,
+                       float* alpha, int threads) {
+    return guarded([&] {
+        if (channels != 3 && channels != 4) throw std::invalid_argument("a pixel has 3 or 4 channels");
+        float shades[256];
+        for (int i = 0; i < 256; i++) shades[i] = float(i) / 255;
+        for_each(threads, count, 8192, [&](int64_t p) {
+            const uint8_t* pixel = pixels + p * channels;
+            const float cover = channels == 4 ? shades[pixel[3]] : 1;
+            for (int c = 0; c < 3; c++) rgb[p * 3 + c] = shades[pixel[c]] * cover + background[c] * (1 - cover);
+            if (channels == 4) alpha[p] = cover;
+        });
+    });
+}

@@ -1,15 +1,19 @@
 // Blending the Gaussians of each tile from front to back, forward and backward. See ../splat_blend.py.
 //
 // A tile of TILE x TILE pixels consists of blocks of LANES pixels, 4 across: a vector holds a block. For each Gaussian
-// of the tile's list, only the blocks that its box meets are evaluated.
+// of the tile's list, only the blocks that its ellipse meets are evaluated. They are found for TOGETHER entries before
+// these are blended: the loop over an entry's blocks then depends on memory alone, so that the processor goes on to the
+// next entries while it waits for square roots and quotients. The backward pass takes the blocks of the forward pass.
 #include "splats/splat.h"
 
-#include <vector>
+#include <algorithm>
 
 namespace {
 
 constexpr int ACROSS = 4, DOWN = LANES / ACROSS;  // pixels of a block
 constexpr int COLUMNS = TILE / ACROSS, ROWS = TILE / DOWN, BLOCKS = COLUMNS * ROWS;
+constexpr int64_t TOGETHER = 32;
+constexpr int64_t AHEAD = 8;  // entries whose memory is fetched before it is used
 
 #if defined(__AVX512F__)
 // 2^x for x in [-126, 0], to 2 units in the last place: 2^(k / 16) of the nearest sixteenth from a table in a register,
@@ -47,13 +51,28 @@ inline Floats power_of_two(Floats x) {
 }
 #endif
 
-// The lanes of a mask that are set, as bits.
-inline uint64_t bits(Ints mask) {
-#if defined(__AVX512DQ__)
-    return _mm512_movepi32_mask((__m512i)mask);
-#elif defined(__AVX512F__)
-    return _mm512_test_epi32_mask((__m512i)mask, (__m512i)mask);
-#elif defined(__AVX__)
+// The lanes where a comparison holds, among those of `within`. AVX-512 has registers of bits for them; compilers make
+// vectors of whole lanes of comparisons that are combined.
+#if defined(__AVX512F__)
+typedef __mmask16 Mask;
+constexpr Mask EVERYWHERE = 0xffff;
+inline Mask less(Floats a, Floats b, Mask within = EVERYWHERE) {
+    return _mm512_mask_cmp_ps_mask(within, (__m512)a, (__m512)b, _CMP_LT_OQ);
+}
+inline Mask at_most(Floats a, Floats b, Mask within = EVERYWHERE) {
+    return _mm512_mask_cmp_ps_mask(within, (__m512)a, (__m512)b, _CMP_LE_OQ);
+}
+inline Floats where(Mask mask, Floats value) { return (Floats)_mm512_maskz_mov_ps(mask, (__m512)value); }
+inline uint64_t bits(Mask mask) { return mask; }
+#else
+typedef Ints Mask;
+inline Mask less(Floats a, Floats b) { return a < b; }
+inline Mask less(Floats a, Floats b, Mask within) { return (a < b) & within; }
+inline Mask at_most(Floats a, Floats b) { return a <= b; }
+inline Mask at_most(Floats a, Floats b, Mask within) { return (a <= b) & within; }
+inline Floats where(Mask mask, Floats value) { return mask ? value : splat(0); }
+inline uint64_t bits(Mask mask) {
+#if defined(__AVX__)
     return uint32_t(_mm256_movemask_ps((__m256)mask));
 #elif defined(__SSE2__)
     return uint32_t(_mm_movemask_ps((__m128)mask));
@@ -63,14 +82,11 @@ inline uint64_t bits(Ints mask) {
     return set;
 #endif
 }
-
-// Whether a pixel of a block lets light through.
-inline bool lets_through(Floats through) {
-#if defined(__AVX512F__)
-    return _mm512_cmp_ps_mask((__m512)through, _mm512_set1_ps(OPAQUE), _CMP_GE_OQ) != 0;
-#else
-    return bits(through >= OPAQUE) != 0;
 #endif
+
+// Whether a pixel of a block lets light through, which is usual: as a branch, so that no later entry waits for it.
+inline bool lets_through(Floats through) {
+    return __builtin_expect_with_probability(bits(at_most(splat(OPAQUE), through)) != 0, true, 0.999);
 }
 
 // Blocks of a tile: bit TILE c + r is set for the block in column c whose first row of pixels is r.
@@ -82,55 +98,25 @@ constexpr Blocks FIRST_ROWS = ~Blocks(0) / ((Blocks(1) << DOWN) - 1);
 inline int first_of(Blocks blocks) { return __builtin_ctzll(blocks) / DOWN; }
 inline Blocks only(int b) { return Blocks(1) << (b * DOWN); }
 
-struct Offsets {  // of a block's pixels from its first
-    Floats x, y;
+// Offsets of a tile's pixels from its first.
+struct Offsets {
+    Floats x[BLOCKS], y[BLOCKS];
     Offsets() {
-        float across[LANES], down[LANES];
-        for (int i = 0; i < LANES; i++) across[i] = float(i % ACROSS), down[i] = float(i / ACROSS);
-        x = load(across), y = load(down);
-    }
-};
-
-// The blocks where a Gaussian reaches the centre of a pixel, and perhaps neighbouring ones.
-struct Reach {
-    Floats rows[TILE / LANES];  // of the tile's pixels
-    Reach() {
-        float numbers[TILE];
-        for (int i = 0; i < TILE; i++) numbers[i] = float(i);
-        for (int v = 0; v < TILE / LANES; v++) rows[v] = load(numbers + v * LANES);
-    }
-    // x, y: the tile's first pixel's centre, from the Gaussian's.
-    Blocks blocks(const float* g, float x, float y) const {
-        const float width = 1 / g[U_X], lean = g[U_Y] * width;
-        Blocks met = 0;
-        for (int v = 0; v < TILE / LANES; v++) {
-            // A row meets the ellipse from `first` to `last`, which are counted in pixels from the tile's first.
-            const Floats dy = rows[v] + y, of_v = g[V_Y] * dy, rest = g[CUT] - of_v * of_v;
-            const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
-            const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
-            const Floats first = middle - half, last = middle + half;
-            for (int c = 0; c < COLUMNS; c++)
-                met |= bits((rest > 0.0f) & (first <= float(c * ACROSS + ACROSS - 1)) & (last >= float(c * ACROSS)))
-                       << (c * TILE + v * LANES);
+        for (int b = 0; b < BLOCKS; b++) {
+            float across[LANES], down[LANES];
+            for (int i = 0; i < LANES; i++) {
+                across[i] = float(b / ROWS * ACROSS + i % ACROSS);
+                down[i] = float(b % ROWS * DOWN + i / ACROSS);
+            }
+            x[b] = load(across), y[b] = load(down);
         }
-        for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
-        return met & FIRST_ROWS;
     }
 };
 
-// What one Gaussian is at the pixels of a tile.
-struct Shape {
-    Floats u, v;  // at the offsets within a block, less its first pixel's
-    float u_x, u_y, v_y, cut, opacity;
-    Shape(const float* g, const Offsets& offset)
-        : u(g[U_X] * offset.x + g[U_Y] * offset.y), v(g[V_Y] * offset.y), u_x(g[U_X]), u_y(g[U_Y]), v_y(g[V_Y]),
-          cut(g[CUT]), opacity(g[OPACITY]) {}
-    // u^2 + v^2 at a block whose first pixel's centre is at (dx, dy) from the Gaussian's.
-    Floats squared(float dx, float dy) const {
-        const Floats a = u + (u_x * dx + u_y * dy), b = v + v_y * dy;
-        return a * a + b * b;
-    }
-};
+const Offsets& offsets_in_tile() {
+    static const Offsets offsets;
+    return offsets;
+}
 
 constexpr float LOG2_E = 1.44269504f;
 
@@ -175,33 +161,85 @@ struct Tile {
         std::memcpy(through, lanes, sizeof lanes);
         Blocks alive = 0;
         for (int b = 0; b < BLOCKS; b++)
-            if (bits(through[b] > 0.0f)) alive |= only(b);
+            if (bits(less(splat(0), through[b]))) alive |= only(b);
         return alive;
     }
 };
 
+// The blocks where a Gaussian reaches the centre of a pixel, and perhaps neighbouring ones.
+struct Reach {
+    Floats rows[TILE / LANES];  // of the tile's pixels
+    Reach() {
+        float numbers[TILE];
+        for (int i = 0; i < TILE; i++) numbers[i] = float(i);
+        for (int v = 0; v < TILE / LANES; v++) rows[v] = load(numbers + v * LANES);
+    }
+    Blocks blocks(const Tile& tile, const float* g) const {
+        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y], width = 1 / g[U_X], lean = g[U_Y] * width;
+        Blocks met = 0;
+        for (int v = 0; v < TILE / LANES; v++) {
+            // A row meets the ellipse from `first` to `last`, which are counted in pixels from the tile's first.
+            const Floats dy = rows[v] + y, of_v = g[V_Y] * dy, rest = g[CUT] - of_v * of_v;
+            const Floats middle = -lean * dy - x, rounding = magnitude(middle) * 1e-6f + 0.01f;
+            const Floats half = square_root(larger(rest, splat(0))) * width + rounding;
+            const Floats first = middle - half, last = middle + half;
+            const Mask rows_met = less(splat(0), rest);
+            for (int c = 0; c < COLUMNS; c++) {
+                const Mask begun = at_most(first, splat(c * ACROSS + ACROSS - 1), rows_met);
+                met |= bits(at_most(splat(c * ACROSS), last, begun)) << (c * TILE + v * LANES);
+            }
+        }
+        for (int down = 1; down < DOWN; down *= 2) met |= met >> down;  // a block has all that its rows have
+        return met & FIRST_ROWS;
+    }
+};
+
+// What one Gaussian is at the pixels of a tile.
+struct Shape {
+    float x, y;  // of the tile's first pixel's centre, from the Gaussian's
+    float u_x, u_y, v_y, cut, opacity;
+    Shape(const Tile& tile, const float* g)
+        : x(tile.left + 0.5f - g[X]), y(tile.top + 0.5f - g[Y]), u_x(g[U_X]), u_y(g[U_Y]), v_y(g[V_Y]), cut(g[CUT]),
+          opacity(g[OPACITY]) {}
+    // Where the offset from the tile's first pixel is (across, down).
+    Floats u(Floats across, Floats down) const { return u_x * (across + x) + u_y * (down + y); }
+    Floats v(Floats down) const { return v_y * (down + y); }
+    // Of u^2 + v^2.
+    Floats alpha(Floats q) const { return opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E); }
+};
+
+// Unless `blended` is null, it gets the blocks of each entry that is used.
 template <int CHANNELS>
 void forward_tile(const Tile& tile, const float* records, const int32_t* ids, int64_t entries, const float* background,
-                  float* image, float* through_image, float* median_image, int32_t* used) {
+                  float* image, float* through_image, float* median_image, Blocks* blended, int32_t* used) {
     alignas(64) Floats sum[CHANNELS][BLOCKS] = {}, through[BLOCKS], median[BLOCKS] = {};
-    const Offsets offset;
+    const Offsets& offset = offsets_in_tile();
     const Reach reach;
-    Blocks alive = tile.clear(through);
+    Blocks alive = tile.clear(through), met[TOGETHER];
     int64_t n = 0;
-    for (; n < entries && alive; n++) {
-        const float* g = records + int64_t(ids[n]) * RECORD;
-        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
-        const Shape shape(g, offset);
-        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
-            const int b = first_of(rest);
-            const Floats q = shape.squared(x + b / ROWS * ACROSS, y + b % ROWS * DOWN), before = through[b];
-            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
-            const Floats alpha = smaller(shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E), splat(MAX_ALPHA));
-            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
-            for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
-            if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
-            through[b] = after;
-            if (!lets_through(after)) alive &= ~only(b);
+    while (n < entries && alive) {
+        const int64_t first = n, end = std::min(entries, first + TOGETHER);
+        for (int64_t i = first; i < end; i++) {
+            if (i + AHEAD < entries) __builtin_prefetch(records + int64_t(ids[i + AHEAD]) * RECORD);
+            met[i - first] = reach.blocks(tile, records + int64_t(ids[i]) * RECORD);
+        }
+        for (; n < end && alive; n++) {
+            const float* g = records + int64_t(ids[n]) * RECORD;
+            const Shape shape(tile, g);
+            Blocks rest = met[n - first] & alive;
+            if (blended) blended[n] = rest;
+            for (; rest; rest &= rest - 1) {
+                const int b = first_of(rest);
+                const Floats u = shape.u(offset.x[b], offset.y[b]), v = shape.v(offset.y[b]);
+                const Floats q = u * u + v * v, before = through[b];
+                const Mask inside = at_most(splat(OPAQUE), before, less(q, splat(shape.cut)));
+                const Floats alpha = smaller(shape.alpha(q), splat(MAX_ALPHA));
+                const Floats weight = where(inside, alpha * before), after = before - weight;
+                for (int c = 0; c < CHANNELS; c++) sum[c][b] += weight * g[RED + c];
+                if (median_image) median[b] = ((before > 0.5f) & (after <= 0.5f)) ? splat(g[DISTANCE]) : median[b];
+                through[b] = after;
+                if (!lets_through(after)) alive &= ~only(b);
+            }
         }
     }
     *used = int32_t(n);
@@ -254,16 +292,20 @@ inline void sum_lanes(const Floats* v, float* out) {
 #endif
 }
 
-// Slots of the sums over a Gaussian's pixels that have no name among the record's.
-enum Sums { SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY, SUM_G, ABSOLUTE_X, ABSOLUTE_Y };
+// Slots of the sums over a Gaussian's pixels that have no name among the record's: of the exponent's gradient, of its
+// products with u and v, and of the magnitudes of the centre's gradients, which splat_gather multiplies by 2 U_X and 2.
+// u and v are of the order of 1, so that thin Gaussians lose no digits, as they would in moments of the offsets.
+enum Sums { SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_G, ABSOLUTE_X, ABSOLUTE_Y };
 
 template <int CHANNELS>
 void backward_tile(const Tile& tile, const float* records, const int32_t* ids, const int32_t* slots, int64_t entries,
-                   int64_t used, const float* image, const float* through_image, const float* image_grad,
-                   const float* through_grad, float* parts) {
+                   const Blocks* blended, int64_t used, const float* image, const float* through_image,
+                   const float* image_grad, const float* through_grad, float* parts) {
+    const auto clear = [&](int64_t n) { std::memset(parts + int64_t(slots[n]) * RECORD, 0, RECORD * sizeof(float)); };
+    for (int64_t n = used; n < entries; n++) clear(n);
+    if (used == 0) return;
     alignas(64) Floats of_image[CHANNELS][BLOCKS], shown[CHANNELS][BLOCKS], through[BLOCKS], behind[BLOCKS], last[BLOCKS];
-    const Offsets offset;
-    const Reach reach;
+    const Offsets& offset = offsets_in_tile();
     if (through_grad) {
         tile.read<1>(through_image, &last), tile.read<1>(through_grad, &behind);
         for (int b = 0; b < BLOCKS; b++) behind[b] *= last[b];
@@ -273,44 +315,44 @@ void backward_tile(const Tile& tile, const float* records, const int32_t* ids, c
     tile.read<CHANNELS>(image, shown), tile.read<CHANNELS>(image_grad, of_image);
     for (int c = 0; c < CHANNELS; c++)
         for (int b = 0; b < BLOCKS; b++) behind[b] += shown[c][b] * of_image[c][b];
-    Blocks alive = tile.clear(through);
+    tile.clear(through);
     for (int64_t n = 0; n < used; n++) {
+        if (n + AHEAD < used) {
+            __builtin_prefetch(records + int64_t(ids[n + AHEAD]) * RECORD);
+            __builtin_prefetch(parts + int64_t(slots[n + AHEAD]) * RECORD, 1);
+        }
+        if (!blended[n]) {
+            clear(n);
+            continue;
+        }
         const float* g = records + int64_t(ids[n]) * RECORD;
-        const float x = tile.left + 0.5f - g[X], y = tile.top + 0.5f - g[Y];
-        const Shape shape(g, offset);
+        const Shape shape(tile, g);
         Floats sums[RECORD] = {};
-        // Rows of the inverse covariance, for the absolute gradient of the centre.
-        const float xx = 2 * g[U_X] * g[U_X], xy = 2 * g[U_X] * g[U_Y], yy = 2 * (g[U_Y] * g[U_Y] + g[V_Y] * g[V_Y]);
-        for (Blocks rest = reach.blocks(g, x, y) & alive; rest; rest &= rest - 1) {
+        for (Blocks rest = blended[n]; rest; rest &= rest - 1) {
             const int b = first_of(rest);
-            const float block_x = x + b / ROWS * ACROSS, block_y = y + b % ROWS * DOWN;
-            const Floats q = shape.squared(block_x, block_y), before = through[b];
-            const Ints inside = (q < shape.cut) & (before >= OPAQUE);
-            const Floats raw = shape.opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E);
-            const Floats alpha = smaller(raw, splat(MAX_ALPHA));
-            const Floats weight = inside ? alpha * before : splat(0), after = before - weight;
+            const Floats u = shape.u(offset.x[b], offset.y[b]), v = shape.v(offset.y[b]);
+            const Floats q = u * u + v * v, before = through[b];
+            const Mask inside = at_most(splat(OPAQUE), before, less(q, splat(shape.cut)));
+            const Floats raw = shape.alpha(q), alpha = smaller(raw, splat(MAX_ALPHA));
+            const Floats weight = where(inside, alpha * before);
             Floats own = splat(0);
             for (int c = 0; c < CHANNELS; c++) {
                 own += g[RED + c] * of_image[c][b];
                 sums[RED + c] += weight * of_image[c][b];
             }
             behind[b] -= weight * own;
-            through[b] = after;
+            through[b] = before - weight;
             // The gradient of the exponent: alpha times the gradient of alpha, 0 if alpha is clipped.
             const Floats of_alpha = before * own - behind[b] / (1.0f - alpha);
-            const Floats of_exponent = (inside & (raw < MAX_ALPHA)) ? of_alpha * alpha : splat(0);
-            const Floats dx = offset.x + block_x, dy = offset.y + block_y;
-            const Floats by_x = of_exponent * dx, by_y = of_exponent * dy;
+            const Floats of_exponent = where(less(raw, splat(MAX_ALPHA), inside), of_alpha * alpha);
+            const Floats by_u = of_exponent * u, by_v = of_exponent * v;
             sums[SUM_G] += of_exponent;
-            sums[SUM_X] += by_x, sums[SUM_Y] += by_y;
-            sums[SUM_XX] += by_x * dx, sums[SUM_XY] += by_x * dy, sums[SUM_YY] += by_y * dy;
-            const Floats of_x = xx * by_x + xy * by_y, of_y = xy * by_x + yy * by_y;
-            sums[ABSOLUTE_X] += magnitude(of_x), sums[ABSOLUTE_Y] += magnitude(of_y);
-            if (!lets_through(after)) alive &= ~only(b);
+            sums[SUM_U] += by_u, sums[SUM_V] += by_v;
+            sums[SUM_UU] += by_u * u, sums[SUM_UV] += by_u * v, sums[SUM_VV] += by_v * v;
+            sums[ABSOLUTE_X] += magnitude(by_u), sums[ABSOLUTE_Y] += magnitude(shape.u_y * by_u + shape.v_y * by_v);
         }
         sum_lanes(sums, parts + int64_t(slots[n]) * RECORD);
     }
-    for (int64_t n = used; n < entries; n++) std::memset(parts + int64_t(slots[n]) * RECORD, 0, RECORD * sizeof(float));
 }
 
 void check_tile(const int32_t* offsets, int64_t tile, int64_t entries, const int32_t* ids, int64_t count) {
@@ -323,18 +365,19 @@ void check_tile(const int32_t* offsets, int64_t tile, int64_t entries, const int
 
 // The image (height, width, channels): colours over the background (3), then, of 4 channels, the sum of weight times
 // distance, and of 7 the sum of the normals. The transmittance (height, width). If median is not null, the distance at
-// which half of the light is gone, or 0. How many entries of each tile's list were used.
+// which half of the light is gone, or 0. How many entries of each tile's list were used and, if blended (entries) is not
+// null, in which blocks of the tile.
 EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids, int64_t entries,
                        int width, int height, int channels, const float* background, float* image, float* through,
-                       float* median, int32_t* used, int threads) {
+                       float* median, uint64_t* blended, int32_t* used, int threads) {
     return guarded([&] {
         const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
         for_chunks(threads, int64_t(columns) * rows, [&](int64_t t, int) {
             check_tile(offsets, t, entries, ids, count);
             const Tile tile(t, columns, width, height);
             const auto run = [&](auto forward) {
-                forward(tile, records, ids + offsets[t], offsets[t + 1] - offsets[t], background, image, through, median,
-                        used + t);
+                forward(tile, records, ids + offsets[t], offsets[t + 1] - offsets[t], background, image, through,
+                        median, blended ? blended + offsets[t] : nullptr, used + t);
             };
             if (channels == 3) run(forward_tile<3>);
             else if (channels == 4) run(forward_tile<4>);
@@ -347,8 +390,9 @@ EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offse
 // From the gradients of image and transmittance (the latter may be null) the sums of each entry, by slot.
 EXPORT int splat_blend_backward(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids,
                                 const int32_t* slots, int64_t entries, int width, int height, int channels,
-                                const float* image, const float* through, const int32_t* used, const float* image_grad,
-                                const float* through_grad, float* parts, int threads) {
+                                const float* image, const float* through, const uint64_t* blended,
+                                const int32_t* used, const float* image_grad, const float* through_grad, float* parts,
+                                int threads) {
     return guarded([&] {
         const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
         for_chunks(threads, int64_t(columns) * rows, [&](int64_t t, int) {
@@ -357,8 +401,8 @@ EXPORT int splat_blend_backward(const float* records, int64_t count, const int32
             if (used[t] > offsets[t + 1] - offsets[t]) bad_index(used[t], offsets[t + 1] - offsets[t], "entries used");
             const Tile tile(t, columns, width, height);
             const auto run = [&](auto backward) {
-                backward(tile, records, ids + offsets[t], slots + offsets[t], offsets[t + 1] - offsets[t], used[t],
-                         image, through, image_grad, through_grad, parts);
+                backward(tile, records, ids + offsets[t], slots + offsets[t], offsets[t + 1] - offsets[t],
+                         blended + offsets[t], used[t], image, through, image_grad, through_grad, parts);
             };
             if (channels == 3) run(backward_tile<3>);
             else if (channels == 4) run(backward_tile<4>);
@@ -375,20 +419,25 @@ EXPORT int splat_gather(const float* records, int64_t count, const int32_t* firs
         for_each(threads, count, 1024, [&](int64_t g) {
             const int64_t begin = firsts[g], end = firsts[g + 1];
             if (begin < 0 || end < begin || end > entries) bad_index(end, entries, "slots");
+            float* out = gradient + g * RECORD;
+            if (begin == end) {  // it may have no shape
+                std::memset(out, 0, RECORD * sizeof(float));
+                return;
+            }
             float s[RECORD] = {};
             for (int64_t slot = begin; slot < end; slot++)
                 for (int k = 0; k < RECORD; k++) s[k] += parts[slot * RECORD + k];
             const float* r = records + g * RECORD;
-            float* out = gradient + g * RECORD;
             std::memcpy(out, s, sizeof s);
-            const float by_u = r[U_X] * s[SUM_X] + r[U_Y] * s[SUM_Y];
-            out[X] = 2 * r[U_X] * by_u;
-            out[Y] = 2 * (r[U_Y] * by_u + r[V_Y] * r[V_Y] * s[SUM_Y]);
-            out[U_X] = -2 * (r[U_X] * s[SUM_XX] + r[U_Y] * s[SUM_XY]);
-            out[U_Y] = -2 * (r[U_X] * s[SUM_XY] + r[U_Y] * s[SUM_YY]);
-            out[V_Y] = -2 * r[V_Y] * s[SUM_YY];
+            // Offsets from the centre are dy = v / V_Y, dx = (u - U_Y dy) / U_X. Where U_X underflows, u is 0 as well.
+            const float per_u = r[U_X] != 0 ? 1 / r[U_X] : 0, per_v = r[V_Y] != 0 ? 1 / r[V_Y] : 0;
+            out[X] = 2 * r[U_X] * s[SUM_U];
+            out[Y] = 2 * (r[U_Y] * s[SUM_U] + r[V_Y] * s[SUM_V]);
+            out[U_X] = -2 * per_u * (s[SUM_UU] - r[U_Y] * per_v * s[SUM_UV]);
+            out[U_Y] = -2 * per_v * s[SUM_UV];
+            out[V_Y] = -2 * per_v * s[SUM_VV];
             out[OPACITY] = r[OPACITY] > 0 ? s[SUM_G] / r[OPACITY] : 0;
-            out[CUT] = s[ABSOLUTE_X], out[REACH_X] = s[ABSOLUTE_Y], out[REACH_Y] = 0;
+            out[CUT] = 2 * std::abs(r[U_X]) * s[ABSOLUTE_X], out[REACH_X] = 2 * s[ABSOLUTE_Y], out[REACH_Y] = 0;
         });
     });
 }

@@ -219,8 +219,8 @@ def blended_pairs(records: Tensor, lists: TileLists, width: int, height: int) ->
 
 BLEND = Operation("blend", blend_reference)
 BLEND.implementation(FEW_OPERATIONS, types=None, order=torch.inf)(_blend_together)
-_forward = native.Function("splat_blend", "pqppqiiipppppi")
-_backward = native.Function("splat_blend_backward", "pqpppqiiipppppp" + "i")
+_forward = native.Function("splat_blend", "pqppqiiippppppi")
+_backward = native.Function("splat_blend_backward", "pqpppqiiippppppp" + "i")
 _gather = native.Function("splat_gather", "pqpqppi")
 
 
@@ -232,14 +232,16 @@ class _Blend(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor | None]:  # fmt: skip
         image, through = records.new_empty(height, width, channels), records.new_empty(height, width)
         middle = records.new_empty(height, width) if median else None
+        blocks = torch.empty(len(lists.ids), dtype=torch.int64) if ctx.needs_input_grad[0] else None
         used = torch.empty(len(lists.offsets) - 1, dtype=torch.int32)
         _forward(
             native.pointer(records, "the records", (len(records), RECORD)), len(records), lists.offsets.data_ptr(),
             lists.ids.data_ptr(), len(lists.ids), width, height, channels,
             native.pointer(background, "the background", (3,)), image.data_ptr(), through.data_ptr(),
-            None if middle is None else middle.data_ptr(), used.data_ptr(), native.threads(),
+            None if middle is None else middle.data_ptr(), None if blocks is None else blocks.data_ptr(),
+            used.data_ptr(), native.threads(),
         )  # fmt: skip
-        ctx.save_for_backward(records, *lists[:4], image, through, used)
+        ctx.save_for_backward(records, *lists[:4], image, through, blocks, used)
         if middle is not None:
             ctx.mark_non_differentiable(middle)
         ctx.set_materialize_grads(False)
@@ -248,7 +250,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        records, offsets, ids, slots, firsts, image, through, used = ctx.saved_tensors
+        records, offsets, ids, slots, firsts, image, through, blocks, used = ctx.saved_tensors
         height, width, channels = image.shape
         of_image = torch.zeros_like(image) if grads[0] is None else grads[0].contiguous()
         of_through = None if grads[1] is None else grads[1].contiguous()
@@ -256,7 +258,7 @@ class _Blend(torch.autograd.Function):
         _backward(
             records.data_ptr(), len(records), offsets.data_ptr(), ids.data_ptr(),
             native.pointer(slots, "the slots, which lists `for_gradients` have,", (len(ids),), torch.int32), len(ids),
-            width, height, channels, image.data_ptr(), through.data_ptr(), used.data_ptr(),
+            width, height, channels, image.data_ptr(), through.data_ptr(), blocks.data_ptr(), used.data_ptr(),
             native.pointer(of_image, "the image's gradient", tuple(image.shape)),
             None if of_through is None else native.pointer(of_through, "the transmittance's", tuple(through.shape)),
             parts.data_ptr(), native.threads(),

@@ -69,5 +69,5 @@ class RunFlags(OpenFlags):
         from nerfloom.training.load import load
 
         given = self.load_checkpoint, self.device_type, self.data, data_format, self.up
-        detail = {"level_error": self.level_error, "memory_limit": self.memory_limit}
-        return load(found, *given, **detail, eval_rendering=self.eval_rendering, **settings)
+        detail = self.level_error, self.memory_limit
+        return load(found, *given, *detail, eval_rendering=self.eval_rendering, **settings)

@@ -42,7 +42,7 @@ WAITING = 32
 class Survey(NamedTuple):
     """The result of the first reading of a stream."""
 
-    count: int
+    drawable: int
     """Number of Gaussians that can be drawn."""
     left_out: int
     """Number of the others."""
@@ -72,7 +72,7 @@ def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size:
     if not MIN_CHUNK <= chunk_size <= MAX_CHUNK:
         raise FlagError(f"--chunk-size is {chunk_size}; it must be from {MIN_CHUNK} to {MAX_CHUNK:,}")
     found = survey(stream, rows_at_once(memory))
-    if not found.count:
+    if not found.drawable:
         raise DataError("there are no Gaussians to write, or none of them is finite; export or crop them again")
     row = row_size(found.degree, 32)
     if not memory >= (least := WAITING * chunk_size * row / 1e6):
@@ -81,7 +81,7 @@ def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size:
     shift = torch.zeros(3, dtype=torch.float64) if local is None else local
     with tempfile.TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as folder:
         sample = (found.sample - shift).float().numpy()
-        buckets = Buckets(Path(folder), sample, found.count, found.degree, int(memory * 1e6 / (COPIES * row)))
+        buckets = Buckets(Path(folder), sample, found.drawable, found.degree, int(memory * 1e6 / (COPIES * row)))
         buckets.fill(stream, shift, rows_at_once(memory))
 
         def write(out: BinaryIO) -> None:
@@ -127,7 +127,7 @@ def survey(stream: GaussianStream, rows: int) -> Survey:
 class _Node(NamedTuple):
     """A node that is written, for the node above it."""
 
-    index: int
+    number: int
     gaussians: Gaussians
     errors: Tensor
     low: Tensor
@@ -177,7 +177,7 @@ class _Tree:
         low = torch.stack([centers.amin(0), *(node.low for node in below)]).amin(0)
         high = torch.stack([centers.amax(0), *(node.high for node in below)]).amax(0)
         reach = max(float(reaches(gaussians).max()), *(node.reach for node in below), 0.0)
-        error, children = float(errors.max()), [node.index for node in below]
+        error, children = float(errors.max()), [node.number for node in below]
         index = self.writer.add(gaussians, children, low, high, reach, error)
         return _Node(index, gaussians, errors, low, high, reach)
 

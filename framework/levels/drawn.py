@@ -85,8 +85,8 @@ class DrawnLevels(Renderable):
         camera, shown = self._shown(view)
         picture = picture_of(shown, camera, view.stride, background, scale * self.scene.far, self.rasteriser)
         normals = picture.extras[NORMALS.name] @ rotation.to(picture.rgb)
-        depths = {"depth": picture.depth / scale, "median_depth": picture.median_depth / scale}
-        return replace(picture, **depths, extras={NORMALS.name: normals})
+        depth, median = picture.depth / scale, picture.median_depth / scale
+        return replace(picture, depth=depth, median_depth=median, extras={NORMALS.name: normals})
 
     @torch.no_grad()
     def render_rgb(self, view: View, background: Tensor) -> Tensor:

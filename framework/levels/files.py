@@ -114,7 +114,7 @@ class LevelsFile:
                 content = np.fromfile(stream, np.uint8, length, offset=self.starts[index])
         except OSError as error:
             raise DataError(f"cannot read {self.path}: {error.strerror or error}") from error
-        if len(content) < length or zlib.crc32(content) != self.checksums[index]:
+        if len(content) < length or zlib.crc32(content.data) != self.checksums[index]:
             raise DataError(f"{self.path}: chunk {index} is damaged; copy or export the file again")
         columns: dict[str, Tensor] = {}
         place = 0
@@ -262,6 +262,7 @@ def _checked(file: Path, header: dict[str, Any], begin: int) -> LevelsFile:
         raise ValueError(f"it has another version of the format than {VERSION}, the only one supported")
     if type(degree) is not int or degree not in DEGREES or type(bits) is not int or bits not in (16, 32):
         raise ValueError("its harmonics must have a degree from 0 to 3, and its numbers 16 or 32 bits")
+    width: Bits = 16 if bits == 16 else 32
     look = checked(Look, header.get("look"))
     if not MIN_BLUR <= look.blur <= MAX_BLUR:
         raise ValueError(f"its blur must be from {MIN_BLUR:g} to {MAX_BLUR:g} pixels^2")
@@ -281,11 +282,11 @@ def _checked(file: Path, header: dict[str, Any], begin: int) -> LevelsFile:
     if not (outward[above] >= outward[:-1]).all():
         raise ValueError("its nodes have larger boxes, extents or errors than those above them")
     nodes = Nodes(*map(torch.from_numpy, (counts, parents, low, high, reach, errors)))
-    starts = chunk_starts(counts.tolist(), degree, bits)
+    starts = chunk_starts(counts.tolist(), degree, width)
     if starts[-1] != begin:
         raise ValueError("its chunks do not end where its header begins")
     origin = torch.from_numpy(_floats(header, "origin", (3,)))
-    return LevelsFile(file, nodes, degree, bits, origin, look, starts, checksums.tolist())
+    return LevelsFile(file, nodes, degree, width, origin, look, starts, checksums.tolist())
 
 
 def _widths(degree: int) -> dict[str, int]:

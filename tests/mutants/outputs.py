@@ -62,8 +62,8 @@ MUTANTS = {
     ],
     "nerfloom.levels.drawn": [
         Mutant("levels-depth-in-units-of-the-file", "DrawnLevels.render_view",
-            "{'depth': picture.depth / A, 'median_depth': picture.median_depth / A}",
-            "{'depth': picture.depth, 'median_depth': picture.median_depth}",
+            "depth, median = (picture.depth / A, picture.median_depth / A)",
+            "depth, median = (picture.depth, picture.median_depth)",
             "depths of levels are in the unit of the file instead of the scene's",
             "levels/test_drawn.py::test_frames_of_file_and_scene_may_differ"),
     ],

@@ -58,8 +58,9 @@ SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
 """Samples per training step with an occupancy grid."""
 COLOR_LAYERS = 4
 """Hidden layers of the papers' colour network."""
-LEAST_ON_FLOOR = 0.05
-"""Minimum share of a reconstruction's points in the sphere that lie on a floor."""
+LEAST_ON_FLOOR, FLOOR_TOLERANCE = 0.05, 0.01
+"""Minimum share of a reconstruction's points in the sphere that lie on a floor, and their maximum distance from it,
+radii of the sphere."""
 LONGEST, EVERY = 4.0, 16
 """Maximum length of a training step, in steps of `num_steps`, and the number of training steps between its changes."""
 
@@ -316,7 +317,8 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
             return
         sphere, up = self.sphere.to(dataset.points), dataset.points.new_tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         near = dataset.points[(dataset.points - sphere[:3]).norm(dim=-1) < sphere[3]]
-        floor = find_floor(near, up, above=dataset.cameras.camera_to_worlds[:, :, 3])
+        eyes = dataset.cameras.camera_to_worlds[:, :, 3]
+        floor = find_floor(near, up, tolerance=FLOOR_TOLERANCE * float(sphere[3]), above=eyes)
         if floor is not None and floor.share >= LEAST_ON_FLOOR:
             distance.stand_on(floor.normal.to(sphere), floor.center.to(sphere))
             say(f"the first ball stands on a floor, where {floor.share:.0%} of {len(near):,} points lie")

@@ -61,6 +61,8 @@ ALIGNMENT = 64
 """Positions of chunks are multiples of this number of bytes."""
 MAX_HEADER = 2**26
 """Maximum length of a header, bytes. The header of 50 million Gaussians in chunks of 50,000 has about 0.5 MB."""
+MAX_NODES = 2**18
+"""Maximum number of nodes that are written. A header has at most 250 bytes for each."""
 LARGEST_HALF = 65504.0
 """Largest float16."""
 Bits = Literal[16, 32]

@@ -22,7 +22,7 @@ from nerfloom.base.console import track, track_bytes
 from nerfloom.base.errors import DataError, FlagError
 from nerfloom.geometry.local_origin import local_origin
 from nerfloom.kernels.splats.project import DEGREES, MIN_ALPHA
-from nerfloom.levels.buckets import Buckets, of_rows
+from nerfloom.levels.buckets import Buckets, drawable, of_rows
 from nerfloom.levels.files import MAX_NODES, Bits, LevelsWriter, row_size
 from nerfloom.levels.merging import halved
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
@@ -79,7 +79,7 @@ def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size:
         raise FlagError(f"--build-memory is {memory:g}; it must be more than 0 and finite, in MB")
     found = survey(stream, rows_at_once(memory))
     if not found.drawable:
-        raise DataError("there are no Gaussians to write, or none of them is finite; export or crop them again")
+        raise DataError("there are no Gaussians to write, or none of them can be drawn; export or crop them again")
     if chunk_size < (smallest := math.ceil(MOST_NODES * found.drawable / MAX_NODES)):
         raise FlagError(f"--chunk-size is {chunk_size}; {found.drawable:,} Gaussians need at least {smallest:,}")
     row = row_size(found.degree, 32)
@@ -122,7 +122,7 @@ def survey(stream: GaussianStream, rows: int) -> Survey:
     keys, sample = torch.zeros(0), torch.zeros(0, 3, dtype=torch.float64)
     with track_bytes("Reading the Gaussians", None) as advance:
         for given in stream.parts(rows):
-            part = given[given.drawable()]
+            part = given[drawable(given)]
             total, count, terms = total + len(given), count + len(part), max(terms, part.harmonics.shape[2])
             keys = torch.cat([keys, torch.rand(len(part), generator=random)])
             sample = torch.cat([sample, part.means.double()])

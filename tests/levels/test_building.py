@@ -79,13 +79,16 @@ def test_many_at_one_place_and_few_of_them(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_drawn_is_left_out(tmp_path: Path) -> None:
-    given = cloud(500)
+    """A centre in float64 may be finite and too far away for float32."""
+    given = Gaussians.of({**cloud(500).columns, "means": cloud(500).means.double()})
     given.means[3] = torch.nan
+    given.means[5] = 1e300
     given.rotations[7] = 0
     given.log_scales[9] = 1000.0
+    given.log_scales[11] = 88.0
     stream = GaussianStream.of(Splats(given, OURS))
-    assert build_levels(tmp_path / "x.levels", stream, ORIGIN, CHUNK, 32, 0.5) == 3
-    assert read_levels(tmp_path / "x.levels").num_gaussians == 497
+    assert build_levels(tmp_path / "x.levels", stream, ORIGIN, CHUNK, 32, 0.5) == 5
+    assert read_levels(tmp_path / "x.levels").num_gaussians == 495
     nothing = GaussianStream.of(Splats(given[3:4], OURS))
     with pytest.raises(DataError, match="no Gaussians"):
         build_levels(tmp_path / "none.levels", nothing, ORIGIN, CHUNK, 32, 0.5)

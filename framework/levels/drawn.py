@@ -123,8 +123,8 @@ class DrawnLevels(Renderable):
             records.append(projected.records[visible])
             if projected.keys is not None:
                 keys.append(projected.keys[visible])
-        by_distance = len(keys) < len(records)
-        return camera, Projected(torch.cat(records), None if by_distance else torch.cat(keys))
+        # Chunks have no keys if they are sorted by distance.
+        return camera, Projected(torch.cat(records), torch.cat(keys) if len(keys) == len(records) else None)
 
     def _report(self, cut: Cut) -> None:
         """Say if the memory makes the level error larger than before."""

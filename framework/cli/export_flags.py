@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from nerfloom.base.changed import refuse
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.region_flags import RegionFlags
 from nerfloom.cli.run_flags import RunFlags
@@ -97,6 +98,7 @@ class LevelsFlags(LevelsSettings, RegionFlags, ExportFlags):
             return
         if self.data is not None or data_format is not None or self.up is not None:
             raise ConfigError("a file of Gaussians keeps its frame as levels: leave out --data, --up and the format")
+        refuse({"load_checkpoint": self.load_checkpoint, **self.changes()}, "a file of Gaussians")
         export_file_levels(found, path, self, self.regions())
 
 

@@ -55,13 +55,18 @@ class RunFlags(OpenFlags):
     """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
     the surface. Default: the run's setting."""
 
+    def changes(self) -> dict[str, Any]:
+        """Return the changed settings of what is opened, by name; None for its own value."""
+        names = ("level_error", "memory_limit", "eval_rendering")
+        return {name: getattr(self, name) for name in names}
+
     def load(self, found: Path, data_format: DataFormat | None = None, **settings: Any) -> Loaded:
         """Load the run or the file that `check` has found.
 
         Args:
             found: the result of `check`.
             data_format: data format for a file, with its flags; None to detect it.
-            settings: further changed settings of a run, by name; None for the run's own value.
+            settings: further changed settings, as in `changes`.
 
         Raises:
             ConfigError, CheckpointError, DataError: if it cannot be used.
@@ -69,5 +74,4 @@ class RunFlags(OpenFlags):
         from nerfloom.training.load import load
 
         given = self.load_checkpoint, self.device_type, self.data, data_format, self.up
-        detail = self.level_error, self.memory_limit
-        return load(found, *given, *detail, eval_rendering=self.eval_rendering, **settings)
+        return load(found, *given, **self.changes(), **settings)

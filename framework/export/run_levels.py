@@ -91,7 +91,7 @@ def _write(
     kept = GaussianStream(_within(stream.parts, origin, regions), stream.look)
     left_out = build_levels(path, kept, origin, settings.chunk_size, settings.bits, settings.build_memory)
     if left_out:
-        say(f"{left_out:,} Gaussians are not finite and are left out")
+        say(f"{left_out:,} Gaussians cannot be drawn and are left out")
     write_scale(path, scale)
     found = read_levels(path)
     size = path.stat().st_size / 1e6

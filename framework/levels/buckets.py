@@ -6,6 +6,7 @@ points. A bucket has the Gaussians of a cell.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +22,14 @@ from nerfloom.splats.stream import GaussianStream
 
 WIDTHS = (3, 3, 4, 1, 3)
 """Numbers of a Gaussian in a row before the harmonics: mean, log scales, rotation, logit and colour."""
+LARGEST = 1e18
+"""Largest coordinate and standard deviation of a Gaussian. The squares of lengths are then finite in float32."""
+
+
+def drawable(gaussians: Gaussians) -> Tensor:
+    """Return (N,) whether N `gaussians` can be drawn, with float32 centres, and merged."""
+    near = (gaussians.means.abs() <= LARGEST).all(1) & (gaussians.log_scales <= math.log(LARGEST)).all(1)
+    return gaussians.drawable() & near
 
 
 class Buckets:
@@ -61,7 +70,7 @@ class Buckets:
         """
         with track_bytes("Dividing the Gaussians", 4 * self.width * self.count) as advance:
             for part in stream.parts(rows):
-                table = as_rows(part[part.drawable()], shift, DEGREES[self.degree])
+                table = as_rows(part[drawable(part)], shift, DEGREES[self.degree])
                 buckets = bucket_of(table[:, :3], self.axes, self.values)
                 table = table[buckets.argsort(kind="stable")]
                 ends = np.bincount(buckets, minlength=len(self)).cumsum()

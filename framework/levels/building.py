@@ -8,6 +8,7 @@ level.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -21,8 +22,8 @@ from nerfloom.base.console import track, track_bytes
 from nerfloom.base.errors import DataError, FlagError
 from nerfloom.geometry.local_origin import local_origin
 from nerfloom.kernels.splats.project import DEGREES, MIN_ALPHA
-from nerfloom.levels.buckets import Buckets, of_rows
-from nerfloom.levels.files import Bits, LevelsWriter, row_size
+from nerfloom.levels.buckets import Buckets, drawable, of_rows
+from nerfloom.levels.files import MAX_NODES, Bits, LevelsWriter, row_size
 from nerfloom.levels.merging import halved
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.stream import GaussianStream
@@ -37,6 +38,9 @@ COPIES = 8
 """Memory for building, in sizes of a full bucket: halving a bucket copies it, and the rest is for chunks."""
 WAITING = 32
 """Memory for building, at least, in sizes of a chunk: one of each level waits, and merging makes copies of two."""
+MOST_NODES = 6
+"""Maximum number of nodes for the Gaussians of a full chunk. A leaf is at least half full, unless it is a bucket; there
+are at most as many buckets as full chunks, and fewer nodes above leaves than leaves."""
 
 
 class Survey(NamedTuple):
@@ -65,15 +69,19 @@ def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size:
         memory: maximum memory for Gaussians, MB (1e6 bytes), besides that of the stream.
 
     Raises:
-        FlagError: if the chunk size or the memory is out of range.
+        FlagError: if the chunk size or the memory is out of range, or too small for the Gaussians.
         DataError: if no Gaussian can be drawn, or the stream cannot be read.
         OSError: if a file cannot be written.
     """
     if not MIN_CHUNK <= chunk_size <= MAX_CHUNK:
         raise FlagError(f"--chunk-size is {chunk_size}; it must be from {MIN_CHUNK} to {MAX_CHUNK:,}")
+    if not 0 < memory < math.inf:
+        raise FlagError(f"--build-memory is {memory:g}; it must be more than 0 and finite, in MB")
     found = survey(stream, rows_at_once(memory))
     if not found.drawable:
-        raise DataError("there are no Gaussians to write, or none of them is finite; export or crop them again")
+        raise DataError("there are no Gaussians to write, or none of them can be drawn; export or crop them again")
+    if chunk_size < (smallest := math.ceil(MOST_NODES * found.drawable / MAX_NODES)):
+        raise FlagError(f"--chunk-size is {chunk_size}; {found.drawable:,} Gaussians need at least {smallest:,}")
     row = row_size(found.degree, 32)
     if not memory >= (least := WAITING * chunk_size * row / 1e6):
         raise FlagError(f"--build-memory is {memory:g}; chunks of {chunk_size:,} Gaussians need at least {least:g} MB")
@@ -114,7 +122,7 @@ def survey(stream: GaussianStream, rows: int) -> Survey:
     keys, sample = torch.zeros(0), torch.zeros(0, 3, dtype=torch.float64)
     with track_bytes("Reading the Gaussians", None) as advance:
         for given in stream.parts(rows):
-            part = given[given.drawable()]
+            part = given[drawable(given)]
             total, count, terms = total + len(given), count + len(part), max(terms, part.harmonics.shape[2])
             keys = torch.cat([keys, torch.rand(len(part), generator=random)])
             sample = torch.cat([sample, part.means.double()])

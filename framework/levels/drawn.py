@@ -123,7 +123,8 @@ class DrawnLevels(Renderable):
             records.append(projected.records[visible])
             if projected.keys is not None:
                 keys.append(projected.keys[visible])
-        return camera, Projected(torch.cat(records), torch.cat(keys) if camera.by_depth else None)
+        # Chunks have no keys if they are sorted by distance.
+        return camera, Projected(torch.cat(records), torch.cat(keys) if len(keys) == len(records) else None)
 
     def _report(self, cut: Cut) -> None:
         """Say if the memory makes the level error larger than before."""

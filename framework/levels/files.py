@@ -61,6 +61,8 @@ ALIGNMENT = 64
 """Positions of chunks are multiples of this number of bytes."""
 MAX_HEADER = 2**26
 """Maximum length of a header, bytes. The header of 50 million Gaussians in chunks of 50,000 has about 0.5 MB."""
+MAX_NODES = 2**18
+"""Maximum number of nodes that are written. A header has at most 250 bytes for each."""
 LARGEST_HALF = 65504.0
 """Largest float16."""
 Bits = Literal[16, 32]
@@ -115,7 +117,10 @@ class LevelsFile:
         except OSError as error:
             raise DataError(f"cannot read {self.path}: {error.strerror or error}") from error
         if len(content) < length or zlib.crc32(content.data) != self.checksums[index]:
-            raise DataError(f"{self.path}: chunk {index} is damaged; copy or export the file again")
+            raise DataError(
+                f"{self.path}: chunk {index} is damaged, or the file has changed since it was opened; open it again, or"
+                " copy or export it again"
+            )
         columns: dict[str, Tensor] = {}
         place = 0
         for name, width in _widths(self.degree).items():
@@ -269,7 +274,7 @@ def _checked(file: Path, header: dict[str, Any], begin: int) -> LevelsFile:
     counts = _integers(header, "count", None)
     total = len(counts)
     if not total or not (counts >= 1).all() or int(counts.max()) > begin:
-        raise ValueError("each node must have Gaussians, and no more than the file has bytes")
+        raise ValueError("each node must have Gaussians ('count'), and no more than the file has bytes")
     checksums, parents = _integers(header, "crc32", total), _integers(header, "parent", total)
     low, high = _floats(header, "low", (total, 3)), _floats(header, "high", (total, 3))
     reach, errors = _floats(header, "reach", (total,)), _floats(header, "error", (total,))
@@ -308,10 +313,12 @@ def _for_half(gaussians: Gaussians) -> Gaussians:
 
 def _integers(header: dict[str, Any], name: str, count: int | None) -> np.ndarray:
     """Return integers (count,) int64 of a header."""
-    values = _array(header, name, None)
-    if values.ndim != 1 or values.dtype.kind != "i" or (count is not None and len(values) != count):
+    values = header.get(name)
+    # Types are checked first, because an array of texts takes the size of the longest for each.
+    integers = isinstance(values, list) and all(type(value) is int for value in values)
+    if not integers or len(values) != (len(values) if count is None else count):
         raise ValueError(f"its '{name}' must be a list of integers, one for each node")
-    return values.astype(np.int64)
+    return _array(header, name, np.int64)
 
 
 def _floats(header: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -322,7 +329,7 @@ def _floats(header: dict[str, Any], name: str, shape: tuple[int, ...]) -> np.nda
     return values
 
 
-def _array(header: dict[str, Any], name: str, kind: type | None) -> np.ndarray:
+def _array(header: dict[str, Any], name: str, kind: type) -> np.ndarray:
     try:
         return np.array(header.get(name), kind)
     except (ValueError, TypeError, OverflowError) as error:

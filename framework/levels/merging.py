@@ -41,8 +41,8 @@ def halved(gaussians: Gaussians, errors: Tensor) -> tuple[Gaussians, Tensor]:
 
     Args:
         gaussians: N Gaussians without further columns, all drawable.
-        errors: (N,) error of each, scene units: the largest standard deviation of a Gaussian that was merged into it,
-            or 0 if none was.
+        errors: (N,) error of each, in the unit of the centres: the largest standard deviation of a merged Gaussian, of
+            itself and of those that were merged into it; 0 if it is not merged.
 
     Returns:
         M Gaussians and (M,) their errors; M is at most N / 2 for N of at least 8.

@@ -47,11 +47,15 @@ def tangents(camera: Cameras, blur: float) -> Tensor:
 def in_view(nodes: Nodes, camera: SplatCamera, tangents: Tensor) -> Tensor:
     """Return (M,) bool, whether an image may show a Gaussian of a node or of those below it.
 
+    An image of directions all around may show any node.
+
     Args:
         nodes: M nodes.
         camera: the camera in the frame of the nodes.
         tangents: (2, 2) range of its directions, from `tangents`.
     """
+    if camera.all_around:
+        return torch.ones(len(nodes), dtype=torch.bool)
     pose = camera.pose.cpu().double()
     corner = torch.cartesian_prod(*[torch.tensor([False, True])] * 3)
     corners = torch.where(corner, nodes.high[:, None], nodes.low[:, None])  # (M, 8, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from nerfloom.base.changed import changed, refuse
 from nerfloom.base.errors import ConfigError
 from nerfloom.blocks.files import is_blocks_file
 from nerfloom.levels.files import is_levels_file
@@ -28,8 +29,6 @@ def load(
     data: Path | None = None,
     data_format: DataFormat | None = None,
     up: Axis | None = None,
-    level_error: float | None = None,
-    memory_limit: float | None = None,
     **settings: Any,
 ) -> Loaded:
     """Load a trained run, a scene in blocks, a file of Gaussians or of levels of them, or an octree.
@@ -43,21 +42,18 @@ def load(
         data: folder of the data, if a run's has moved; optional data for a file.
         data_format: data format for a file, with its flags; None to detect it.
         up: up axis of a file of Gaussians without data; None for z.
-        level_error: largest error of a file of levels, pixels; None for the default.
-        memory_limit: memory for the Gaussians of a file of levels, MB; None for the default.
-        settings: changed settings of a run, by name, as in `rays_per_pixel=4`; None for the run's own value.
+        settings: changed settings by name, of a run (as in `rays_per_pixel=4`) or of a file of levels
+            (`DetailSettings`); None for its own value.
 
     Raises:
         ConfigError: if settings are missing or do not fit.
         CheckpointError: if there is no readable checkpoint, or it does not fit the settings.
         DataError: if the file or the data cannot be read.
     """
-    detail = {"level_error": level_error, "memory_limit": memory_limit}
     if is_levels_file(path):
-        _refuse("levels of detail", {"load_checkpoint": checkpoint, **settings})
-        given = {name: value for name, value in detail.items() if value is not None}
-        return load_levels(path, data, data_format, device_type, up, DetailSettings(**given))
-    _refuse("what has no levels of detail (.levels)", detail)
+        what = "levels of detail"
+        refuse({"load_checkpoint": checkpoint}, what)
+        return load_levels(path, data, data_format, device_type, up, changed(DetailSettings(), settings, what))
     is_octree = is_octree_file(path)
     if not is_octree and not is_splat_file(path):
         if data_format is not None:
@@ -66,19 +62,12 @@ def load(
             raise ConfigError("--up is for files of Gaussians: the run knows which way is up; leave it out")
         if is_blocks_file(path):
             refused = {"load_checkpoint": checkpoint, "eval_appearance": settings.pop("eval_appearance", None)}
-            _refuse("a scene in blocks", refused)
+            refuse(refused, "a scene in blocks")
             return load_blocks(path, device_type, data, **settings)
         return load_trained(path, checkpoint, device_type, data, **settings)
-    _refuse("an octree" if is_octree else "a file of Gaussians", {"load_checkpoint": checkpoint, **settings})
+    refuse({"load_checkpoint": checkpoint, **settings}, "an octree" if is_octree else "a file of Gaussians")
     if is_octree:
         if up is not None:
             raise ConfigError("--up is for files of Gaussians: an octree knows which way is up; leave it out")
         return load_octree(path, data, data_format, device_type)
     return load_splats(path, data, data_format, device_type, up)
-
-
-def _refuse(what: str, useless: dict[str, Any]) -> None:
-    """Raise ConfigError if a setting that has no effect with what is loaded is given."""
-    for name, value in useless.items():
-        if value is not None:
-            raise ConfigError(f"--{name.replace('_', '-')} has no effect with {what}: leave it out")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from nerfloom.base.changed import changed
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import choose_device
-from nerfloom.base.errors import CheckpointError, ConfigError, NerfloomError, one_line
+from nerfloom.base.errors import CheckpointError, NerfloomError, one_line
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import read_scale
 from nerfloom.data.scene import Scene
@@ -50,7 +50,7 @@ def load_trained(
     """
     run = read_run(config_path)
     config = dataclasses.replace(
-        _changed(run.config, run.method, settings),
+        changed(run.config, settings, run.method),
         machine=dataclasses.replace(run.config.machine, device_type=device_type),
         data=run.config.data if data is None else find_data(data, run.dataparser)[0],
     )
@@ -84,15 +84,6 @@ def load_parameters(run: Run, checkpoint: Path | None = None) -> Loaded:
     step = state.get("step") if isinstance(state, dict) else None
     loaded = Loaded(model, placement, run.method, run.folder, path, step if isinstance(step, int) else 0, run)
     return loaded.scaled(read_scale(run.folder))
-
-
-def _changed(config: TrainConfig, method: str, settings: Mapping[str, Any]) -> TrainConfig:
-    """Return a config with the `settings` that are not None; raise ConfigError if the method has no such settings."""
-    given = {name: value for name, value in settings.items() if value is not None}
-    for name in given:
-        if not hasattr(config, name):
-            raise ConfigError(f"--{name.replace('_', '-')} has no effect with {method}: leave it out")
-    return dataclasses.replace(config, **given)
 
 
 def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:

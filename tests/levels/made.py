@@ -1,6 +1,7 @@
 """Clouds of Gaussians, files of levels made of them, and cameras that look at them."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.scene import Scene
+from nerfloom.geometry.lenses import panorama
 from nerfloom.levels.building import build_levels
 from nerfloom.levels.files import Bits, LevelsFile, read_levels
 from nerfloom.splats.gaussians import Gaussians, Splats
@@ -58,3 +60,13 @@ def camera(distance: float = 3.0, model: str = "pinhole", turn: float = 0.0, siz
     length, middle, pixels = torch.tensor([float(size)]), torch.tensor([size / 2]), torch.tensor([size])
     lens = torch.tensor([LENSES[model]]) if model in LENSES else None
     return Cameras(pose, length, length, middle, middle, pixels, pixels, model, lens)
+
+
+def all_around(model: str, distance: float) -> Cameras:
+    """A camera, placed as `camera` does, that sees what is beside and behind it: a panorama, or an ideal fisheye."""
+    if model == "fisheye":  # 2.3 radians from the axis at the middle of an edge
+        length = torch.tensor([14.0])
+        return replace(camera(distance, "fisheye", turn=0.5), fx=length, fy=length, lens=None)
+    fx, fy, cx, cy = (torch.tensor([value]) for value in panorama(64, 32))
+    sides = {"widths": torch.tensor([64]), "heights": torch.tensor([32])}
+    return replace(camera(distance, turn=0.5), fx=fx, fy=fy, cx=cx, cy=cy, model="equirectangular", **sides)

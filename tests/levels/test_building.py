@@ -1,5 +1,6 @@
 """Building out of core: every Gaussian is in one leaf, boxes and errors hold, and the memory is bounded."""
 
+import math
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -78,20 +79,36 @@ def test_many_at_one_place_and_few_of_them(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_drawn_is_left_out(tmp_path: Path) -> None:
-    given = cloud(500)
+    """A centre in float64 may be finite and too far away for float32."""
+    given = Gaussians.of({**cloud(500).columns, "means": cloud(500).means.double()})
     given.means[3] = torch.nan
+    given.means[5] = 1e300
     given.rotations[7] = 0
     given.log_scales[9] = 1000.0
+    given.log_scales[11] = 88.0
     stream = GaussianStream.of(Splats(given, OURS))
-    assert build_levels(tmp_path / "x.levels", stream, ORIGIN, CHUNK, 32, 0.5) == 3
-    assert read_levels(tmp_path / "x.levels").num_gaussians == 497
+    assert build_levels(tmp_path / "x.levels", stream, ORIGIN, CHUNK, 32, 0.5) == 5
+    assert read_levels(tmp_path / "x.levels").num_gaussians == 495
     nothing = GaussianStream.of(Splats(given[3:4], OURS))
     with pytest.raises(DataError, match="no Gaussians"):
         build_levels(tmp_path / "none.levels", nothing, ORIGIN, CHUNK, 32, 0.5)
-    for chunk_size, memory, flag in ((5, 0.5, "--chunk-size"), (CHUNK, 0.1, "--build-memory")):
+    wrong = [(5, 0.5, "--chunk-size"), *((CHUNK, memory, "--build-memory") for memory in (0.1, 0.0, np.nan, np.inf))]
+    for chunk_size, memory, flag in wrong:
         with pytest.raises(FlagError, match=flag):
             build_levels(tmp_path / "none.levels", stream, ORIGIN, chunk_size, 32, memory)
     assert list(tmp_path.iterdir()) == [tmp_path / "x.levels"]
+
+
+def test_a_file_has_no_more_nodes_than_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of nodes is known only afterwards, and is at most the one that is expected."""
+    stream = GaussianStream.of(Splats(cloud(1000), OURS))
+    for chunk_size, memory in ((16, 0.1), (100, 0.5)):
+        monkeypatch.setattr(building, "MAX_NODES", math.ceil(building.MOST_NODES * 1000 / chunk_size))
+        build_levels(tmp_path / "x.levels", stream, ORIGIN, chunk_size, 32, memory)
+        assert len(read_levels(tmp_path / "x.levels").nodes) <= building.MAX_NODES
+        monkeypatch.setattr(building, "MAX_NODES", building.MAX_NODES // 2)
+        with pytest.raises(FlagError, match="1,000 Gaussians need at least"):
+            build_levels(tmp_path / "x.levels", stream, ORIGIN, chunk_size, 32, memory)
 
 
 def test_parts_of_other_degrees_and_far_from_the_origin(tmp_path: Path) -> None:

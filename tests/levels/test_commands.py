@@ -141,6 +141,8 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, shared_tiny: Path, refused
     said = refused(eval_command.main, levels, "--data", shared_tiny, "--memory-limit", 0.001)
     assert "--memory-limit is 0.001 MB" in said
     assert "leave out --data" in refused(export_command.main, "levels", file, *out, "--data", shared_tiny)
+    said = refused(export_command.main, "levels", file, *out, "--level-error", 2)
+    assert said == "error: --level-error has no effect with a file of Gaussians: leave it out"
     assert "--chunk-size is 3" in refused(export_command.main, "levels", file, *out, "--chunk-size", 3, status=2)
     assert "--build-memory" in refused(export_command.main, "levels", file, *out, "--build-memory", 1, status=2)
     assert "has no Gaussians" in refused(export_command.main, "gaussian-splat", levels, *out)

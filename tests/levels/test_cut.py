@@ -10,7 +10,7 @@ from nerfloom.levels.nodes import Nodes
 from nerfloom.levels.on_image import in_view, sizes_on_image, tangents
 from nerfloom.splats.drawing import splat_camera
 from nerfloom.splats.rasteriser import RASTERISER
-from tests.levels.made import built, camera, cloud, leaves
+from tests.levels.made import all_around, built, camera, cloud, leaves
 
 ALL = 10**9
 CAMERAS = [
@@ -20,6 +20,8 @@ CAMERAS = [
     camera(1.2, "opencv", turn=0.3),
     camera(0.8, "fisheye", turn=-0.4),
     camera(3.0, turn=3.1),
+    all_around("equirectangular", 0.5),
+    all_around("fisheye", 0.5),
 ]
 
 

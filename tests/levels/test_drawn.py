@@ -19,7 +19,7 @@ from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.transform import transformed
-from tests.levels.made import FAR, built, camera, cloud, scene
+from tests.levels.made import FAR, all_around, built, camera, cloud, scene
 
 BLACK = torch.zeros(3)
 SAME = Placement.of(None, 1.0)
@@ -52,6 +52,20 @@ def test_error_0_is_the_picture_of_all_gaussians(tmp_path: Path, look: Look, mod
         assert float((found.rgb - expected.rgb).abs().max()) < 2 / 255
         assert levels.error == 0
         torch.testing.assert_close(levels.render_rgb(view, BLACK), found.rgb, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("look", [OURS, Look(sort="depth")])
+@pytest.mark.parametrize("model", ["fisheye", "equirectangular"])
+def test_what_is_behind_is_in_a_picture_of_all_directions(tmp_path: Path, look: Look, model: str) -> None:
+    """Sorted by distance, whatever the Gaussians were trained with, from a place among them and one beside them."""
+    levels = drawn(built(tmp_path / "x.levels", cloud(), look=look), 0.0)
+    plain = DrawnGaussians(cloud(), look, scene())
+    for distance in (0.3, 3.0):
+        view = View(all_around(model, distance))
+        found, expected = levels.render_view(view, BLACK), plain.render_view(view, BLACK)
+        assert float(expected.accumulation.mean()) > 0.01
+        for name in ("rgb", "accumulation"):
+            assert float((found.of(name) - expected.of(name)).abs().mean()) < 1e-3, name
 
 
 def test_frames_of_file_and_scene_may_differ(file: LevelsFile) -> None:

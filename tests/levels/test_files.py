@@ -130,6 +130,7 @@ HOSTILE: list[tuple[str, Callable[[dict[str, Any]], Any]]] = [
     ("'count'", grown("count", 0, 2**70)),
     ("'count'", grown("count", 0, 1.5)),
     ("'count'", grown("count", 0, [1])),
+    ("'count'", lambda header: header.update(count=["x" * 10**6] + 10**6 * [""])),  # 4 TB as an array
     ("must have Gaussians", grown("count", 0, 0)),
     ("must have Gaussians", grown("count", 0, -5)),
     ("'count'", lambda header: header.update(count=[])),

@@ -67,6 +67,11 @@ MUTANTS = {
             "depths of levels are in the unit of the file instead of the scene's",
             "levels/test_drawn.py::test_frames_of_file_and_scene_may_differ"),
     ],
+    "nerfloom.levels.on_image": [
+        Mutant("levels-ahead-alone", "in_view", "camera.all_around", "False",
+            "panoramas of levels show nothing of what is behind the camera",
+            "levels/test_drawn.py::test_what_is_behind_is_in_a_picture_of_all_directions"),
+    ],
     "nerfloom.levels.merging": [
         Mutant("levels-weights-without-size", "merged", "torch.sigmoid(A) * grouped(B)", "torch.sigmoid(A)",
             "small Gaussians count as much as large ones where they are merged",

@@ -1,0 +1,42 @@
+"""Settings with some values changed by name, where a value without effect is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from nerfloom.base.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def changed(settings: T, given: Mapping[str, Any], what: str) -> T:
+    """Return settings with the given values.
+
+    Args:
+        settings: a dataclass.
+        given: new values by name; None keeps a value.
+        what: what the settings are of, for the message.
+
+    Raises:
+        ConfigError: if there is no setting of a name.
+    """
+    new = {name: value for name, value in given.items() if value is not None}
+    refuse({name: value for name, value in new.items() if not hasattr(settings, name)}, what)
+    return dataclasses.replace(settings, **new)  # type: ignore[type-var]
+
+
+def refuse(useless: Mapping[str, Any], what: str) -> None:
+    """Refuse values that have no effect.
+
+    Args:
+        useless: the values by the name of their flag, with underscores; None for one that is not given.
+        what: what they have no effect with, for the message.
+
+    Raises:
+        ConfigError: if a value is given.
+    """
+    for name, value in useless.items():
+        if value is not None:
+            raise ConfigError(f"--{name.replace('_', '-')} has no effect with {what}: leave it out")

@@ -206,11 +206,11 @@ class Adam:
         moments = state["exp_avg"], state["exp_avg_sq"], state["seen"]
         betas, eps = group["betas"], group["eps"]
         updated: int | Tensor = 0
-        if deferred is not None and deferred.pending:
+        if deferred is not None and deferred.pending and parameter.grad is None:
             updated = deferred.adam(parameter, *moments, group["lr"], betas, eps)
-        if parameter.grad is not None and parameter.numel():  # a table may have no columns
-            rate = self._rate(index, parameter.device)
-            updated += sparse_adam(parameter, parameter.grad, *moments, rate, betas, eps, found_inf)
+        elif self.has_gradient(parameter) and parameter.numel():  # a table may have no columns
+            rate, gradient = self._rate(index, parameter.device), self.gradient(parameter)
+            updated = sparse_adam(parameter, gradient, *moments, rate, betas, eps, found_inf)
         self._count(updated, len(parameter))
 
     def _count(self, updated: int | Tensor, there: int) -> None:

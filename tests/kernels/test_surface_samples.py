@@ -134,6 +134,15 @@ def test_the_first_shape_is_the_union_of_a_ball_and_a_half_space() -> None:
     torch.testing.assert_close(first_distance(network, positions, alone)[0], ball)
 
 
+def test_the_first_shape_keeps_its_digits_under_autocast() -> None:
+    """Which rounds products of matrices to bfloat16."""
+    network, _, positions, shape, _ = given(1.0)
+    truth = first_distance(network, positions, shape)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = first_distance(network, positions, shape)
+    assert all(torch.equal(one, other) for one, other in zip(found, truth, strict=True))
+
+
 @needs_kernels
 def test_gradients_become_unit_vectors() -> None:
     """Of any length, 0 too; the other features stay."""

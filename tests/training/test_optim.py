@@ -112,3 +112,22 @@ def test_a_gradient_that_no_step_took_is_gone_at_the_next() -> None:
     encoding(torch.rand(20, 3)).sum().backward()
     optimizer.step()
     assert not torch.equal(encoding.table, before)
+
+
+def test_a_gradient_that_waits_and_one_of_autograd_are_one_step() -> None:
+    """As where a table is looked up, and is a term of the loss itself too: Adam takes their sum."""
+    found = []
+    for waits in (True, False):
+        torch.manual_seed(0)
+        encoding, points = HashGrid(3, 2, 4, 16, 8, True), torch.rand(20, 3)
+        if not waits:
+            encoding.deferred = None
+        deferred = {} if encoding.deferred is None else {encoding.table: encoding.deferred}
+        optimizer = Adam([{"params": [encoding.table], "sparse": True}], deferred, 0.1, (0.9, 0.99), 1e-8)
+        for _ in range(2):
+            optimizer.zero_grad()
+            (encoding(points).sum() + encoding.table.square().sum()).backward()
+            optimizer.step()
+        found.append((encoding.table.detach(), optimizer.entries))
+    torch.testing.assert_close(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]

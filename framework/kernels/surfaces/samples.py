@@ -70,7 +70,9 @@ def first_distance(network: Tensor, positions: Tensor, first: FirstShape) -> tup
     """
     offsets = positions - first.centre
     lengths = (offsets.square().sum(-1) + first.rounding**2).sqrt()
-    normal, heights = first.floor[:3], positions @ first.floor[:3] - first.floor[3]
+    normal = first.floor[:3]
+    # Products and sums, because autocast would round a matrix product to bfloat16.
+    heights = (positions * normal).sum(-1) - first.floor[3]
     lower = heights < lengths - first.radius
     distances = torch.where(lower, heights, lengths - first.radius) + first.size * network[:, 0]
     gradients = torch.where(lower[:, None], normal, offsets / lengths[:, None])

@@ -46,7 +46,7 @@ class Page:
         self._curve: Any = None
         self._heading = server.gui.add_markdown("")
         if queue.second is not None:
-            server.gui.add_markdown(f"right of the divider:  \n{heading(queue.second.loaded)}")
+            server.gui.add_markdown(f"right of the divider:  \n{heading(queue.second)}")
         with server.gui.add_folder("Learning curve", expand_by_default=False):
             self._place_of_curve = server.gui.add_folder(None)
         self.refresh()

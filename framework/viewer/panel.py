@@ -31,7 +31,7 @@ class Panel:
     def __init__(self, client: viser.ClientHandle, queue: RenderQueue) -> None:
         self._client, self._queue = client, queue
         scene = queue.loaded.model.scene
-        both = [queue.loaded, *(() if queue.second is None else (queue.second.loaded,))]
+        both = [queue.loaded, *(() if queue.second is None else (queue.second,))]
         declared = [output.name for output in both[0].model.outputs if output in both[-1].model.outputs]
         has_photographs = queue.loaded.source is not None and not scene.warped
         self._outputs = [*OUTPUTS[:-1], *declared, *(OUTPUTS[-1:] if has_photographs else ())]

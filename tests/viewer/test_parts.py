@@ -6,6 +6,7 @@ import json
 import math
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import imageio.v3 as iio
@@ -30,6 +31,7 @@ from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.checkpoint import list_checkpoints
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.run import Run
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.crop import CroppedCameras, picture_within
@@ -186,6 +188,17 @@ def test_elsewhere_there_is_no_truth(photographs: Photographs) -> None:
     matrix = list(pose.matrix)
     matrix[3] += 0.1
     assert photographs.at(dataclasses.replace(pose, matrix=tuple(matrix))) is None
+
+
+def test_of_a_camera_that_stood_still_the_time_chooses_the_photograph(shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path)
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path)
+    times = torch.tensor([0.0, 0.5, 1.0, 0.2])
+    parsed = dataclasses.replace(run.parse("train")[torch.tensor([3, 3, 3, 5])], times=times)
+    still = Photographs(cast(Run, SimpleNamespace(parse=lambda split: parsed)), lambda: trainer.model)
+    pose = at(still, 0)
+    assert [still.at(pose, time) for time in (0.0, 0.2, 0.3, 0.6, 0.9)] == [0, 0, 1, 1, 2]
+    assert still.at(at(still, 3), 1.0) == 3  # of its camera there is one
 
 
 def test_small_pictures(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.viewer.camera_panel import plain
-from nerfloom.viewer.commands import Commands
+from nerfloom.viewer.commands import Commands, follow
 
 if TYPE_CHECKING:
     import viser
@@ -51,14 +51,16 @@ class CommandPanel:
             if percent is not None:
                 self._bar.value = float(percent)
 
+        process = self._commands.start(module, arguments)
+        if process is None:
+            self._note.content = "Another command is running; wait until it has ended."
+            return
         self._file, self._download.visible = None, False
         self._bar.value, self._bar.visible = 0.0, True
         self._note.content = "Starting ..."
-        status = self._commands.run(module, arguments, tell)
+        status = follow(process, tell)
         self._bar.visible = False
-        if status is None:
-            self._note.content = "Another command is running; wait until it has ended."
-        elif status:
+        if status:
             self._note.content = plain(last) if last.startswith("error: ") else "It failed; see the terminal."
         else:
             self._offer(written())

@@ -4,12 +4,15 @@ import os
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from nerfloom.export.kinds import KINDS
 from nerfloom.viewer import commands
-from nerfloom.viewer.commands import Commands
+from nerfloom.viewer.command_panel import CommandPanel
+from nerfloom.viewer.commands import Commands, follow
 from nerfloom.viewer.export_panel import CHOICES, newest
 from tests.patience import until
 
@@ -37,8 +40,9 @@ def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("status", [0, 3])
 def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) -> None:
     told: list[tuple[str, int | None]] = []
-    found = Commands().run(PRINTS, [status], lambda line, percent: told.append((line, percent)))
-    assert found == status
+    process = Commands().start(PRINTS, [status])
+    assert process is not None
+    assert follow(process, lambda line, percent: told.append((line, percent))) == status
     assert told == [
         ("42 frames take long", None),
         ("Rendering: 34 %, 41 of 120, 12 s left often", 34),
@@ -50,20 +54,19 @@ def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
-    running, told, ended = Commands(), list[str](), list[int | None]()
+    running, told, ended = Commands(), list[str](), list[int]()
 
     def run(file: Path) -> threading.Thread:
         told.clear()
-        words = [file]
-        thread = threading.Thread(
-            target=lambda: ended.append(running.run(WAITS, words, lambda line, _: told.append(line)))
-        )
+        process = running.start(WAITS, [file])
+        assert process is not None
+        thread = threading.Thread(target=lambda: ended.append(follow(process, lambda line, _: told.append(line))))
         thread.start()
         until(lambda: told)
         return thread
 
     first = run(tmp_path / "end")
-    assert running.run(PRINTS, [0], lambda line, _: told.append(line)) is None
+    assert running.start(PRINTS, [0]) is None
     (tmp_path / "end").touch()
     first.join()
     assert ended == [0]
@@ -71,8 +74,50 @@ def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
     second = run(tmp_path / "never")
     running.close()
     second.join()
-    assert ended[1] not in (0, None)
+    assert ended[1] != 0
     running.close()  # nothing is left to stop
+    assert running.start(PRINTS, [0]) is None  # and nothing begins that would outlive the viewer
+
+
+class Screen:
+    """The controls of a browser, and what it downloads."""
+
+    def __init__(self) -> None:
+        self.gui, self.sent = self, list[tuple[str, bytes]]()
+
+    def add_progress_bar(self, value: float, visible: bool) -> SimpleNamespace:
+        self.bar = SimpleNamespace(value=value, visible=visible)
+        return self.bar
+
+    def add_markdown(self, content: str) -> SimpleNamespace:
+        self.note = SimpleNamespace(content=content)
+        return self.note
+
+    def add_button(self, label: str, visible: bool = True) -> SimpleNamespace:
+        self.button = SimpleNamespace(visible=visible, on_click=lambda action: setattr(self, "press", action))
+        return self.button
+
+    def add_dropdown(self, label: str, options: list[str], initial_value: str) -> SimpleNamespace:
+        return SimpleNamespace(value=initial_value)
+
+    def send_file_download(self, name: str, content: bytes, save_immediately: bool) -> None:
+        self.sent.append((name, content))
+
+
+def test_a_second_press_leaves_the_progress_of_the_first(tmp_path: Path) -> None:
+    running, screen, file = Commands(), Screen(), tmp_path / "splat.ply"
+    file.write_bytes(b"ply")
+    panel = CommandPanel(cast(Any, screen), running)
+    first = threading.Thread(target=lambda: panel.run(WAITS, [tmp_path / "end"], lambda: file))
+    first.start()
+    until(lambda: screen.note.content == "begun")
+    panel.run(PRINTS, [0], lambda: file)
+    assert screen.note.content.startswith("Another command is running")
+    assert screen.bar.visible
+    (tmp_path / "end").touch()
+    first.join()
+    assert "Wrote splat.ply" in screen.note.content
+    assert (screen.bar.visible, screen.button.visible) == (False, True)
 
 
 def test_every_kind_and_format_is_offered() -> None:

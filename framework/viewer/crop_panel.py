@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable
 from functools import partial
 from itertools import combinations, product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -159,26 +158,16 @@ class CropPanel:
         crop = self.crop()
         return None if crop is None else crop.box.moved(*self._loaded().placement.original_similarity())
 
-    def write(self) -> Path | None:
-        """Write the box to the run's folder, and return its file; None if there is no crop.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
+    def _save(self) -> None:
+        """Write the box to the run's folder."""
         region, file = self.region(), self._loaded().folder / FILE
         if region is None:
-            return None
-        write_region(file, region)
-        return file
-
-    def _save(self) -> None:
+            self._note.content = "There is no box: the crop is off, or a lowest coordinate is not below the highest."
+            return
         try:
-            file = self.write()
+            write_region(file, region)
         except OSError as error:
             self._note.content = f"Cannot write {FILE}: {error.strerror or error}"
-            return
-        if file is None:
-            self._note.content = "Switch the crop on first."
             return
         say(f"viewer: saved {file}; ns-export and ns-edit take it: --region {shlex.quote(str(file))}")
         self._note.content = f"Saved {FILE}; ns-export and ns-edit take it as --region."

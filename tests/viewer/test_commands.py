@@ -10,10 +10,11 @@ from typing import Any, cast
 import pytest
 
 from nerfloom.export.kinds import KINDS
+from nerfloom.geometry.regions import Box, Region, read_region
 from nerfloom.viewer import commands
 from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands, follow
-from nerfloom.viewer.export_panel import CHOICES, newest
+from nerfloom.viewer.export_panel import CHOICES, ExportPanel, newest
 from tests.patience import until
 
 PRINTS = """
@@ -118,6 +119,36 @@ def test_a_second_press_leaves_the_progress_of_the_first(tmp_path: Path) -> None
     first.join()
     assert "Wrote splat.ply" in screen.note.content
     assert (screen.bar.visible, screen.button.visible) == (False, True)
+
+
+def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
+    """What is saved in the run's folder stays as it is. Data that has moved is not asked for."""
+    boxes, screen = [Box((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0)), Box((0.0, 0.0, 0.0), (3.0, 3.0, 3.0))], Screen()
+    read, files = list[Region](), list[Path]()
+
+    def start(module: str, words: list[Any]) -> None:
+        flags = dict(zip(words[2::2], words[3::2], strict=True))
+        assert "--data" not in flags
+        files.append(flags["--region"])
+        read.append(read_region(files[-1]))
+
+    source = SimpleNamespace(config=SimpleNamespace(data=tmp_path / "gone"))
+    model = SimpleNamespace(device=SimpleNamespace(type="cpu"))
+    loaded = SimpleNamespace(model=model, folder=tmp_path, origin=tmp_path, run=source)
+    left = boxes.copy()
+    given: list[Any] = [
+        screen,
+        lambda: loaded,
+        lambda: None,
+        SimpleNamespace(region=lambda: left.pop(0)),
+        SimpleNamespace(start=start),
+    ]
+    panel = ExportPanel(*given)
+    panel._export()
+    panel._export()
+    assert read == boxes
+    assert not any(file.exists() for file in files)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_kind_and_format_is_offered() -> None:

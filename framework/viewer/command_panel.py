@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +20,8 @@ MAX_DOWNLOAD = 2**29
 class CommandPanel:
     """A bar, a line of text and a button of one browser.
 
-    Only the file that its last command has written is sent. A browser cannot name a file.
+    Only the file that its last command has written is sent. A browser cannot name a file. It receives the file once:
+    what is on its way is in memory, and a browser could ask again and again, and read nothing.
 
     Args:
         client: the browser.
@@ -29,6 +31,7 @@ class CommandPanel:
     def __init__(self, client: viser.ClientHandle, commands: Commands) -> None:
         self._client, self._commands = client, commands
         self._file: Path | None = None
+        self._lock = threading.Lock()
         self._bar = client.gui.add_progress_bar(0.0, visible=False)
         self._note = client.gui.add_markdown("")
         self._download = client.gui.add_button("Download", visible=False)
@@ -72,13 +75,16 @@ class CommandPanel:
             self._file, self._download.visible = file, True
 
     def _send(self) -> None:
-        """Send the file."""
-        file = self._file
+        """Send the file, unless it has been sent."""
+        with self._lock:
+            file, self._file = self._file, None
         if file is None:
             return
+        self._download.visible = False
         try:
             content = file.read_bytes()
         except OSError as error:
             self._note.content = f"Cannot read {plain(file.name)}: {error.strerror or error}"
             return
         self._client.send_file_download(file.name, content, save_immediately=True)
+        self._note.content = f"Sent {plain(file.name)}; it is also kept with the run."

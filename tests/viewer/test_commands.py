@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -83,6 +84,8 @@ def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
 class Screen:
     """The controls of a browser, and what it downloads."""
 
+    press: Callable[[Any], None]
+
     def __init__(self) -> None:
         self.gui, self.sent = self, list[tuple[str, bytes]]()
 
@@ -119,6 +122,19 @@ def test_a_second_press_leaves_the_progress_of_the_first(tmp_path: Path) -> None
     first.join()
     assert "Wrote splat.ply" in screen.note.content
     assert (screen.bar.visible, screen.button.visible) == (False, True)
+
+
+def test_a_file_is_sent_once(tmp_path: Path) -> None:
+    """Each download holds the file in memory until the browser has read it."""
+    screen, file = Screen(), tmp_path / "splat.ply"
+    file.write_bytes(b"ply")
+    panel = CommandPanel(cast(Any, screen), Commands())
+    screen.press(None)  # before there is any
+    panel.run(PRINTS, [0], lambda: file)
+    for _ in range(3):
+        screen.press(None)
+    assert screen.sent == [("splat.ply", b"ply")]
+    assert not screen.button.visible
 
 
 def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:

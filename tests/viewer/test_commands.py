@@ -25,6 +25,10 @@ print("Rendering: 34 %, 41 of 120, 12 s left", os.environ["NERFLOOM_PROGRESS"], 
 print("error: the disk is full", file=sys.stderr)
 sys.exit(int(sys.argv[1]))
 """
+IS_A_TERMINAL = """
+from nerfloom.base.console import console, say
+say(str(console.is_terminal))
+"""
 WAITS = """
 import os, sys, time
 print("begun", file=sys.stderr, flush=True)
@@ -53,6 +57,17 @@ def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) 
     said = capsys.readouterr().err
     assert "the disk is full" in said
     assert "Rendering" not in said  # the page shows it
+
+
+@pytest.mark.parametrize("variable", ["FORCE_COLOR", "TTY_COMPATIBLE"])
+def test_progress_comes_as_lines_whatever_the_terminal_is_said_to_be(
+    variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, "1")
+    told, process = list[str](), Commands().start(IS_A_TERMINAL, [])
+    assert process is not None
+    assert follow(process, lambda line, _: told.append(line)) == 0
+    assert told == ["False"]
 
 
 def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:

@@ -70,8 +70,9 @@ class CommandPanel:
 
     def _offer(self, file: Path) -> None:
         size = file.stat().st_size
-        self._note.content = f"Wrote {plain(file.name)}, {size / 1e6:.2f} MB."
-        if size <= MAX_DOWNLOAD:
+        limit = "" if size <= MAX_DOWNLOAD else f" It is not sent: that is above {MAX_DOWNLOAD / 1e6:.0f} MB."
+        self._note.content = f"Wrote {plain(file.name)}, {size / 1e6:.2f} MB.{limit}"
+        if not limit:
             self._file, self._download.visible = file, True
 
     def _send(self) -> None:

@@ -76,6 +76,11 @@ class Panel:
         index = self._outputs.index(one_of(self._output.value, self._outputs))
         self._output.value = self._outputs[(index + 1) % len(self._outputs)]
 
+    def show_time(self, time: float | None) -> None:
+        """Show a moving scene at a `time` in [0, 1]; None for no change."""
+        if self._time is not None and time is not None:
+            self._time.value = time
+
     # -- requests ---------------------------------------------------------------------------------------------
 
     def _ask(self) -> None:

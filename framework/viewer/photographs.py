@@ -101,6 +101,11 @@ class Photographs:
             return math.radians(60)
         return 2 * math.atan(0.5 * float(cameras.heights[index]) / float(cameras.fy[index]))
 
+    def time(self, index: int) -> float | None:
+        """Return the time of image `index` in [0, 1]; None in a static scene."""
+        times = None if self.parsed is None else self.parsed.times
+        return None if times is None else float(times[index])
+
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return a thumbnail (H, W, 3) uint8 of image `index`, over white; None if the file cannot be read."""
         with self._lock:

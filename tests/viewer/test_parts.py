@@ -7,7 +7,7 @@ import math
 import time
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import imageio.v3 as iio
 import numpy as np
@@ -34,6 +34,7 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.training.run import Run
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.crop import CroppedCameras, picture_within
 from nerfloom.viewer.crop_panel import FACES, edges, middle, outward
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
@@ -190,12 +191,28 @@ def test_elsewhere_there_is_no_truth(photographs: Photographs) -> None:
     assert photographs.at(dataclasses.replace(pose, matrix=tuple(matrix))) is None
 
 
-def test_of_a_camera_that_stood_still_the_time_chooses_the_photograph(shared_tiny: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def still(shared_tiny: Path, tmp_path: Path) -> Photographs:
+    """Three photographs of one place and one of another, at several times."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path)
     run = tiny_run("instant-ngp", shared_tiny, tmp_path)
-    times = torch.tensor([0.0, 0.5, 1.0, 0.2])
+    times = torch.tensor([0.0, 0.5, 1.0, 0.25])
     parsed = dataclasses.replace(run.parse("train")[torch.tensor([3, 3, 3, 5])], times=times)
-    still = Photographs(cast(Run, SimpleNamespace(parse=lambda split: parsed)), lambda: trainer.model)
+    return Photographs(cast(Run, SimpleNamespace(parse=lambda split: parsed)), lambda: trainer.model)
+
+
+def test_a_photograph_is_visited_at_its_time(still: Photographs) -> None:
+    moves = list[tuple[Any, ...]]()
+    kinds = ("add_checkbox", "add_number", "add_button", "add_markdown")
+    handle = SimpleNamespace(value=0, content="", on_update=lambda action: None, on_click=lambda action: None)
+    gui = SimpleNamespace(**{kind: lambda *_, **__: SimpleNamespace(**vars(handle)) for kind in kinds})
+    panel = CameraPanel(cast(Any, SimpleNamespace(gui=gui)), still, lambda *how: moves.append(how))
+    for _ in range(4):
+        panel.step(1)
+    assert [time for _, _, time in moves] == [0.5, 1.0, 0.25, 0.0]
+
+
+def test_of_a_camera_that_stood_still_the_time_chooses_the_photograph(still: Photographs) -> None:
     pose = at(still, 0)
     assert [still.at(pose, time) for time in (0.0, 0.2, 0.3, 0.6, 0.9)] == [0, 0, 1, 1, 2]
     assert still.at(at(still, 3), 1.0) == 3  # of its camera there is one

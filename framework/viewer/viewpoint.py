@@ -20,7 +20,7 @@ FIRST_FOV = 50.0
 SLIDER = (5.0, 140.0)
 """Range of the slider of the field of view, degrees."""
 Move = Callable[[Tensor, float, "float | None"], None]
-"""Function of a pose (3, 4), a field of view in radians and a time, which moves a browser's camera; no time: no change."""
+"""Function of a pose (3, 4), a field of view in radians and a time, if there is one, that moves a browser's camera."""
 SCENE = "scene"
 """Entry of the list of up directions: that of the scene."""
 AXES: dict[str, Vector] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.request import number_in, quaternion_of
 from nerfloom.viewer.viewpoint import Move
@@ -99,8 +100,3 @@ class CameraPanel:
         photographs = self._photographs
         self._move(photographs.pose(index), photographs.fov(index), photographs.time(index))
         self._note.content = f"photograph {index}: {plain(photographs.name(index))}"
-
-
-def plain(text: str) -> str:
-    """Return `text` without Markdown marks, which the panel would interpret."""
-    return "".join(letter if letter.isalnum() or letter in "-. ,:" else "-" for letter in text)

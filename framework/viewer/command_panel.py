@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerfloom.viewer.camera_panel import plain
 from nerfloom.viewer.commands import Commands, follow
+from nerfloom.viewer.markdown import plain
 
 if TYPE_CHECKING:
     import viser
@@ -50,7 +50,7 @@ class CommandPanel:
         def tell(line: str, percent: int | None) -> None:
             nonlocal last
             last = line
-            self._note.content = plain(line.replace("%", "percent"))
+            self._note.content = plain(line)
             if percent is not None:
                 self._bar.value = float(percent)
 

@@ -12,10 +12,10 @@ from nerfloom.export.kinds import KINDS
 from nerfloom.geometry.regions import write_region
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.camera_panel import plain
 from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands
 from nerfloom.viewer.crop_panel import FILE, CropPanel
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.request import Request, one_of
 
 if TYPE_CHECKING:

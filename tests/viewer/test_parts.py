@@ -37,6 +37,7 @@ from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.crop import CroppedCameras, picture_within
 from nerfloom.viewer.crop_panel import FACES, edges, middle, outward
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
@@ -259,6 +260,11 @@ def test_reports_that_make_no_sense(content: str, tmp_path: Path) -> None:
         (tmp_path / name).write_text(content)
     assert curve(tmp_path) == ([], [])
     assert "step 7" in heading(at_step_7(tmp_path))
+
+
+def test_names_and_messages_are_shown_as_they_are() -> None:
+    assert plain("error: cannot read r_0.png (34 %)") == r"error: cannot read r\_0.png (34 %)"
+    assert not set(plain("<img src=x> [a](b) *c* `d` &lt; #e {f} | ~g~ \\")) & set("<>[]*`&#{}|~\\")
 
 
 def test_reports(tmp_path: Path) -> None:

@@ -144,10 +144,8 @@ class CropPanel:
             return
         self._dragged = None if event.phase == "end" else face
         place = corner_of(event.target.position, middle(box, face))[axis]
-        if side:
-            self._high.value = replaced(box.high, axis, max(place, box.low[axis] + self._thinnest))
-        else:
-            self._low.value = replaced(box.low, axis, min(place, box.high[axis] - self._thinnest))
+        corner = (self._low, self._high)[side]
+        corner.value = dragged(box, face, place, self._thinnest)
         if self._dragged is None:
             self._place()
 
@@ -190,6 +188,23 @@ def middle(box: Box, face: Face) -> Vector:
     """
     x, y, z = ((low + high) / 2 for low, high in zip(box.low, box.high, strict=True))
     return replaced((x, y, z), face[0], (box.low, box.high)[face[1]][face[0]])
+
+
+def dragged(box: Box, face: Face, place: float, thinnest: float) -> Vector:
+    """Return the corner of a box whose face has been dragged.
+
+    Args:
+        box: a box that is parallel to the axes.
+        face: axis and side.
+        place: coordinate along that axis to which it has been dragged.
+        thinnest: minimum length of an edge. One that is shorter already may stay so, or the face would jump.
+    """
+    axis, side = face
+    low, high = box.low[axis], box.high[axis]
+    least = min(thinnest, high - low)
+    if side:
+        return replaced(box.high, axis, max(place, low + least))
+    return replaced(box.low, axis, min(place, high - least))
 
 
 def outward(face: Face) -> tuple[float, float, float, float]:

@@ -36,7 +36,7 @@ from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.crop import CroppedCameras, picture_within
-from nerfloom.viewer.crop_panel import FACES, edges, middle, outward
+from nerfloom.viewer.crop_panel import FACES, dragged, edges, middle, outward
 from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
@@ -86,6 +86,15 @@ def test_the_edges_and_the_arrows_of_the_box() -> None:
         w, *vector = outward((axis, side))
         turn = 2 * np.outer(vector, vector) + (2 * w * w - 1) * np.eye(3)  # of quaternions whose w is 0 or 1
         assert (turn @ np.eye(3)[axis]).tolist() == ((2 * side - 1) * np.eye(3)[axis]).tolist()
+
+
+def test_a_dragged_face_keeps_its_distance_from_the_other_one() -> None:
+    box = Box((-1.0, 2.0, 3.0), (1.0, 5.0, 3.25))
+    assert dragged(box, (0, 1), 4.0, 0.5) == (4.0, 5.0, 3.25)
+    assert dragged(box, (0, 1), -7.0, 0.5) == (-0.5, 5.0, 3.25)
+    assert dragged(box, (1, 0), 9.0, 0.5) == (-1.0, 4.5, 3.0)
+    for face, corner in (((2, 0), box.low), ((2, 1), box.high)):  # thinner than that, it stays where it is
+        assert dragged(box, face, middle(box, face)[2], 0.5) == corner
 
 
 def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:

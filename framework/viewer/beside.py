@@ -54,7 +54,7 @@ def draw_beside(
 
     def truth_here(view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
         camera = request.camera(piece.stride, (piece.top, piece.bottom))
-        return None if truth is None else truth(replace(view, camera=camera), rgb, background)
+        return None if truth is None else truth(replace(view, camera=camera, time=request.time), rgb, background)
 
     there = second.scaled(loaded.scale)
     moved = request.moved(*loaded.placement.similarity_to(there.placement))

@@ -91,8 +91,11 @@ def test_each_side_of_the_divider_is_of_its_run(here: Loaded, there: Loaded) -> 
 def test_a_photograph_counts_for_both_runs(here: Loaded, there: Loaded) -> None:
     """It is known from the first run's camera; the second may have moved its own."""
 
+    times = list[float | None]()
+
     def truth(view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
         matrix = view.camera.camera_to_worlds[0].flatten().tolist()
+        times.append(view.time)
         return torch.full_like(rgb, 0.25) if np.allclose(matrix, ABOVE.matrix) else None
 
     request = Request(ABOVE, 64, 48, overlay=1.0, divider=0.5)
@@ -102,6 +105,10 @@ def test_a_photograph_counts_for_both_runs(here: Loaded, there: Loaded) -> None:
     both, alone = draw_beside(here, there, error, WHOLE, None, truth), draw(here, error, WHOLE, None, truth)
     assert list(both) == list(alone) == ["error"]
     assert np.abs(both["error"].astype(int) - alone["error"]).mean() < 10
+    assert set(times) == {None}
+    here.model.scene = dataclasses.replace(here.model.scene, moving=True)
+    draw_beside(here, there, dataclasses.replace(request, time=0.25), WHOLE, None, truth)
+    assert times[-2:] == [0.25, 0.25]  # of the first run, whether the second moves or not
 
 
 def test_a_moving_run_beside_a_still_one_shows_its_time(

@@ -1,7 +1,7 @@
 """Output on the terminal: messages on standard error, and the progress of long operations.
 
-Progress is a bar on a terminal. Elsewhere, for example in a file, it is a line every ten seconds, or every second if
-NERFLOOM_PROGRESS is "often".
+Progress is a bar on a terminal. Elsewhere, for example in a file, it is a line every ten seconds. If NERFLOOM_PROGRESS
+is "often", it is a line every second, also where FORCE_COLOR makes a pipe count as a terminal.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from nerfloom.base.meter import Meter
 
 PROGRESS, OFTEN = "NERFLOOM_PROGRESS", "often"
 """Environment variable of the lines of progress, and its value for programs that show them."""
-SECONDS_BETWEEN_LINES = 1.0 if os.environ.get(PROGRESS) == OFTEN else 10.0
+_IS_OFTEN = os.environ.get(PROGRESS) == OFTEN
+SECONDS_BETWEEN_LINES = 1.0 if _IS_OFTEN else 10.0
 """Seconds between lines of progress without a terminal."""
 
 T = TypeVar("T")
 
-console = Console(stderr=True, highlight=False)
+console = Console(stderr=True, highlight=False, force_terminal=False if _IS_OFTEN else None)
 
 
 def say(message: str) -> None:

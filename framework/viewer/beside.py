@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
+from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.ndc import Ndc
+from nerfloom.cameras.view import View
 from nerfloom.evaluation.outputs import Arrays
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.drawing import Truth, draw
@@ -16,16 +18,6 @@ from nerfloom.viewer.request import Request
 
 COLOR = (255, 190, 0)
 """Colour of the divider."""
-
-
-@dataclass(frozen=True)
-class Beside:
-    """A second run or file of the same data."""
-
-    loaded: Loaded
-    """The second run; its scene may be placed in another way."""
-    truth: Truth | None = None
-    """True images for its output `error`."""
 
 
 def check_beside(loaded: Loaded, second: Loaded) -> None:
@@ -44,23 +36,29 @@ def check_beside(loaded: Loaded, second: Loaded) -> None:
 
 
 def draw_beside(
-    loaded: Loaded, second: Beside | None, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None
+    loaded: Loaded, second: Loaded | None, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None
 ) -> Arrays:
     """Return the part of a piece of a view that the requested output needs, of one run or of two.
 
     Args:
         loaded: the first run, left of the divider.
-        second: the second run; None for the first alone.
+        second: the second run, whose scene may be placed in another way; None for the first alone.
         request: the view, in the frame of the first run's scene.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
-        truth: true images of the first run for the output `error`.
+        truth: true images of the first run for the output `error` and the overlay. They count for both runs, which see
+            the same data: the second may have moved its cameras.
     """
     if second is None or request.divider is None or request.divider >= 1:
         return draw(loaded, request, piece, ndc, truth)
-    there = second.loaded.scaled(loaded.scale)
+
+    def truth_here(view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
+        camera = request.camera(piece.stride, (piece.top, piece.bottom))
+        return None if truth is None else truth(replace(view, camera=camera, time=request.time), rgb, background)
+
+    there = second.scaled(loaded.scale)
     moved = request.moved(*loaded.placement.similarity_to(there.placement))
-    right = draw(there, moved, piece, None, second.truth)
+    right = draw(there, moved, piece, None, truth_here)
     return joined(draw(loaded, request, piece, None, truth), right, request.divider)
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from torch import Tensor
-
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.request import number_in, quaternion_of
+from nerfloom.viewer.viewpoint import Move
 
 if TYPE_CHECKING:
     import viser
@@ -25,12 +24,10 @@ class CameraPanel:
     Args:
         client: the browser.
         photographs: the training images.
-        move: function of a pose (3, 4) and a field of view that moves the browser's camera.
+        move: moves the browser's camera.
     """
 
-    def __init__(
-        self, client: viser.ClientHandle, photographs: Photographs, move: Callable[[Tensor, float], None]
-    ) -> None:
+    def __init__(self, client: viser.ClientHandle, photographs: Photographs, move: Move) -> None:
         self._client, self._photographs, self._move = client, photographs, move
         self._generation = 0
         self._shown = client.gui.add_checkbox(
@@ -100,10 +97,6 @@ class CameraPanel:
     def visit(self, index: int) -> None:
         """Move the browser's camera to the photograph `index`."""
         self._number.value = index
-        self._move(self._photographs.pose(index), self._photographs.fov(index))
-        self._note.content = f"photograph {index}: {plain(self._photographs.name(index))}"
-
-
-def plain(text: str) -> str:
-    """Return `text` without Markdown marks, which the panel would interpret."""
-    return "".join(letter if letter.isalnum() or letter in "-. ,:" else "-" for letter in text)
+        photographs = self._photographs
+        self._move(photographs.pose(index), photographs.fov(index), photographs.time(index))
+        self._note.content = f"photograph {index}: {plain(photographs.name(index))}"

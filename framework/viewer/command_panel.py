@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerfloom.viewer.camera_panel import plain
-from nerfloom.viewer.commands import Commands
+from nerfloom.viewer.commands import Commands, follow
+from nerfloom.viewer.markdown import plain
 
 if TYPE_CHECKING:
     import viser
@@ -19,7 +20,8 @@ MAX_DOWNLOAD = 2**29
 class CommandPanel:
     """A bar, a line of text and a button of one browser.
 
-    Only the file that its last command has written is sent. A browser cannot name a file.
+    Only the file that its last command has written is sent. A browser cannot name a file. It receives the file once:
+    what is on its way is in memory, and a browser could ask again and again, and read nothing.
 
     Args:
         client: the browser.
@@ -29,6 +31,7 @@ class CommandPanel:
     def __init__(self, client: viser.ClientHandle, commands: Commands) -> None:
         self._client, self._commands = client, commands
         self._file: Path | None = None
+        self._lock = threading.Lock()
         self._bar = client.gui.add_progress_bar(0.0, visible=False)
         self._note = client.gui.add_markdown("")
         self._download = client.gui.add_button("Download", visible=False)
@@ -47,36 +50,42 @@ class CommandPanel:
         def tell(line: str, percent: int | None) -> None:
             nonlocal last
             last = line
-            self._note.content = plain(line.replace("%", "percent"))
+            self._note.content = plain(line)
             if percent is not None:
                 self._bar.value = float(percent)
 
+        process = self._commands.start(module, arguments)
+        if process is None:
+            self._note.content = "Another command is running; wait until it has ended."
+            return
         self._file, self._download.visible = None, False
         self._bar.value, self._bar.visible = 0.0, True
         self._note.content = "Starting ..."
-        status = self._commands.run(module, arguments, tell)
+        status = follow(process, tell)
         self._bar.visible = False
-        if status is None:
-            self._note.content = "Another command is running; wait until it has ended."
-        elif status:
+        if status:
             self._note.content = plain(last) if last.startswith("error: ") else "It failed; see the terminal."
         else:
             self._offer(written())
 
     def _offer(self, file: Path) -> None:
         size = file.stat().st_size
-        self._note.content = f"Wrote {plain(file.name)}, {size / 1e6:.2f} MB."
-        if size <= MAX_DOWNLOAD:
+        limit = "" if size <= MAX_DOWNLOAD else f" It is not sent: that is above {MAX_DOWNLOAD / 1e6:.0f} MB."
+        self._note.content = f"Wrote {plain(file.name)}, {size / 1e6:.2f} MB.{limit}"
+        if not limit:
             self._file, self._download.visible = file, True
 
     def _send(self) -> None:
-        """Send the file."""
-        file = self._file
+        """Send the file, unless it has been sent."""
+        with self._lock:
+            file, self._file = self._file, None
         if file is None:
             return
+        self._download.visible = False
         try:
             content = file.read_bytes()
         except OSError as error:
             self._note.content = f"Cannot read {plain(file.name)}: {error.strerror or error}"
             return
         self._client.send_file_download(file.name, content, save_immediately=True)
+        self._note.content = f"Sent {plain(file.name)}; it is also kept with the run."

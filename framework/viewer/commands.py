@@ -18,24 +18,24 @@ Tell = Callable[[str, "int | None"], None]
 
 
 class Commands:
-    """The command that a browser has started, if any. Its messages are printed on the viewer's terminal."""
+    """The command that a browser has started, if any."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
+        self._is_closed = False
         self._lock = threading.Lock()
 
-    def run(self, module: str, arguments: Sequence[object], tell: Tell) -> int | None:
-        """Run a command, and return its exit status; None if another command is running.
+    def start(self, module: str, arguments: Sequence[object]) -> subprocess.Popen[str] | None:
+        """Start a command, and return its process; None if another command is running, or the viewer ends.
 
         Args:
             module: module of the command, such as nerfloom.cli.render.
             arguments: its arguments.
-            tell: function that is called with each line that it prints.
         """
         with self._lock:
-            if self._process is not None and self._process.poll() is None:
+            if self._is_closed or (self._process is not None and self._process.poll() is None):
                 return None
-            self._process = process = subprocess.Popen(
+            self._process = subprocess.Popen(
                 python_command(module, *arguments),
                 stdin=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
@@ -43,18 +43,29 @@ class Commands:
                 errors="replace",
                 env={**os.environ, PROGRESS: OFTEN},
             )
-        assert process.stderr is not None
-        with process.stderr:
-            for line in filter(None, map(str.strip, process.stderr)):
-                found = PERCENT.search(line)
-                if found is None:
-                    say(line)
-                tell(line, None if found is None else min(int(found[1]), 100))
-        return process.wait()
+            return self._process
 
     def close(self) -> None:
-        """Stop the command that is running."""
-        process = self._process
+        """Stop the command that is running, and start no other."""
+        with self._lock:
+            self._is_closed, process = True, self._process
         if process is not None and process.poll() is None:
             process.terminate()
             say("viewer: a command was stopped; repeat ns-render with the same path to continue a video")
+
+
+def follow(process: subprocess.Popen[str], tell: Tell) -> int:
+    """Print the messages of a command on the viewer's terminal until it ends, and return its exit status.
+
+    Args:
+        process: the command, as `Commands.start` returns it.
+        tell: function that is called with each line that it prints.
+    """
+    assert process.stderr is not None
+    with process.stderr:
+        for line in filter(None, map(str.strip, process.stderr)):
+            found = PERCENT.search(line)
+            if found is None:
+                say(line)
+            tell(line, None if found is None else min(int(found[1]), 100))
+    return process.wait()

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable
 from functools import partial
 from itertools import combinations, product
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,10 +144,8 @@ class CropPanel:
             return
         self._dragged = None if event.phase == "end" else face
         place = corner_of(event.target.position, middle(box, face))[axis]
-        if side:
-            self._high.value = replaced(box.high, axis, max(place, box.low[axis] + self._thinnest))
-        else:
-            self._low.value = replaced(box.low, axis, min(place, box.high[axis] - self._thinnest))
+        corner = (self._low, self._high)[side]
+        corner.value = dragged(box, face, place, self._thinnest)
         if self._dragged is None:
             self._place()
 
@@ -159,26 +156,16 @@ class CropPanel:
         crop = self.crop()
         return None if crop is None else crop.box.moved(*self._loaded().placement.original_similarity())
 
-    def write(self) -> Path | None:
-        """Write the box to the run's folder, and return its file; None if there is no crop.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
+    def _save(self) -> None:
+        """Write the box to the run's folder."""
         region, file = self.region(), self._loaded().folder / FILE
         if region is None:
-            return None
-        write_region(file, region)
-        return file
-
-    def _save(self) -> None:
+            self._note.content = "There is no box: the crop is off, or a lowest coordinate is not below the highest."
+            return
         try:
-            file = self.write()
+            write_region(file, region)
         except OSError as error:
             self._note.content = f"Cannot write {FILE}: {error.strerror or error}"
-            return
-        if file is None:
-            self._note.content = "Switch the crop on first."
             return
         say(f"viewer: saved {file}; ns-export and ns-edit take it: --region {shlex.quote(str(file))}")
         self._note.content = f"Saved {FILE}; ns-export and ns-edit take it as --region."
@@ -201,6 +188,23 @@ def middle(box: Box, face: Face) -> Vector:
     """
     x, y, z = ((low + high) / 2 for low, high in zip(box.low, box.high, strict=True))
     return replaced((x, y, z), face[0], (box.low, box.high)[face[1]][face[0]])
+
+
+def dragged(box: Box, face: Face, place: float, thinnest: float) -> Vector:
+    """Return the corner of a box whose face has been dragged.
+
+    Args:
+        box: a box that is parallel to the axes.
+        face: axis and side.
+        place: coordinate along that axis to which it has been dragged.
+        thinnest: minimum length of an edge. One that is shorter already may stay so, or the face would jump.
+    """
+    axis, side = face
+    low, high = box.low[axis], box.high[axis]
+    least = min(thinnest, high - low)
+    if side:
+        return replaced(box.high, axis, max(place, low + least))
+    return replaced(box.low, axis, min(place, high - least))
 
 
 def outward(face: Face) -> tuple[float, float, float, float]:

@@ -48,7 +48,7 @@ def draw(loaded: Loaded, request: Request, piece: Piece, ndc: Ndc | None, truth:
     model = loaded.model
     camera = request.camera(piece.stride, (piece.top, piece.bottom), ndc).to(model.device)
     crop = request.crop if ndc is None else None
-    view = View(camera, request.time if model.scene.moving else None, piece.rays)
+    view = View(camera, (request.time or 0.0) if model.scene.moving else None, piece.rays)
     background = model.background
     if request.background is not None:
         background = background.new_tensor(request.background)

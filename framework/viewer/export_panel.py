@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from nerfloom.export.kinds import KINDS
+from nerfloom.geometry.regions import write_region
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.camera_panel import plain
 from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands
-from nerfloom.viewer.crop_panel import CropPanel
+from nerfloom.viewer.crop_panel import FILE, CropPanel
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.request import Request, one_of
 
 if TYPE_CHECKING:
@@ -56,26 +58,31 @@ class ExportPanel:
     def _export(self) -> None:
         """Start ns-export in another process."""
         name, suffix = CHOICES[one_of(self._kind.value, list(CHOICES))]
-        if self._crop.crop() is not None and not KINDS[name].is_cropped:
+        region = self._crop.region()
+        if region is not None and not KINDS[name].is_cropped:
             self._note.content = f"{name} takes no crop: switch the crop off."
-            return
-        try:
-            region = self._crop.write()
-        except OSError as error:
-            self._note.content = f"Cannot write the crop box: {plain(error.strerror or str(error))}."
             return
         self._note.content = ""
         folder = self._loaded().folder / FOLDER
         words = [name, self._loaded().origin, "--output-dir", folder, *self._flags(name, suffix)]
-        words += [] if region is None else ["--region", region]
-        self._command.run("nerfloom.cli.export", words, lambda: newest(folder, suffix))
+        try:
+            # Not in the run's folder: another browser may save its box there before the process has read this one.
+            with TemporaryDirectory(prefix="nerfloom-") as temporary:
+                if region is not None:
+                    file = Path(temporary) / FILE
+                    write_region(file, region)
+                    words += ["--region", file]
+                self._command.run("nerfloom.cli.export", words, lambda: newest(folder, suffix))
+        except OSError as error:
+            self._note.content = f"Cannot export: {plain(error.strerror or str(error))}."
 
     def _flags(self, name: str, suffix: str) -> list[object]:
         """Return the flags of ns-export for a kind of export, a suffix, and what is shown."""
         loaded, kind, request = self._loaded(), KINDS[name], self._request()
         flags: list[object] = ["--device-type", loaded.model.device.type]
-        if loaded.run.config.data is not None:
-            flags += ["--data", loaded.run.config.data]
+        data = loaded.run.config.data
+        if data is not None and data.exists():  # without its photographs, a run can still export what needs none
+            flags += ["--data", data]
         if len(kind.suffixes) > 1:
             flags += ["--format", suffix.removeprefix(".")]
         has_time = any(field.name == "time" for field in dataclasses.fields(kind.settings))

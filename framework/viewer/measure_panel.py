@@ -11,8 +11,8 @@ from torch import Tensor
 
 from nerfloom.base.errors import NerfloomError
 from nerfloom.cameras.view import View
-from nerfloom.viewer.camera_panel import plain
 from nerfloom.viewer.crop import CroppedCameras
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Request, number_in
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nerfloom.cameras.poses import looked_at
 from nerfloom.geometry.regions import Vector
@@ -46,7 +47,7 @@ class Page:
         self._curve: Any = None
         self._heading = server.gui.add_markdown("")
         if queue.second is not None:
-            server.gui.add_markdown(f"right of the divider:  \n{heading(queue.second.loaded)}")
+            server.gui.add_markdown(f"right of the divider:  \n{heading(queue.second)}")
         with server.gui.add_folder("Learning curve", expand_by_default=False):
             self._place_of_curve = server.gui.add_folder(None)
         self.refresh()
@@ -82,16 +83,21 @@ class Page:
     ) -> tuple[list[Any], list[Key]]:
         """Add the tabs of a scene with lengths, and return the parts to close when the browser leaves, and keys."""
         queue, parts, keys = self._queue, list[Any](), [Key("C", "Crop on or off", crop.toggle)]
+
+        def move(pose: Tensor, fov: float, time: float | None) -> None:
+            viewpoint.move(pose, fov)
+            panel.show_time(time)
+
         if queue.loaded.source is not None:
             with tabs.add_tab("Photographs"):
-                cameras = CameraPanel(client, self._photographs, viewpoint.move)
+                cameras = CameraPanel(client, self._photographs, move)
             parts.append(cameras)
             keys += [
                 Key("N", "Next photograph", lambda: cameras.step(1)),
                 Key("P", "Previous photograph", lambda: cameras.step(-1)),
             ]
         with tabs.add_tab("Path"):
-            parts.append(PathPanel(client, lambda: queue.loaded, panel.request, viewpoint.move, self._commands))
+            parts.append(PathPanel(client, lambda: queue.loaded, panel.request, move, self._commands))
         with tabs.add_tab("Measure"):
             MeasurePanel(client, queue, panel.request)
         if self._commands is not None:

@@ -31,7 +31,7 @@ class Panel:
     def __init__(self, client: viser.ClientHandle, queue: RenderQueue) -> None:
         self._client, self._queue = client, queue
         scene = queue.loaded.model.scene
-        both = [queue.loaded, *(() if queue.second is None else (queue.second.loaded,))]
+        both = [queue.loaded, *(() if queue.second is None else (queue.second,))]
         declared = [output.name for output in both[0].model.outputs if output in both[-1].model.outputs]
         has_photographs = queue.loaded.source is not None and not scene.warped
         self._outputs = [*OUTPUTS[:-1], *declared, *(OUTPUTS[-1:] if has_photographs else ())]
@@ -75,6 +75,11 @@ class Panel:
         """Show the next output of the list."""
         index = self._outputs.index(one_of(self._output.value, self._outputs))
         self._output.value = self._outputs[(index + 1) % len(self._outputs)]
+
+    def show_time(self, time: float | None) -> None:
+        """Show a moving scene at a `time` in [0, 1]; None for no change."""
+        if self._time is not None and time is not None:
+            self._time.value = time
 
     # -- requests ---------------------------------------------------------------------------------------------
 

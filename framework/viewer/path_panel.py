@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.cameras.camera_path import CameraPath, Keyframe, write_camera_path
@@ -21,6 +20,7 @@ from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands
 from nerfloom.viewer.keyframes import MAX_KEYFRAMES, Editor, listed, path_file
 from nerfloom.viewer.request import Request, number_in
+from nerfloom.viewer.viewpoint import Move
 
 if TYPE_CHECKING:
     import viser
@@ -40,7 +40,7 @@ class PathPanel:
         client: the browser.
         loaded: function that returns the model and its run.
         request: function that returns the browser's request; None if its camera is invalid.
-        move: function of a pose (3, 4) and a field of view that moves the browser's camera.
+        move: moves the browser's camera.
         commands: the commands of all browsers; None if rendering is not allowed.
     """
 
@@ -49,7 +49,7 @@ class PathPanel:
         client: viser.ClientHandle,
         loaded: Callable[[], Loaded],
         request: Callable[[], Request | None],
-        move: Callable[[Tensor, float], None],
+        move: Move,
         commands: Commands | None,
     ) -> None:
         self._client, self._loaded, self._request, self._move = client, loaded, request, move
@@ -101,7 +101,7 @@ class PathPanel:
         action, keyframe = event.target.value, self._keyframe()
         if action == "go to":
             chosen = self._editor.keyframes[index]
-            self._move(chosen.pose, math.radians(chosen.fov))
+            self._move(chosen.pose, math.radians(chosen.fov), chosen.time)
         elif action == "remove":
             self._edit(lambda editor: editor.without(index))
         elif action == "move here" and keyframe is not None:
@@ -156,7 +156,8 @@ class PathPanel:
         try:
             while self._playing and (passed := time.monotonic() - start) < path.seconds:
                 index = min(int(passed * path.fps), len(path) - 1)
-                self._move(path.poses[index], math.radians(float(path.fovs[index])))
+                moment = None if path.times is None else float(path.times[index])
+                self._move(path.poses[index], math.radians(float(path.fovs[index])), moment)
                 self._client.flush()
                 time.sleep(1 / min(MAX_PREVIEW_FPS, path.fps))
         finally:

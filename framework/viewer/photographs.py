@@ -101,6 +101,11 @@ class Photographs:
             return math.radians(60)
         return 2 * math.atan(0.5 * float(cameras.heights[index]) / float(cameras.fy[index]))
 
+    def time(self, index: int) -> float | None:
+        """Return the time of image `index` in [0, 1]; None in a static scene."""
+        times = None if self.parsed is None else self.parsed.times
+        return None if times is None else float(times[index])
+
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return a thumbnail (H, W, 3) uint8 of image `index`, over white; None if the file cannot be read."""
         with self._lock:
@@ -120,11 +125,12 @@ class Photographs:
 
     # -- errors -----------------------------------------------------------------------------------------------
 
-    def at(self, pose: Pose) -> int | None:
+    def at(self, pose: Pose, time: float | None = None) -> int | None:
         """Return the image whose camera has a given position and direction; None if there is none.
 
         Args:
             pose: camera of a view.
+            time: time of the view, which chooses among the images of a camera that stood still; None for no time.
         """
         cameras = self.cameras
         if cameras is None or self.ndc is not None:
@@ -134,7 +140,11 @@ class Photographs:
         size = float((known[:, :, 3] - known[:, :, 3].mean(0)).norm(dim=-1).max()) or 1.0
         ahead = (known[:, :, 2] * here[:, 2]).sum(-1)
         close = (distances <= MAX_SHIFT * size) & (ahead >= math.cos(MAX_ANGLE))
-        return int(torch.where(close, distances, torch.inf).argmin()) if bool(close.any()) else None
+        if not bool(close.any()):
+            return None
+        times = None if self.parsed is None else self.parsed.times
+        order = distances if times is None or time is None else (times.double() - time).abs()
+        return int(torch.where(close, order, torch.inf).argmin())
 
     def truth(self, view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
         """Return the photograph's colours in the pixels of a view from the photograph's position.
@@ -152,7 +162,7 @@ class Photographs:
         """
         matrix = view.camera.camera_to_worlds[0].double().cpu().flatten().tolist()
         with self._lock:
-            index = self.at(Pose(tuple(matrix), 1.0))
+            index = self.at(Pose(tuple(matrix), 1.0), view.time)
             image, cameras = None if index is None else self._whole(index), self.cameras
         if index is None or image is None or cameras is None:
             return None

@@ -14,7 +14,7 @@ from nerfloom.cameras.ndc import Ndc
 from nerfloom.evaluation.outputs import Arrays
 from nerfloom.renderable import RendersRays
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.beside import Beside, draw_beside
+from nerfloom.viewer.beside import draw_beside
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.drawing import Truth
 from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
@@ -42,8 +42,8 @@ class RenderQueue:
         coarse_seconds: time limit for a picture while the camera moves.
         piece_seconds: time limit for a piece of a refinement.
         ndc: function that returns the normalised device coordinates of the scene; None if it has none.
-        truth: true images for the output `error`.
-        second: a second run, drawn beside the first; None for none.
+        truth: true images for the output `error` and the overlay.
+        second: a second run or file, drawn beside the first; None for none.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class RenderQueue:
         piece_seconds: float = 0.1,
         ndc: Ndc | None = None,
         truth: Truth | None = None,
-        second: Beside | None = None,
+        second: Loaded | None = None,
     ) -> None:
         self.loaded, self.second = loaded, second
         self.coarse_seconds, self.piece_seconds = coarse_seconds, piece_seconds
@@ -156,7 +156,7 @@ class RenderQueue:
 
     @property
     def _piece_seconds(self) -> float:
-        shown = (self.loaded,) if self.second is None else (self.loaded, self.second.loaded)
+        shown = (self.loaded,) if self.second is None else (self.loaded, self.second)
         return self.piece_seconds if all(isinstance(one.model, RendersRays) for one in shown) else NO_LIMIT
 
     @property

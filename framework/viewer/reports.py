@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.training.loaded import Loaded
+from nerfloom.viewer.markdown import plain
 
 MAX_REPORT = 2**24
 """Maximum size of a report, bytes."""
@@ -20,7 +21,7 @@ def heading(loaded: Loaded) -> str:
         loaded: the run or file.
     """
     step = f" · step {loaded.step:,}" if loaded.is_run else ""
-    lines = [f"**{_plain(loaded.method)}** · {_plain(loaded.origin.name)}{step}"]
+    lines = [f"**{plain(loaded.method)}** · {plain(loaded.origin.name)}{step}"]
     origin = loaded.origin
     content = _read(origin / "eval.json" if loaded.is_run else origin.with_suffix(".eval.json"))
     results = content.get("results") if isinstance(content, dict) else None
@@ -59,8 +60,3 @@ def _read(path: Path) -> Any:
 def _finite(value: Any) -> float | None:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return float(value) if is_number and abs(value) < 1e30 and math.isfinite(value) else None
-
-
-def _plain(text: str) -> str:
-    """Return text without characters that Markdown or HTML would interpret."""
-    return "".join(letter if letter.isalnum() or letter in "-_. :" else "?" for letter in text).replace("_", r"\_")

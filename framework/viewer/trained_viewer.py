@@ -9,7 +9,7 @@ from pathlib import Path
 from nerfloom.base.console import say
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.beside import Beside, check_beside
+from nerfloom.viewer.beside import check_beside
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
@@ -36,9 +36,10 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool, second: Load
     """
     queue: RenderQueue
     photographs = Photographs(loaded.source, lambda: queue.loaded.model)
-    beside = None if second is None else _beside(loaded, second)
+    if second is not None:
+        check_beside(loaded, second)
     ndc = _ndc(loaded.model.scene.warped, photographs)
-    queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=beside)
+    queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=second)
     server = open_server(host, port, "nerfloom")
     page = Page(server, queue, photographs, may_start=follow)
     say("Ctrl-C ends it")
@@ -70,11 +71,6 @@ def _follow(queue: RenderQueue, page: Page, seen: Path) -> Path:
         queue.loaded = found
         page.refresh()
     return newer
-
-
-def _beside(loaded: Loaded, second: Loaded) -> Beside:
-    check_beside(loaded, second)
-    return Beside(second, Photographs(second.source, lambda: second.model).truth)
 
 
 def _ndc(warped: bool, photographs: Photographs) -> Ndc | None:

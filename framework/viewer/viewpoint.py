@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ FIRST_FOV = 50.0
 """Initial vertical field of view, degrees."""
 SLIDER = (5.0, 140.0)
 """Range of the slider of the field of view, degrees."""
+Move = Callable[[Tensor, float, "float | None"], None]
+"""Function of a pose (3, 4), a field of view in radians and a time, if there is one, that moves a browser's camera."""
 SCENE = "scene"
 """Entry of the list of up directions: that of the scene."""
 AXES: dict[str, Vector] = {

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.regions import Box
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.beside import Beside, check_beside, draw_beside, joined, with_divider
+from nerfloom.viewer.beside import check_beside, draw_beside, joined, with_divider
 from nerfloom.viewer.drawing import draw
 from nerfloom.viewer.pace import Piece
 from nerfloom.viewer.request import Crop, Pose, Request
@@ -68,7 +69,7 @@ def test_what_is_the_same_looks_the_same_in_both_scenes(
     request = Request(ABOVE, 64, 48, output, crop=crop)
     alone = draw(here, request, WHOLE, None)
     for divider in (0.0, 0.4, 1.0):
-        both = draw_beside(here, Beside(there), dataclasses.replace(request, divider=divider), WHOLE, None)
+        both = draw_beside(here, there, dataclasses.replace(request, divider=divider), WHOLE, None)
         assert both.keys() == alone.keys()
         visible = alone.get("accumulation", np.full((48, 64), 255)) > 200
         for name, values in alone.items():
@@ -80,11 +81,51 @@ def test_each_side_of_the_divider_is_of_its_run(here: Loaded, there: Loaded) -> 
     behind = torch.tensor([[-50.0, 0.0, 50.0]] * 3)  # the camera
     other = loaded(behind, 0.1, SCALE, there.placement)
     request = Request(ABOVE, 64, 48, divider=0.25)
-    found = draw_beside(here, Beside(other), request, WHOLE, None)["rgb"]
+    found = draw_beside(here, other, request, WHOLE, None)["rgb"]
     alone = draw(here, request, WHOLE, None)["rgb"]
     np.testing.assert_array_equal(found[:, :16], alone[:, :16])
     assert (found[:, 16:] == 255).all()
     assert (alone[:, 16:] < 200).any()
+
+
+def test_a_photograph_counts_for_both_runs(here: Loaded, there: Loaded) -> None:
+    """It is known from the first run's camera; the second may have moved its own."""
+
+    times = list[float | None]()
+
+    def truth(view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
+        matrix = view.camera.camera_to_worlds[0].flatten().tolist()
+        times.append(view.time)
+        return torch.full_like(rgb, 0.25) if np.allclose(matrix, ABOVE.matrix) else None
+
+    request = Request(ABOVE, 64, 48, overlay=1.0, divider=0.5)
+    over = draw_beside(here, there, request, WHOLE, None, truth)["rgb"]
+    assert np.unique(over).size == 1
+    error = dataclasses.replace(request, output="error", overlay=0.0)
+    both, alone = draw_beside(here, there, error, WHOLE, None, truth), draw(here, error, WHOLE, None, truth)
+    assert list(both) == list(alone) == ["error"]
+    assert np.abs(both["error"].astype(int) - alone["error"]).mean() < 10
+    assert set(times) == {None}
+    here.model.scene = dataclasses.replace(here.model.scene, moving=True)
+    draw_beside(here, there, dataclasses.replace(request, time=0.25), WHOLE, None, truth)
+    assert times[-2:] == [0.25, 0.25]  # of the first run, whether the second moves or not
+
+
+def test_a_moving_run_beside_a_still_one_shows_its_time(
+    here: Loaded, there: Loaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The panel of a still scene has no time; that of the other is then 0."""
+    times = list[float | None]()
+
+    def render(view: View, background: Tensor) -> Tensor:
+        times.append(view.time)
+        return background.expand(view.height, view.width, 3)
+
+    there.model.scene = dataclasses.replace(there.model.scene, moving=True)
+    monkeypatch.setattr(there.model, "render_rgb", render)
+    for time in (None, 0.25):
+        draw_beside(here, there, Request(ABOVE, 64, 48, time=time, divider=0.5), WHOLE, None)
+    assert times == [0.0, 0.25]
 
 
 def test_rays_move_with_the_scene() -> None:

@@ -3,14 +3,19 @@
 import os
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from nerfloom.export.kinds import KINDS
+from nerfloom.geometry.regions import Box, Region, read_region
 from nerfloom.viewer import commands
-from nerfloom.viewer.commands import Commands
-from nerfloom.viewer.export_panel import CHOICES, newest
+from nerfloom.viewer.command_panel import CommandPanel
+from nerfloom.viewer.commands import Commands, follow
+from nerfloom.viewer.export_panel import CHOICES, ExportPanel, newest
 from tests.patience import until
 
 PRINTS = """
@@ -19,6 +24,10 @@ print("42 frames take long", file=sys.stderr)
 print("Rendering: 34 %, 41 of 120, 12 s left", os.environ["NERFLOOM_PROGRESS"], file=sys.stderr)
 print("error: the disk is full", file=sys.stderr)
 sys.exit(int(sys.argv[1]))
+"""
+IS_A_TERMINAL = """
+from nerfloom.base.console import console, say
+say(str(console.is_terminal))
 """
 WAITS = """
 import os, sys, time
@@ -37,8 +46,9 @@ def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("status", [0, 3])
 def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) -> None:
     told: list[tuple[str, int | None]] = []
-    found = Commands().run(PRINTS, [status], lambda line, percent: told.append((line, percent)))
-    assert found == status
+    process = Commands().start(PRINTS, [status])
+    assert process is not None
+    assert follow(process, lambda line, percent: told.append((line, percent))) == status
     assert told == [
         ("42 frames take long", None),
         ("Rendering: 34 %, 41 of 120, 12 s left often", 34),
@@ -49,21 +59,31 @@ def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) 
     assert "Rendering" not in said  # the page shows it
 
 
+@pytest.mark.parametrize("variable", ["FORCE_COLOR", "TTY_COMPATIBLE"])
+def test_progress_comes_as_lines_whatever_the_terminal_is_said_to_be(
+    variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, "1")
+    told, process = list[str](), Commands().start(IS_A_TERMINAL, [])
+    assert process is not None
+    assert follow(process, lambda line, _: told.append(line)) == 0
+    assert told == ["False"]
+
+
 def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
-    running, told, ended = Commands(), list[str](), list[int | None]()
+    running, told, ended = Commands(), list[str](), list[int]()
 
     def run(file: Path) -> threading.Thread:
         told.clear()
-        words = [file]
-        thread = threading.Thread(
-            target=lambda: ended.append(running.run(WAITS, words, lambda line, _: told.append(line)))
-        )
+        process = running.start(WAITS, [file])
+        assert process is not None
+        thread = threading.Thread(target=lambda: ended.append(follow(process, lambda line, _: told.append(line))))
         thread.start()
         until(lambda: told)
         return thread
 
     first = run(tmp_path / "end")
-    assert running.run(PRINTS, [0], lambda line, _: told.append(line)) is None
+    assert running.start(PRINTS, [0]) is None
     (tmp_path / "end").touch()
     first.join()
     assert ended == [0]
@@ -71,8 +91,95 @@ def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
     second = run(tmp_path / "never")
     running.close()
     second.join()
-    assert ended[1] not in (0, None)
+    assert ended[1] != 0
     running.close()  # nothing is left to stop
+    assert running.start(PRINTS, [0]) is None  # and nothing begins that would outlive the viewer
+
+
+class Screen:
+    """The controls of a browser, and what it downloads."""
+
+    press: Callable[[Any], None]
+
+    def __init__(self) -> None:
+        self.gui, self.sent = self, list[tuple[str, bytes]]()
+
+    def add_progress_bar(self, value: float, visible: bool) -> SimpleNamespace:
+        self.bar = SimpleNamespace(value=value, visible=visible)
+        return self.bar
+
+    def add_markdown(self, content: str) -> SimpleNamespace:
+        self.note = SimpleNamespace(content=content)
+        return self.note
+
+    def add_button(self, label: str, visible: bool = True) -> SimpleNamespace:
+        self.button = SimpleNamespace(visible=visible, on_click=lambda action: setattr(self, "press", action))
+        return self.button
+
+    def add_dropdown(self, label: str, options: list[str], initial_value: str) -> SimpleNamespace:
+        return SimpleNamespace(value=initial_value)
+
+    def send_file_download(self, name: str, content: bytes, save_immediately: bool) -> None:
+        self.sent.append((name, content))
+
+
+def test_a_second_press_leaves_the_progress_of_the_first(tmp_path: Path) -> None:
+    running, screen, file = Commands(), Screen(), tmp_path / "splat.ply"
+    file.write_bytes(b"ply")
+    panel = CommandPanel(cast(Any, screen), running)
+    first = threading.Thread(target=lambda: panel.run(WAITS, [tmp_path / "end"], lambda: file))
+    first.start()
+    until(lambda: screen.note.content == "begun")
+    panel.run(PRINTS, [0], lambda: file)
+    assert screen.note.content.startswith("Another command is running")
+    assert screen.bar.visible
+    (tmp_path / "end").touch()
+    first.join()
+    assert "Wrote splat.ply" in screen.note.content
+    assert (screen.bar.visible, screen.button.visible) == (False, True)
+
+
+def test_a_file_is_sent_once(tmp_path: Path) -> None:
+    """Each download holds the file in memory until the browser has read it."""
+    screen, file = Screen(), tmp_path / "splat.ply"
+    file.write_bytes(b"ply")
+    panel = CommandPanel(cast(Any, screen), Commands())
+    screen.press(None)  # before there is any
+    panel.run(PRINTS, [0], lambda: file)
+    for _ in range(3):
+        screen.press(None)
+    assert screen.sent == [("splat.ply", b"ply")]
+    assert not screen.button.visible
+
+
+def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
+    """What is saved in the run's folder stays as it is. Data that has moved is not asked for."""
+    boxes, screen = [Box((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0)), Box((0.0, 0.0, 0.0), (3.0, 3.0, 3.0))], Screen()
+    read, files = list[Region](), list[Path]()
+
+    def start(module: str, words: list[Any]) -> None:
+        flags = dict(zip(words[2::2], words[3::2], strict=True))
+        assert "--data" not in flags
+        files.append(flags["--region"])
+        read.append(read_region(files[-1]))
+
+    source = SimpleNamespace(config=SimpleNamespace(data=tmp_path / "gone"))
+    model = SimpleNamespace(device=SimpleNamespace(type="cpu"))
+    loaded = SimpleNamespace(model=model, folder=tmp_path, origin=tmp_path, run=source)
+    left = boxes.copy()
+    given: list[Any] = [
+        screen,
+        lambda: loaded,
+        lambda: None,
+        SimpleNamespace(region=lambda: left.pop(0)),
+        SimpleNamespace(start=start),
+    ]
+    panel = ExportPanel(*given)
+    panel._export()
+    panel._export()
+    assert read == boxes
+    assert not any(file.exists() for file in files)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_kind_and_format_is_offered() -> None:

@@ -6,7 +6,8 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any, cast
 
 import imageio.v3 as iio
 import numpy as np
@@ -30,10 +31,13 @@ from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.checkpoint import list_checkpoints
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.run import Run
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.crop import CroppedCameras, picture_within
-from nerfloom.viewer.crop_panel import FACES, edges, middle, outward
+from nerfloom.viewer.crop_panel import FACES, dragged, edges, middle, outward
+from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
@@ -82,6 +86,15 @@ def test_the_edges_and_the_arrows_of_the_box() -> None:
         w, *vector = outward((axis, side))
         turn = 2 * np.outer(vector, vector) + (2 * w * w - 1) * np.eye(3)  # of quaternions whose w is 0 or 1
         assert (turn @ np.eye(3)[axis]).tolist() == ((2 * side - 1) * np.eye(3)[axis]).tolist()
+
+
+def test_a_dragged_face_keeps_its_distance_from_the_other_one() -> None:
+    box = Box((-1.0, 2.0, 3.0), (1.0, 5.0, 3.25))
+    assert dragged(box, (0, 1), 4.0, 0.5) == (4.0, 5.0, 3.25)
+    assert dragged(box, (0, 1), -7.0, 0.5) == (-0.5, 5.0, 3.25)
+    assert dragged(box, (1, 0), 9.0, 0.5) == (-1.0, 4.5, 3.0)
+    for face, corner in (((2, 0), box.low), ((2, 1), box.high)):  # thinner than that, it stays where it is
+        assert dragged(box, face, middle(box, face)[2], 0.5) == corner
 
 
 def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
@@ -188,6 +201,33 @@ def test_elsewhere_there_is_no_truth(photographs: Photographs) -> None:
     assert photographs.at(dataclasses.replace(pose, matrix=tuple(matrix))) is None
 
 
+@pytest.fixture
+def still(shared_tiny: Path, tmp_path: Path) -> Photographs:
+    """Three photographs of one place and one of another, at several times."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path)
+    run = tiny_run("instant-ngp", shared_tiny, tmp_path)
+    times = torch.tensor([0.0, 0.5, 1.0, 0.25])
+    parsed = dataclasses.replace(run.parse("train")[torch.tensor([3, 3, 3, 5])], times=times)
+    return Photographs(cast(Run, SimpleNamespace(parse=lambda split: parsed)), lambda: trainer.model)
+
+
+def test_a_photograph_is_visited_at_its_time(still: Photographs) -> None:
+    moves = list[tuple[Any, ...]]()
+    kinds = ("add_checkbox", "add_number", "add_button", "add_markdown")
+    handle = SimpleNamespace(value=0, content="", on_update=lambda action: None, on_click=lambda action: None)
+    gui = SimpleNamespace(**{kind: lambda *_, **__: SimpleNamespace(**vars(handle)) for kind in kinds})
+    panel = CameraPanel(cast(Any, SimpleNamespace(gui=gui)), still, lambda *how: moves.append(how))
+    for _ in range(4):
+        panel.step(1)
+    assert [time for _, _, time in moves] == [0.5, 1.0, 0.25, 0.0]
+
+
+def test_of_a_camera_that_stood_still_the_time_chooses_the_photograph(still: Photographs) -> None:
+    pose = at(still, 0)
+    assert [still.at(pose, time) for time in (0.0, 0.2, 0.3, 0.6, 0.9)] == [0, 0, 1, 1, 2]
+    assert still.at(at(still, 3), 1.0) == 3  # of its camera there is one
+
+
 def test_small_pictures(tmp_path: Path) -> None:
     big = np.full((400, 300, 3), (10, 200, 30), np.uint8)
     iio.imwrite(tmp_path / "big.jpg", big)
@@ -229,6 +269,11 @@ def test_reports_that_make_no_sense(content: str, tmp_path: Path) -> None:
         (tmp_path / name).write_text(content)
     assert curve(tmp_path) == ([], [])
     assert "step 7" in heading(at_step_7(tmp_path))
+
+
+def test_names_and_messages_are_shown_as_they_are() -> None:
+    assert plain("error: cannot read r_0.png (34 %)") == r"error: cannot read r\_0.png (34 %)"
+    assert not set(plain("<img src=x> [a](b) *c* `d` &lt; #e {f} | ~g~ \\")) & set("<>[]*`&#{}|~\\")
 
 
 def test_reports(tmp_path: Path) -> None:

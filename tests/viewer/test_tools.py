@@ -145,6 +145,8 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
         tick(tab, "Crop")
         type_into(tab, "Highest corner", 2, "0")
         time.sleep(1)
+        tab.press("Save the box")
+        until((run / "crop.yaml").is_file)
         tab.press("Export")
         time.sleep(1)
         tab.press("Export")  # the button in the tab

@@ -1,0 +1,23 @@
+"""Files that are complete or absent."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import BinaryIO
+
+from nerfloom.base.atomic import write_atomically
+
+
+def test_two_threads_write_one_file(tmp_path: Path) -> None:
+    """As two browsers of a viewer do. The one that ends last has its content there, and nothing else is left."""
+    file = tmp_path / "crop.yaml"
+
+    def write_during_another(stream: BinaryIO) -> None:
+        stream.write(b"the first, ")
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(write_atomically, file, lambda other: other.write(b"the second")).result()
+        assert file.read_bytes() == b"the second"
+        stream.write(b"which ends last")
+
+    write_atomically(file, write_during_another)
+    assert file.read_bytes() == b"the first, which ends last"
+    assert [one.name for one in tmp_path.iterdir()] == ["crop.yaml"]

@@ -32,7 +32,7 @@ class KiloNeRFConfig(
     SamplingConfig,
     max_num_iterations=50_000,
     num_rays_per_batch=8_192,
-    learning_rate=1e-3,
+    learning_rate=1e-2,
     lr_schedule="exponential",
     lr_final=0.05,
     num_steps=384,
@@ -52,7 +52,7 @@ class KiloNeRFConfig(
         "distill_share": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    network_resolution: int = 16
+    network_resolution: int = 8
     """Cells along the longest edge of the box, each with a network of its own."""
     hidden_width: int = 32
     """Features per hidden layer of a network."""

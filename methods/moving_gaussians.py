@@ -31,7 +31,7 @@ MAX_LOGIT = 30.0
 
 
 @dataclass(frozen=True)
-class MovingGaussiansConfig(GaussianSplattingConfig, strategy="relocation"):
+class MovingGaussiansConfig(GaussianSplattingConfig, noise=0.0, opacity_penalty=0.0, scale_penalty=0.0):
     """Settings of moving-gaussians."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -48,7 +48,7 @@ class MovingGaussiansConfig(GaussianSplattingConfig, strategy="relocation"):
     """Learning rate of moments, in the time from 0 to 1, before --rate-factor."""
     duration_rate: float = 5e-3
     """Learning rate of the logarithms of durations, before --rate-factor."""
-    start_duration: float = 1.0
+    start_duration: float = 0.1
     """Duration of Gaussians at the start: the standard deviation of their visibility, in the time from 0 to 1."""
     min_duration: Auto[float] = AUTO
     """Minimum duration, in the time from 0 to 1. Default: half the time between images. A shorter one would be seen in

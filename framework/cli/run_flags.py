@@ -73,5 +73,5 @@ class RunFlags(OpenFlags):
         """
         from nerfloom.training.load import load
 
-        given = self.load_checkpoint, self.device_type, self.data, data_format, self.up
-        return load(found, *given, **self.changes(), **settings)
+        changes = {**self.changes(), **settings}
+        return load(found, self.load_checkpoint, self.device_type, self.data, data_format, self.up, **changes)

@@ -315,8 +315,8 @@ def _integers(header: dict[str, Any], name: str, count: int | None) -> np.ndarra
     """Return integers (count,) int64 of a header."""
     values = header.get(name)
     # Types are checked first, because an array of texts takes the size of the longest for each.
-    integers = isinstance(values, list) and all(type(value) is int for value in values)
-    if not integers or len(values) != (len(values) if count is None else count):
+    integers = values if isinstance(values, list) and all(type(value) is int for value in values) else []
+    if not integers or (count is not None and len(integers) != count):
         raise ValueError(f"its '{name}' must be a list of integers, one for each node")
     return _array(header, name, np.int64)
 

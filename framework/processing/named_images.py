@@ -29,8 +29,8 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
     """Find the image files of a capture's cameras.
 
     A name is matched as in all data sets (`names_on_disk`), and at last by its part after the last slash, without
-    ending, where one camera and one file have it. Images beside them that no camera has are counted and reported, since
-    some programs list only the cameras that they placed.
+    ending, where one camera and one file have it. Other images in their folders, which no camera has, are counted and
+    reported, because some programs list only the cameras that they placed.
 
     Args:
         folder: folder of the photographs.
@@ -70,13 +70,13 @@ def reasons(left_out: Counter[str]) -> str:
 
 
 def _report_others(folder: Path, placed: Iterable[Path]) -> None:
-    """Report how many images in the folders of the images `placed` are not among these."""
+    """Report the number of images in the folders of the `placed` images that are not among them."""
     ours = {path.as_posix() for path in placed}
     folders = {name.rpartition("/")[0] for name in ours}
     others = [name for name in files_below(folder) if name not in ours and name.rpartition("/")[0] in folders]
     others = [name for name in others if (folder / name).is_file()]  # not the full size of a reduced image
     if others:
-        say(f"{folder}: {len(others)} other images are of no camera that is placed, the first: {others[0]}")
+        say(f"{folder}: {len(others)} other images have no placed camera, the first: {others[0]}")
 
 
 def _is_possible(name: str) -> bool:

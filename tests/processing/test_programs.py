@@ -398,7 +398,7 @@ def test_photographs_that_were_not_aligned_are_counted(tmp_path: Path) -> None:
     write_images(tmp_path / "photographs", ["sketches/plan.png"])
     _, said = process("realitycapture", tmp_path / "photographs", tmp_path / "out", "--csv", file)
     assert "2 of 2 cameras are placed" in said
-    assert f"3 other images are of no camera that is placed, the first: {NAMES[2]}" in said
+    assert f"3 other images have no placed camera, the first: {NAMES[2]}" in said
 
 
 def test_heading_pitch_and_roll_have_their_meaning() -> None:

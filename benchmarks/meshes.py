@@ -37,7 +37,7 @@ from nerfloom.training.run import read_run
 SURFACE_POINTS = 20_000
 """Number of points on the exact surface."""
 MESH_POINTS, OCCLUDERS = 300_000, 1_000_000
-"""Numbers of points on a mesh, and of those that hide points behind them."""
+"""Number of points on a mesh, and number of points on it that may hide others."""
 EYES = 20
 """Number of training cameras used to determine visibility."""
 

@@ -62,7 +62,7 @@ class Row:
     conditions: Conditions
     """Its data and budget."""
     geometry: GeometryFlags
-    """How its surface is judged; not at all without a reference."""
+    """Settings that judge its surface; without a reference the surface is not judged."""
 
     @property
     def seconds(self) -> float:

@@ -60,7 +60,7 @@ def sparse_points(images: PosedImages, placement: Placement, cameras: Cameras, k
     if images.points is not None:
         points = placement.points(images.points.double()).float()
         points = sound = points[points.isfinite().all(-1)]
-        observations = None  # those are of the tracks' points
+        observations = None  # observations refer to the tracks' points
         lost = {"out of range": len(images.points) - len(points)}
         notes = [_note(len(points), len(images.points), "of a file are used", lost), *notes[1:]]
     if known is not None and notes:

@@ -195,7 +195,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         """
         config, terms = self.config, dict[str, Tensor]()
         if config.flatness_penalty > 0 and len(gaussians):
-            # As in PGSR (Chen et al. 2024). Of equal scales a single one gets the gradient, so round Gaussians flatten.
+            # As in PGSR (Chen et al. 2024). One of several equal scales gets the gradient, so round Gaussians flatten.
             smallest = gaussians.log_scales.min(-1).values.exp()
             terms["flatness"] = config.flatness_penalty / self.extent * smallest.mean()
         if self.aligns_normals(progress):

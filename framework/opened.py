@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Opened(Loaded):
-    """A loaded run, file of Gaussians or of levels of them, or octree, with what `ns-render` and `ns-export` write."""
+    """A loaded run, file of Gaussians or of levels, or octree, with what `ns-render` and `ns-export` write."""
 
     @classmethod
     def of(cls, loaded: Loaded) -> Opened:

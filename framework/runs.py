@@ -38,7 +38,7 @@ def load(
     up: Axis | None = None,
     checkpoint: str | Path | None = None,
 ) -> Opened:
-    """Load a trained run, a scene in blocks, a file of Gaussians or of levels of them, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians or of levels, or an octree.
 
     Args:
         path: folder of the run, its config.yml, a folder above it (for its newest run), a blocks.yml or its folder, a

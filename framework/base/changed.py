@@ -17,7 +17,7 @@ def changed(settings: T, given: Mapping[str, Any], what: str) -> T:
     Args:
         settings: a dataclass.
         given: new values by name; None keeps a value.
-        what: what the settings are of, for the message.
+        what: name of the object with these settings, for the message.
 
     Raises:
         ConfigError: if there is no setting of a name.
@@ -31,8 +31,8 @@ def refuse(useless: Mapping[str, Any], what: str) -> None:
     """Refuse values that have no effect.
 
     Args:
-        useless: the values by the name of their flag, with underscores; None for one that is not given.
-        what: what they have no effect with, for the message.
+        useless: the values by the name of their flag, with underscores; None for a value that is not given.
+        what: name of the object that does not use them, for the message.
 
     Raises:
         ConfigError: if a value is given.

@@ -1,4 +1,4 @@
-"""Flags of commands that train by jobs: on what data, where, and how many jobs at a time."""
+"""Flags of commands that train by jobs: the data, the machines, and the number of jobs at a time."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ paths:
   ns-render interpolate RUN_FOLDER --output-path walk.mp4
   ns-render orbit RUN_FOLDER --output-path orbit.mp4 --seconds 8 --width 1920 --height 1080
 
-Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels of them (.levels), or an
+Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels (.levels), or an
 octree (.octree): orbit and camera-path need no data, others --data DIR [FORMAT [format flags]], as in
 
   ns-render orbit splat.ply --output-path orbit.mp4

@@ -22,7 +22,7 @@ class OpenFlags:
 
     load_config: Path
     """RUN_FOLDER, its config.yml, a folder above (its newest run), a blocks.yml of ns-blocks or its folder, a file of
-    Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels of them (.levels), or an octree (.octree). The flag's
+    Gaussians (.ply, .spz, .sog, .splat, .ksplat) or of levels (.levels), or an octree (.octree). The flag's
     name may be omitted."""
     load_checkpoint: Path | None = None
     """Checkpoint to load. Default: the newest."""
@@ -56,7 +56,7 @@ class RunFlags(OpenFlags):
     the surface. Default: the run's setting."""
 
     def changes(self) -> dict[str, Any]:
-        """Return the changed settings of what is opened, by name; None for its own value."""
+        """Return the changed settings of the run or file by name; None keeps its own value."""
         names = ("level_error", "memory_limit", "eval_rendering")
         return {name: getattr(self, name) for name in names}
 

@@ -50,7 +50,7 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Observations:
-    """O observations: which of M images see which of K sparse points, at known distances or not."""
+    """O observations: pairs of an image and a sparse point that it sees, with or without known distances."""
 
     images: Tensor
     """(O,) int64 image of each observation."""

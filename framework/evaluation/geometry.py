@@ -31,7 +31,7 @@ from nerfloom.evaluation.visibility import Shown, count_sightings
 NUM_POINTS = 100_000
 """Number of points on each surface."""
 DENSE, OCCLUDERS = 8, 10
-"""Numbers of points that find nearest faces, and that hide points behind them, for each judged point."""
+"""For each judged point: number of points that find nearest faces, and number of points that may hide others."""
 F_SCORE_AT = (0.0025, 0.01)
 """Default distances of F-scores, in sides of the reference's bounding box."""
 ELSEWHERE = 0.2

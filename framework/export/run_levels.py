@@ -103,7 +103,7 @@ def _write(
 def _within(
     parts: Callable[[int], Iterator[Gaussians]], origin: Tensor, regions: Sequence[Region]
 ) -> Callable[[int], Iterator[Gaussians]]:
-    """Return a function that yields what `parts` does, without Gaussians outside of a region."""
+    """Return a function that yields the Gaussians of `parts` without those outside of a region."""
 
     def kept(most: int) -> Iterator[Gaussians]:
         for part in parts(most):

@@ -273,9 +273,9 @@ def project(model: str, local: Tensor, lenses: Distortion | None) -> tuple[Tenso
         lenses: one lens, or the N lenses, one for each point, for the models in `DISTORTED`.
 
     Returns:
-        x and y (N,) in normalised image coordinates, and (N,) bool, whether the camera sees the point: it lies in front
-        of the camera and within the lens's reach. x and y are finite where it does not: a point beyond the reach lies
-        on its edge.
+        x and y (N,) in normalised image coordinates, and (N,) bool, whether the camera sees the point. It sees points
+        in front of it and within the lens's reach. x and y of other points are finite, too; a point beyond the reach is
+        moved to its edge.
     """
     right, down, depth = local[:, 0], -local[:, 1], -local[:, 2]
     visible = depth > 0

@@ -38,7 +38,7 @@ class Box:
     """A box, parallel to the axes of the frame or to axes of its own.
 
     Raises:
-        ConfigError: if it has no volume, or its axes are no unit vectors at right angles.
+        ConfigError: if it has no volume, or its axes are not unit vectors at right angles.
     """
 
     low: Vector

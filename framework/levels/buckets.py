@@ -1,4 +1,4 @@
-"""Division of a stream of Gaussians into files, each with those near each other, which fit into memory.
+"""Division of a stream of Gaussians into files of neighbouring Gaussians, each small enough for memory.
 
 A sample of the centres gives the cells of a kd-tree, which is halved at the median across the longest side of a cell's
 points. A bucket has the Gaussians of a cell.
@@ -82,8 +82,8 @@ class Buckets:
     def taken(self, index: int) -> Iterator[np.ndarray]:
         """Yield the rows (n, width) of a bucket, and remove its file.
 
-        They come at once, unless a bucket is too large. That is if very many Gaussians are at one place, so that no
-        plane can part them.
+        All rows are yielded at once, unless the bucket is too large. A bucket is too large if very many Gaussians are
+        at one place, where no plane can separate them.
 
         Args:
             index: index of the bucket.
@@ -110,7 +110,7 @@ def splits(points: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
     axes, values = np.zeros(2**depth - 1, np.int64), np.zeros(2**depth - 1, np.float32)
     cells = [points]
     for index in range(len(axes)):
-        cell, cells[index] = cells[index], points[:0]  # which is not needed below
+        cell, cells[index] = cells[index], points[:0]  # the cell itself is not needed below
         if len(cell):
             axes[index] = np.ptp(cell, axis=0).argmax()
             values[index] = np.median(cell[:, axes[index]])
@@ -120,7 +120,7 @@ def splits(points: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bucket_of(points: np.ndarray, axes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the cell (N,) int64 of each point, from 0, among those that the planes of a kd-tree leave.
+    """Return the index (N,) int64, from 0, of the cell of a kd-tree that contains each point.
 
     Args:
         points: (N, 3) positions.

@@ -37,7 +37,7 @@ MAX_ROWS = 2**17
 COPIES = 8
 """Memory for building, in sizes of a full bucket: halving a bucket copies it, and the rest is for chunks."""
 WAITING = 32
-"""Memory for building, at least, in sizes of a chunk: one of each level waits, and merging makes copies of two."""
+"""Minimum memory for building, in sizes of a chunk: one chunk of each level waits, and merging makes copies of two."""
 MOST_NODES = 6
 """Maximum number of nodes for the Gaussians of a full chunk. A leaf is at least half full, unless it is a bucket; there
 are at most as many buckets as full chunks, and fewer nodes above leaves than leaves."""
@@ -49,11 +49,11 @@ class Survey(NamedTuple):
     drawable: int
     """Number of Gaussians that can be drawn."""
     left_out: int
-    """Number of the others."""
+    """Number of Gaussians that cannot be drawn."""
     degree: int
     """Highest degree of their harmonics."""
     sample: Tensor
-    """(S, 3) float64 centres of some."""
+    """(S, 3) float64 centres of a random sample."""
 
 
 def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size: int, bits: Bits, memory: float) -> int:
@@ -133,7 +133,7 @@ def survey(stream: GaussianStream, rows: int) -> Survey:
 
 
 class _Node(NamedTuple):
-    """A node that is written, for the node above it."""
+    """A written node, with the values that the node above it needs."""
 
     number: int
     gaussians: Gaussians
@@ -173,14 +173,14 @@ class _Tree:
         return node
 
     def joined(self, first: _Node | None, second: _Node | None) -> _Node | None:
-        """Write the node above two nodes, and return it; return a node without a neighbour."""
+        """Write the node above two nodes, and return it; return a single node as it is."""
         if first is None or second is None:
             return first or second
         gaussians = Gaussians.joined([first.gaussians, second.gaussians])
         return self.node(*halved(gaussians, torch.cat([first.errors, second.errors])), first, second)
 
     def node(self, gaussians: Gaussians, errors: Tensor, *below: _Node) -> _Node:
-        """Write a node of Gaussians with their errors above others, and return it."""
+        """Write a node of Gaussians, with their errors, above its children, and return it."""
         centers = gaussians.means.double()
         low = torch.stack([centers.amin(0), *(node.low for node in below)]).amin(0)
         high = torch.stack([centers.amax(0), *(node.high for node in below)]).amax(0)
@@ -191,7 +191,7 @@ class _Tree:
 
 
 def reaches(gaussians: Gaussians) -> Tensor:
-    """Return the maximum distance (N,) float64 from its centre where each of N `gaussians` is drawn."""
+    """Return the maximum distance (N,) float64 from its centre at which each of N `gaussians` is drawn."""
     opacities = torch.sigmoid(gaussians.logits.double())
     sizes = gaussians.log_scales.double().amax(1).exp()
     return (2 * (opacities / MIN_ALPHA).clamp(min=1).log()).sqrt() * sizes

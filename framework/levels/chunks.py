@@ -1,4 +1,4 @@
-"""Chunks of Gaussians in memory: those that were used last, up to a limit."""
+"""A cache of the most recently used chunks of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nerfloom.splats.gaussians import Gaussians
 
 
 class ChunkCache:
-    """The chunks that were used last.
+    """A cache of the most recently used chunks, up to a maximum size.
 
     Args:
         read: reads a chunk, given its index.
@@ -24,14 +24,14 @@ class ChunkCache:
         self._held: OrderedDict[int, Gaussians] = OrderedDict()
 
     def chunks(self, indices: Sequence[int]) -> list[Gaussians]:
-        """Return chunks; those that are not in memory are read, in the place of those that were not used for longest.
+        """Return chunks. Missing ones are read, in place of the least recently used.
 
         Args:
-            indices: indices of the chunks, whose sizes do not exceed the capacity together.
+            indices: indices of the chunks; the sum of their sizes does not exceed the capacity.
         """
         for index in indices:
             if index in self._held:
-                self._held.move_to_end(index)  # before any is read, so that none of these leaves
+                self._held.move_to_end(index)  # before any chunk is read, so that none of these is removed
         return [self._chunk(index) for index in indices]
 
     def _chunk(self, index: int) -> Gaussians:

@@ -12,25 +12,25 @@ from nerfloom.levels.nodes import Nodes
 
 
 class Cut(NamedTuple):
-    """Nodes that together show what a view sees, each part of the scene once."""
+    """Nodes that show each visible part of the scene once."""
 
     nodes: list[int]
     """Indices of the nodes, in ascending order."""
     error: float
-    """Level error that the cut keeps, pixels."""
+    """Level error of the cut, pixels."""
 
 
 def cut_of(nodes: Nodes, sizes: Tensor, seen: Tensor, level_error: float, most: int) -> Cut:
     """Return the nodes that are drawn for a view.
 
     A node is drawn if its error on the image is at most the level error, or nothing is below it, and no node above it
-    is drawn. If these nodes have too many Gaussians, the level error grows to the smallest value for which they do not.
-    So a smaller limit never has a smaller error.
+    is drawn. If these nodes have too many Gaussians, the level error grows to the smallest value with few enough. So a
+    smaller limit never leads to a smaller error.
 
     Args:
         nodes: M nodes.
         sizes: (M,) error of each node on the image, pixels, at most that of the node above.
-        seen: (M,) bool, whether the view may show a node; if so, it may show the node above, too.
+        seen: (M,) bool, whether the view may show a node; it may then show the node above, too.
         level_error: requested level error, pixels; 0 for all Gaussians of the leaves.
         most: maximum number of Gaussians, at least that of the root.
     """

@@ -1,4 +1,4 @@
-"""A renderable of Gaussians in a tree of levels: for each view, chunks of the detail that it needs, from disk."""
+"""A renderable of Gaussians in a tree of levels, which reads the chunks that a view needs from disk."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ DRAWN_SIZE = 192
 """Memory of a drawn Gaussian besides its parameters, bytes: its record, twice while records are joined, and its entries
 in lists of tiles."""
 NEWS = 1.5
-"""A larger level error is reported if it is at least this many times the one that was reported before."""
+"""Minimum ratio of a level error to the last reported one for a new report."""
 
 
 class DrawnLevels(Renderable):
-    """A renderable of a file of levels. Chunks are in the frame of the file, where the camera of each view is moved.
+    """A renderable of a file of levels. Chunks stay in the frame of the file; the camera of each view is moved to it.
 
     Args:
         file: the file.
@@ -127,7 +127,7 @@ class DrawnLevels(Renderable):
         return camera, Projected(torch.cat(records), torch.cat(keys) if len(keys) == len(records) else None)
 
     def _report(self, cut: Cut) -> None:
-        """Say if the memory makes the level error larger than before."""
+        """Report a level error that the memory limit has made larger than before."""
         self.error = cut.error
         if cut.error >= NEWS * self._reported and cut.error > self.settings.level_error:
             limit = f"{self.settings.memory_limit:g} MB"

@@ -20,8 +20,8 @@ All but the means are float32 or float16, by `bits`; all numbers are little endi
     low, high              of each node: corners of a box of the centres of its Gaussians and of those below
     reach, error           of each node: `levels/nodes.py`
 
-So the place of each chunk follows from the numbers before, and the sizes are compared with the file's before any chunk
-is read. A chunk is read into memory and then used, instead of being mapped: if another process truncated a mapped file,
+The positions of all chunks follow from these numbers. They are compared with the size of the file before any chunk is
+read. A chunk is read into memory and then used, instead of being mapped: if another process truncated a mapped file,
 drawing would end this one.
 """
 
@@ -86,13 +86,13 @@ class LevelsFile:
     look: Look
     """The settings of drawing."""
     starts: Sequence[int]
-    """Position of each chunk in the file, bytes; behind them that of the header."""
+    """Position of each chunk in the file, and last that of the header, bytes."""
     checksums: Sequence[int]
     """CRC-32 of each chunk."""
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians of the scene: those of the leaves."""
+        """Number of Gaussians of the scene, which are in the leaves."""
         return int(self.nodes.counts[self.nodes.is_leaf].sum())
 
     @property
@@ -138,7 +138,7 @@ class LevelsFile:
 
 
 class LevelsWriter:
-    """Writes chunks of a file one after the other, those of the nodes below first.
+    """Writes the chunks of a file. The nodes below a node are written before it.
 
     Args:
         stream: a new binary file, which can be sought.
@@ -240,7 +240,7 @@ def read_levels(file: Path) -> LevelsFile:
 
 
 def _header(file: Path) -> tuple[dict[str, Any], int]:
-    """Return the header of a file and its position, after comparing what the file states of it with the file."""
+    """Return the header of a file and its position, after checking its length and checksum."""
     with file.open("rb") as stream:
         size, start = os.fstat(stream.fileno()).st_size, stream.read(PREAMBLE.size)
         if len(start) < PREAMBLE.size:
@@ -305,7 +305,7 @@ def _kind(name: str, bits: Bits) -> np.dtype[Any]:
 
 
 def _for_half(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians whose numbers fit into float16."""
+    """Return Gaussians with their numbers clamped to the range of float16, and unit rotations."""
     rotations = torch.nn.functional.normalize(gaussians.rotations.double(), dim=-1, eps=0).float()
     limited = gaussians.map(lambda values: values.clamp(-LARGEST_HALF, LARGEST_HALF))
     return Gaussians.of({**limited.columns, "means": gaussians.means, "rotations": rotations})

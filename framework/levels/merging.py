@@ -1,4 +1,4 @@
-"""Merging of Gaussians: one that stands for several near each other where they are seen from afar.
+"""Merging of neighbouring Gaussians into one that replaces them in distant views.
 
 Source: A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets (Kerbl et al. 2024,
 arXiv:2406.12080), the generation of the hierarchy. With opacities o, surfaces S of the ellipsoids, means m and
@@ -34,15 +34,15 @@ FLAT = 1e-14
 
 
 def halved(gaussians: Gaussians, errors: Tensor) -> tuple[Gaussians, Tensor]:
-    """Return Gaussians for the same space of about half the number, and their errors.
+    """Return about half as many Gaussians for the same space, and their errors.
 
     Gaussians near each other form groups of `GROUP`. Two thirds of the groups are merged, those that become smallest.
     The others stay as they are: large Gaussians, and those far from others.
 
     Args:
         gaussians: N Gaussians without further columns, all drawable.
-        errors: (N,) error of each, in the unit of the centres: the largest standard deviation of a merged Gaussian, of
-            itself and of those that were merged into it; 0 if it is not merged.
+        errors: (N,) error of each, in the unit of the centres; 0 if the Gaussian is not merged, else the largest
+            standard deviation among itself and the merged Gaussians in it.
 
     Returns:
         M Gaussians and (M,) their errors; M is at most N / 2 for N of at least 8.

@@ -12,8 +12,8 @@ from nerfloom.kernels.splats.project import MARGIN, MIN_ALPHA, SplatCamera
 from nerfloom.levels.nodes import Nodes
 
 STRETCH = math.pi / 2
-"""Maximum ratio of a Gaussian's extent on an image, which is that of a linear approximation, to its true one; a fisheye
-has the largest."""
+"""Maximum ratio of a Gaussian's linearly approximated extent on an image to its true extent; fisheyes have the
+largest."""
 EDGE_POINTS = 33
 """Number of positions along each edge of an image, for the directions that it shows."""
 SPARE = 0.02
@@ -27,8 +27,8 @@ def tangents(camera: Cameras, blur: float) -> Tensor:
 
     Args:
         camera: one camera, of a model that Gaussians can be drawn with; x is to the right, y down and z forward.
-        blur: variance that is added to Gaussians on the image, pixels^2. It widens the image by what reaches over its
-            edges.
+        blur: variance that is added to Gaussians on the image, pixels^2. The range is widened
+            accordingly, because Gaussians reach over the image's edges.
     """
     height, width = camera.sizes[0]
     border = math.sqrt(-2 * math.log(MIN_ALPHA) * blur)

@@ -8,14 +8,14 @@ from torch import Tensor
 from nerfloom.kernels.math import safe_normalize
 
 MIN_OPACITY = 0.5
-"""Minimum opacity of a pixel that counts. The mean distance of a more transparent one is that of no surface."""
+"""Minimum opacity of a pixel that counts. The mean distance of a more transparent pixel belongs to no surface."""
 
 
 def normals_of_distances(distances: Tensor, directions: Tensor) -> Tensor:
     """Return the unit normals (H - 2, W - 2, 3) of a surface at the inner pixels of an image, towards the camera.
 
-    A normal is the cross product of the differences between the points of opposite neighbours. It is 0 if the points
-    are one.
+    A normal is the cross product of the differences between the points of opposite neighbours. It is 0 if these
+    points coincide.
 
     Args:
         distances: (H, W) distance of the surface along each pixel's ray, scene units.
@@ -31,9 +31,9 @@ def normal_error(
 ) -> Tensor:
     """Return the mean error () of rendered normals against those of the rendered surface; 0 if no pixel counts.
 
-    The error of a pixel is sum_i w_i (1 - n_i . N). w_i and n_i are the weights and normals of what it shows, N is the
-    normal of the surface at the mean distances. A pixel counts if it and its four neighbours are kept and at least half
-    opaque.
+    The error of a pixel is sum_i w_i (1 - n_i . N). w_i and n_i are the weights and normals of the Gaussians in it, and
+    N is the normal of the surface at the mean distances. A pixel counts if it and its four neighbours are kept and at
+    least half opaque.
 
     Args:
         normals: (H, W, 3) sums of weight times normal.

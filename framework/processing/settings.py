@@ -198,7 +198,7 @@ class ProgramFlags(ViewFlags):
     """Flags of captures that another program placed."""
 
     panoramas: Literal["views", "whole"] = "views"
-    """What becomes of panoramas: perspective views, or whole, if a capture has nothing else."""
+    """Treatment of panoramas. views: cut into perspective views. whole: kept, if a capture has no other images."""
 
 
 @dataclass(frozen=True, kw_only=True)

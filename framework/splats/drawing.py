@@ -40,8 +40,8 @@ def splat_camera(
 ) -> SplatCamera:
     """Return a camera in the form that the rasteriser takes.
 
-    The lens decides how Gaussians are projected: by the unscented transform where EWA would leave out what an image
-    shows, which are panoramas and images of a fisheye beyond `EWA_ANGLE`.
+    Gaussians are projected by the unscented transform on panoramas and on images of a fisheye beyond `EWA_ANGLE`, where
+    EWA would leave out a part of the image. On all other images they are projected by EWA.
 
     Args:
         camera: one camera.

@@ -135,7 +135,7 @@ def stream_gaussians(file: Path) -> GaussianStream:
 
 
 def _reader(file: Path) -> tuple[Format, Callable[[Path], Splats]]:
-    """Return the format of a file, by its content or its name, and what reads it."""
+    """Return the format of a file, by its content or its name, and the function that reads it."""
     try:
         with file.open("rb") as stream:
             start = stream.read(4)

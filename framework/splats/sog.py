@@ -187,7 +187,7 @@ def _numbers(file: Path, part: dict[str, Any], key: str, number: int) -> np.ndar
 
 
 def _codes(file: Path, meta: dict[str, Any], key: str) -> np.ndarray:
-    """Return a codebook (CODES,) float64, whose first number early programs left out: it is null in their files.
+    """Return a codebook (CODES,) float64. Early programs wrote null instead of its first number.
 
     PlayCanvas's engine (src/scene/gsplat/gsplat-sog-data.js) puts it a step before the second, and so do we.
     """

@@ -1,4 +1,4 @@
-"""Loading of a run, a folder of runs, a scene in blocks, a file of Gaussians or of levels of them, or an octree."""
+"""Loading of a run, a folder of runs, a scene in blocks, a file of Gaussians or of levels, or an octree."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def load(
     up: Axis | None = None,
     **settings: Any,
 ) -> Loaded:
-    """Load a trained run, a scene in blocks, a file of Gaussians or of levels of them, or an octree.
+    """Load a trained run, a scene in blocks, a file of Gaussians or of levels, or an octree.
 
     Args:
         path: the run's folder, its config.yml, a folder above it (for its newest run), a blocks.yml, a file of
-            Gaussians (.ply, .spz, .sog, .splat, .ksplat) in the frame of the input, or one of levels of them (.levels),
+            Gaussians (.ply, .spz, .sog, .splat, .ksplat) in the frame of the input, or a file of levels (.levels),
             or an octree (.octree).
         checkpoint: checkpoint of a run; None for the newest readable one.
         device_type: auto, cpu, cuda or mps.

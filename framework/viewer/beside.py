@@ -28,7 +28,7 @@ def check_beside(loaded: Loaded, second: Loaded) -> None:
         second: the second run or file.
 
     Raises:
-        ConfigError: if one of them is in normalised device coordinates, in which frames differ by no similarity.
+        ConfigError: if one of them is in normalised device coordinates, where no similarity relates two frames.
     """
     for one in (loaded, second):
         if one.model.scene.warped:
@@ -38,7 +38,7 @@ def check_beside(loaded: Loaded, second: Loaded) -> None:
 def draw_beside(
     loaded: Loaded, second: Loaded | None, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None
 ) -> Arrays:
-    """Return the part of a piece of a view that the requested output needs, of one run or of two.
+    """Draw a piece of a view of one run, or of two with a divider: the arrays that the requested output needs.
 
     Args:
         loaded: the first run, left of the divider.
@@ -46,8 +46,8 @@ def draw_beside(
         request: the view, in the frame of the first run's scene.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
-        truth: true images of the first run for the output `error` and the overlay. They count for both runs, which see
-            the same data: the second may have moved its cameras.
+        truth: true images of the first run for the output `error` and the overlay. They count for both
+            runs, because the second may have refined its cameras.
     """
     if second is None or request.divider is None or request.divider >= 1:
         return draw(loaded, request, piece, ndc, truth)
@@ -63,7 +63,7 @@ def draw_beside(
 
 
 def joined(left: Arrays, right: Arrays, divider: float) -> Arrays:
-    """Return arrays whose left part is of one picture, and the rest of another.
+    """Join the left part of one picture's arrays to the right part of another's.
 
     Args:
         left: arrays (H, W, ...) of the picture on the left.

@@ -20,8 +20,8 @@ MAX_DOWNLOAD = 2**29
 class CommandPanel:
     """A bar, a line of text and a button of one browser.
 
-    Only the file that its last command has written is sent. A browser cannot name a file. It receives the file once:
-    what is on its way is in memory, and a browser could ask again and again, and read nothing.
+    Only the file that its last command has written is sent. A browser cannot name a file. It receives the file once,
+    because a file is in memory while it is sent, and a browser could request it repeatedly without reading it.
 
     Args:
         client: the browser.

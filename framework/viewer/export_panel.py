@@ -1,4 +1,4 @@
-"""The exports of one browser: what is shown, as `ns-export` writes it."""
+"""The exports of one browser, which `ns-export` writes with the crop and time that are shown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import viser
 
 FOLDER = "exports"
-"""Folder of exports in that of a run."""
+"""Folder of exports in the folder of a run."""
 CHOICES = {f"{name} {suffix}": (name, suffix) for name, kind in KINDS.items() for suffix in kind.suffixes}
 """Kinds of exports and the suffixes of their files, by their name in the list."""
 

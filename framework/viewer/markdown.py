@@ -7,5 +7,5 @@ KEPT = frozenset(" -_.,:;!?/%()'\"=–±")
 
 
 def plain(text: str) -> str:
-    """Return the Markdown of a `text` that is shown as it is, with question marks for what could be interpreted."""
+    """Return Markdown that shows `text` literally. Question marks replace characters that could be interpreted."""
     return "".join(letter if letter.isalnum() or letter in KEPT else "?" for letter in text).replace("_", r"\_")

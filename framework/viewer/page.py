@@ -81,7 +81,7 @@ class Page:
     def _add_tabs(
         self, client: viser.ClientHandle, tabs: Any, panel: Panel, crop: CropPanel, viewpoint: Viewpoint
     ) -> tuple[list[Any], list[Key]]:
-        """Add the tabs of a scene with lengths, and return the parts to close when the browser leaves, and keys."""
+        """Add the tabs of a scene with lengths. Return the parts to close when the browser leaves, and the keys."""
         queue, parts, keys = self._queue, list[Any](), [Key("C", "Crop on or off", crop.toggle)]
 
         def move(pose: Tensor, fov: float, time: float | None) -> None:

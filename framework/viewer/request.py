@@ -63,7 +63,7 @@ class Request:
     output: str = "rgb"
     """Name of the output: one of `OUTPUTS`, or one declared by the method."""
     time: float | None = None
-    """Time in [0, 1]; None for a static scene, and 0 of a moving one that is shown beside it."""
+    """Time in [0, 1]; None for a static scene. A moving scene beside a static one is then shown at time 0."""
     appearance: int | None = None
     """Training image whose appearance to use; None for the mean."""
     background: tuple[float, float, float] | None = None

@@ -1,4 +1,4 @@
-"""The gradient of a table of which a step uses few rows, such as the leaves of an octree, or one network per row."""
+"""Gradient of a table where a step uses few rows, such as the leaves of an octree, or one network per row."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _adam = native.Function("adam_rows", "ppppppqifddfi")
 
 
 class RowGradient:
-    """The deferred gradient of a table: rows, from each backward pass.
+    """The deferred gradient of a table: some of its rows, from each backward pass.
 
-    It fills the place of `nerfloom.kernels.grids.hash_grid_lookup.TableGradient`.
+    It has the methods of `nerfloom.kernels.grids.hash_grid_lookup.TableGradient`.
     """
 
     def __init__(self) -> None:

@@ -1,11 +1,11 @@
 """Many small networks of the same shape, each for some of the rows: KiloNeRF (Reiser et al. 2021), section 3.
 
-The parameters of a network are one row of a table, so that a step can update the networks that it used, and no other.
+The parameters of a network are one row of a table, so that a step can update only the networks that it used.
 
 A network has too few rows for a matrix product of its own to be fast. The compiled kernel sorts rows by network, and
-takes the rows of a network through all layers while its weights are in the cache. In PyTorch, rows are brought to
-places in chunks of equal size, each of rows of one network, and all chunks are multiplied in one batched product. A
-chunk that is not full is padded with zeros. In both forms a network without rows costs nothing.
+takes the rows of a network through all layers while its weights are in the cache. In PyTorch, rows are copied into
+chunks of equal size, each with rows of one network, and one batched product multiplies all chunks. A chunk that is not
+full is padded with zeros. In both forms a network without rows costs nothing.
 """
 
 from __future__ import annotations

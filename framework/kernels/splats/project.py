@@ -199,8 +199,8 @@ def _in_front(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Return which Gaussians (N,) can be projected and lie in front of the camera, and which can be. If the camera
-    shows all directions, those at a distance lie in front of it."""
+    """Return (N,) bool, whether a Gaussian can be projected and lies in front of the camera, and whether its numbers
+    allow a projection. If the camera is `all_around`, every Gaussian beyond `near` lies in front of it."""
     pose = camera.pose.to(means)
     with torch.no_grad():  # apart from the projection, since the gradient of the pose would be NaN times 0
         if camera.all_around:

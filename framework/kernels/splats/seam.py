@@ -9,7 +9,7 @@ from nerfloom.kernels.splats.project import Record
 
 
 def copies(records: Tensor, width: int, turn: float) -> tuple[Tensor, Tensor]:
-    """Return copies of the Gaussians that an image shows a whole turn to the left or to the right of their centre, too.
+    """Return copies of Gaussians that a panorama also shows a whole turn to the left or right of their centre.
 
     A Gaussian that is wider than a turn overlaps its copies. Gradients of a copy go to the Gaussian.
 

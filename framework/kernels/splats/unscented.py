@@ -13,15 +13,16 @@ No Jacobian is taken, so a Gaussian may lie beside the camera or behind it. The 
 sqrt(c_i) (f(p_i) - mean), whose squares cannot cancel; gradients go through all seven points. `unscented.h` is the
 same in C++.
 
-**What a lens does not show.** A Gaussian is left out if its centre is. For the lenses `ALL_AROUND`, a sigma point
-beyond the reach counts at the edge of the lens's disk, so that Gaussians there keep a size. For the others, a Gaussian
-with a sigma point that is not shown is left out, because points behind the camera have no position.
+**Points that a lens does not show.** A Gaussian is left out if the lens does not show its centre. For the lenses
+`ALL_AROUND`, a sigma point beyond the lens's reach is moved to the edge of its disk, so that Gaussians there keep a
+size. For the other lenses, a Gaussian is left out if the lens does not show all its sigma points, because points behind
+the camera have no position.
 
 **A panorama** (equirectangular) is an image of longitudes and latitudes. Longitudes are angles: they are counted from
-the centre's, within half a turn, and their mean is that of directions (the angle of the mean sine and cosine). So a
-Gaussian on the seam has the size that it has elsewhere; `seam.py` draws its other side. Near a pole a Gaussian is wide,
-and no ellipse is its image once it contains the pole. Its longitudes then still differ by at most half a turn, so the
-covariance stays finite: the Gaussian covers much of the rows next to the pole, which show a small solid angle.
+that of the centre, within half a turn, and their mean is the angle of the mean sine and cosine. So a Gaussian on the
+seam has the same size as elsewhere; `seam.py` draws its other side. Near a pole a Gaussian is wide, and the image of a
+Gaussian that contains the pole is not an ellipse. Its longitudes still differ by at most half a turn, so the covariance
+stays finite. The Gaussian covers much of the rows next to the pole, which show a small solid angle.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ def unscented(
         model: projection, a key of `LENSES`.
         lens: the distortion, for the models in `DISTORTED`.
         intrinsics: fx, fy, cx, cy, pixels; for equirectangular, pixels per radian.
-        width: width of the image, pixels. Of the positions of a panorama, which repeat every turn, the one nearest to
-            the middle of the image is returned.
+        width: width of the image, pixels. Positions on a panorama repeat every turn; the one nearest to the middle of
+            the image is returned.
 
     Returns:
         The means x, y (K,), pixels; columns (K, 2, 7) whose products are the covariance, pixels; and (K,) bool, whether

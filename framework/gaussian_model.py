@@ -71,6 +71,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         most = most_octaves(scene.image_pixels or scene.image_size**2)
         self.sizes = ImageSizes(config.reduced_until, most, config.paced)
         self.steps_per_move, self._first = config.steps_per_move, 0
+        self._last_change: int | None = None
         anywhere = torch.lerp(scene.box[0], scene.box[1], torch.rand(min(config.start_gaussians, MAX_NEW_GAUSSIANS), 3))
         self.set_gaussians(from_points(anywhere, torch.full_like(anywhere, 0.5), config.degree))
 
@@ -221,10 +222,13 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         self.columns["means"].values.data[which] += by / self.extent
 
     def changes_rows(self, step: int, progress: float) -> bool:
-        return step % self.steps_per_move == self.steps_per_move - 1 and progress <= self.config.growth_end
+        if self._last_change is None:  # a run that goes on has the same steps as one that was not stopped
+            self._last_change = step // self.steps_per_move * self.steps_per_move - 1
+        return step - self._last_change >= self.steps_per_move and progress <= self.config.growth_end
 
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
+        self._last_change = step
         gaussians = self.at_rest()
         if values := self.strategy.reset(gaussians, step):
             none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, which resets Adam's state

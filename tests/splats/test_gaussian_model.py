@@ -1,6 +1,7 @@
 """A method of Gaussians that is nothing but a start and a loss."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import pytest
@@ -65,3 +66,35 @@ def test_a_slow_run_changes_the_number_more_often(given: dict[str, Any], expecte
         model.keep_pace(Pace(step, float(step), 60.0))
         model.before_step(step, step / 60)
     assert model.steps_per_move == expected
+
+
+def test_changes_are_as_far_apart_as_was_asked_when_that_varies() -> None:
+    """Measured times vary, and with them the steps between changes. Multiples of a varying number would be anywhere."""
+    config, _ = decide_splatting(SplattingConfig(max_seconds=60.0, start_gaussians=100), SCENE)
+    model, changed = Plain(config, SCENE), []
+    for step in range(2000):
+        model.steps_per_move = 58 + step % 5
+        if model.changes_rows(step, 0.5):
+            assert list(model.after_step(step, 0.5)) == []  # nothing wants to grow
+            changed.append(step)
+    apart = [second - first for first, second in itertools.pairwise(changed)]
+    assert len(apart) > 30
+    assert set(apart) <= set(range(58, 63))
+
+
+def test_a_run_that_goes_on_changes_at_the_same_steps() -> None:
+    config, _ = decide_splatting(
+        SplattingConfig(max_num_iterations=1000, steps_per_move=10, start_gaussians=100), SCENE
+    )
+
+    def changes(first: int) -> list[int]:
+        model, changed = Plain(config, SCENE), []
+        for step in range(first, 60):
+            if model.changes_rows(step, step / 1000):
+                model.after_step(step, step / 1000)
+                changed.append(step)
+        return changed
+
+    assert changes(0) == [9, 19, 29, 39, 49, 59]
+    assert changes(30) == [39, 49, 59]
+    assert changes(39) == [39, 49, 59]

@@ -104,6 +104,7 @@ class DensityControl(Strategy):
     def __init__(self, steps_per_reset: int) -> None:
         super().__init__()
         self.steps_per_reset, self.gradients = steps_per_reset, GradientMean()
+        self._last_step: int | None = None
 
     def watch(self, records: Tensor, camera: SplatCamera) -> None:
         self.gradients.watch(records, camera)
@@ -112,7 +113,8 @@ class DensityControl(Strategy):
         self.gradients.add(finite)
 
     def reset(self, gaussians: Gaussians, step: int) -> dict[str, Tensor]:
-        if step % self.steps_per_reset != self.steps_per_reset - 1:
+        last, self._last_step = step - 1 if self._last_step is None else self._last_step, step
+        if (step + 1) // self.steps_per_reset == (last + 1) // self.steps_per_reset:
             return {}
         self.gradients.take(len(gaussians))
         return {"logits": gaussians.logits.clamp(max=math.log(MAX_RESET_OPACITY / (1 - MAX_RESET_OPACITY)))}

@@ -13,7 +13,9 @@ from nerfloom.splats.density_control import (
     GRADIENT,
     MAX_CLONED_SIZE,
     MAX_DEAD_OPACITY,
+    MAX_RESET_OPACITY,
     SHRUNK,
+    DensityControl,
     grown,
     image_gradients,
 )
@@ -87,6 +89,17 @@ def test_transparent_ones_and_those_that_are_not_finite_are_dropped() -> None:
     assert change is not None
     assert change.kept.tolist() == [0, 3]
     assert len(change.fresh) == 0
+
+
+@pytest.mark.parametrize(
+    ("asked", "reset"),
+    [([9, 19, 29, 39, 49, 59], [19, 39, 59]), ([7, 18, 26, 37, 48], [26, 48]), ([29, 39, 49], [39])],
+)
+def test_opacity_is_reset_once_in_a_period(asked: list[int], reset: list[int]) -> None:
+    """Also where no change of the number falls on the period's last step; a run may begin in its middle."""
+    control, given = DensityControl(20), row(3)
+    assert [step for step in asked if control.reset(given, step)] == reset
+    assert float(torch.sigmoid(control.reset(given, 79)["logits"]).max()) <= MAX_RESET_OPACITY * (1 + 1e-4)
 
 
 def test_nothing_to_do() -> None:

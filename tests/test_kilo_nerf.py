@@ -45,7 +45,7 @@ def test_the_grid_follows_the_box() -> None:
     flat = replace(SCENE, box=torch.tensor([[-1.0, -1.0, -0.25], [1.0, 1.0, 0.25]]))
     field = METHOD.build(METHOD.config, flat).field
     assert isinstance(field, NetworkGrid)
-    assert field.cells == (16, 16, 4)
+    assert field.cells == (8, 8, 2)
     assert METHOD.build(replace(METHOD.config, network_resolution=2), replace(SCENE, unbounded=True)).field.unbounded
 
 

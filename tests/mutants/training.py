@@ -169,7 +169,7 @@ MUTANTS = {
             "training/test_taught.py::test_density_and_colours_at_points"),
     ],
     "nerfloom.training.trained": [
-        Mutant("eval-flags-lost", "load_trained", "_changed(A, B, settings)", "A",
+        Mutant("eval-flags-lost", "load_trained", "changed(A, settings, B)", "A",
             "ns-eval --rays-per-pixel changes nothing",
             "cli/test_eval_command.py::test_rays_per_pixel_are_as_the_run_says_or_as_asked"),
     ],

@@ -147,7 +147,7 @@ def as_rows(gaussians: Gaussians, shift: Tensor, terms: int) -> np.ndarray:
 
 
 def of_rows(rows: np.ndarray) -> Gaussians:
-    """Return the Gaussians in `rows` (N, width) float32, with which most columns share memory."""
+    """Return the Gaussians in `rows` (N, width) float32; most columns share their memory."""
     parts = torch.from_numpy(rows).split([*WIDTHS, rows.shape[1] - sum(WIDTHS)], dim=1)
     columns = dict(zip(COLUMNS, parts, strict=True))
     columns["logits"] = columns["logits"][:, 0]

@@ -191,7 +191,7 @@ class _Tree:
 
 
 def reaches(gaussians: Gaussians) -> Tensor:
-    """Return the maximum distance (N,) float64 from its centre at which each of N `gaussians` is drawn."""
+    """Return how far (N,) float64 from their centres N `gaussians` are drawn."""
     opacities = torch.sigmoid(gaussians.logits.double())
     sizes = gaussians.log_scales.double().amax(1).exp()
     return (2 * (opacities / MIN_ALPHA).clamp(min=1).log()).sqrt() * sizes

@@ -61,7 +61,7 @@ def with_points(capture: Capture, file: Path | None) -> Capture:
 
 
 def _report_rounding(file: Path, points: Tensor) -> None:
-    """Report if float32, in which a file has the positions of `points` (K, 3), is too coarse for them."""
+    """Report if a file has the positions of `points` (K, 3) in float32, and float32 is too coarse for them."""
     if local_origin(points) is not None:
         say(
             f"{file}: so far from the origin, single precision has rounded its coordinates by up to "

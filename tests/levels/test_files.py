@@ -184,4 +184,4 @@ def test_headers_that_are_none(good: Path, tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "x.levels"
     path.write_bytes(good.read_bytes())
     write_header(path, text, header_of(path)[1])
-    refusal(path)
+    assert "is not a file of levels, or is damaged" in refusal(path)

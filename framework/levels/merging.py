@@ -119,7 +119,7 @@ def covariances(gaussians: Gaussians) -> Tensor:
 
 
 def nearby_order(points: Tensor, size: int) -> Tensor:
-    """Return an order (N,) of points in which each `size` consecutive ones, from the first, are near each other.
+    """Return an order (N,) of points with near points in each group of `size` consecutive ones.
 
     The points are halved across the longest side of their box, and so are the halves, down to groups of `size`.
 

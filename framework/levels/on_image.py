@@ -17,7 +17,7 @@ largest."""
 EDGE_POINTS = 33
 """Number of positions along each edge of an image, for the directions that it shows."""
 SPARE = 0.02
-"""Share by which the range of directions is enlarged, since a lens bends edges between these positions."""
+"""Relative enlargement of the range of directions, since a lens bends edges between these positions."""
 MIN_DEPTH = 1e-3
 """Minimum depth of a unit direction, whose tangents would be infinite at 90 degrees from the optical axis."""
 

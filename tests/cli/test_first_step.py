@@ -47,7 +47,7 @@ SLOW = {
 def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
     """Also with TensorBoard's files: what that alone imports comes after what is imported without.
 
-    Torch is there from the start; of what it imports itself nothing is slow.
+    Torch is imported from the start, and its own imports are not slow.
     """
     words = ["instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path, *TINY_NGP]
     done = forks.run(FIRST_STEP, *words)
@@ -108,7 +108,7 @@ Answer = tuple[int, str, list[str]]
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Answer, Path]]:
-    """What each mistake is answered with, and in which folder, by one process: what it imports stays imported."""
+    """The answers to all mistakes, with their folders, by one process; its imports stay imported."""
     folders = {mistake: with_a_run(tmp_path_factory.mktemp("refused")) for mistake in PATHS}
     asked = [
         (name, [word.format(folders[mistake]) for word in words], str(folders[mistake]))

@@ -53,7 +53,7 @@ def test_images_reduced_beforehand_are_reduced_on(capture: Path) -> None:
 
 
 def write_alike(folder: Path, width: int, height: int) -> None:
-    """Write images of which the size alone matters; to encode each would take most of the time."""
+    """Write images for their size alone; encoding each would take most of the time."""
     write_images(folder, NAMES[:1], width, height)
     for name in NAMES[1:]:
         shutil.copy(folder / NAMES[0], folder / name)

@@ -8,15 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from nerfloom.base.errors import ConfigError
-from nerfloom.losses.few_images import (
-    MAX_FEW,
-    MAX_FEW_WITH_ALPHA,
-    UNSEEN_START,
-    UNSEEN_STEPS,
-    FewImagesConfig,
-    unseen_weight,
-)
+from nerfloom.losses.few_images import MAX_FEW, MAX_FEW_WITH_ALPHA, FewImagesConfig
 from nerfloom.registry import load_method
 from nerfloom.training.trainer import Trainer
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
@@ -35,8 +27,8 @@ def decided(method: str, count: int, scene: Any = CAPTURE, **settings: Any) -> t
     return config, "\n".join(decision.line() for decision in made)
 
 
-def parts(config: FewImagesConfig) -> tuple[float, float, float]:
-    return config.open_levels_until, config.unseen_loss_mult, config.occlusion_loss_mult
+def parts(config: FewImagesConfig) -> tuple[float, float]:
+    return config.open_levels_until, config.occlusion_loss_mult
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -48,20 +40,20 @@ def test_few_images_of_a_capture_are_recognised(method: str) -> None:
     assert "(else: --few-images False)" in said
     many, said = decided(method, MAX_FEW + 1)
     assert not many.few_images
-    assert parts(many) == (0, 0, 0)
-    assert not re.search("few images|unseen|occlusion|levels", said)
+    assert parts(many) == (0, 0)
+    assert not re.search("few images|occlusion|levels", said)
 
 
 def test_a_flag_turns_them_off_and_on() -> None:
     off, said = decided("nerfacto", 3, few_images=False)
-    assert parts(off) == (0, 0, 0)
+    assert parts(off) == (0, 0)
     assert "few images" not in said
     on, _ = decided("nerfacto", 500, few_images=True)
     assert parts(on) == parts(decided("nerfacto", 3)[0])
 
 
 def test_each_part_has_a_flag() -> None:
-    for name in ("open_levels_until", "unseen_loss_mult", "occlusion_loss_mult"):
+    for name in ("open_levels_until", "occlusion_loss_mult"):
         config, said = decided("nerfacto", 3, **{name: 0.25})
         assert getattr(config, name) == 0.25
         assert name.replace("_", " ") not in said
@@ -72,22 +64,12 @@ def test_alpha_shows_what_is_empty_so_that_fewer_images_are_few() -> None:
     for count, few in ((MAX_FEW_WITH_ALPHA, True), (MAX_FEW_WITH_ALPHA + 1, False)):
         config, _ = decided("vanilla-nerf", count, dataclasses.replace(SCENE, has_alpha=True))
         assert config.few_images == few
-        assert parts(config) == (0.5 * few, 0, 0)
+        assert parts(config) == (0.5 * few, 0)
     assert not decided("instant-ngp", 3, dataclasses.replace(SCENE, has_alpha=True))[0].few_images
 
 
-def test_no_view_between_cameras_in_normalised_device_coordinates_or_in_motion() -> None:
-    with pytest.raises(ConfigError, match="do not work in normalised device coordinates"):
-        decided("nerfacto", 3, dataclasses.replace(CAPTURE, warped=True, unbounded=False), unseen_loss_mult=0.1)
+def test_few_images_of_a_moving_scene_are_not_recognised() -> None:
     assert not decided("kplanes", 3, dataclasses.replace(CAPTURE, moving=True))[0].few_images
-
-
-def test_the_weight_of_unseen_views_falls_to_what_is_asked_for() -> None:
-    config = load_method("nerfacto").config
-    assert isinstance(config, FewImagesConfig)
-    config = dataclasses.replace(config, unseen_loss_mult=0.3)
-    found = [unseen_weight(config, step) for step in (0, UNSEEN_STEPS // 2, UNSEEN_STEPS, 10 * UNSEEN_STEPS)]
-    assert found == pytest.approx([0.3 * UNSEEN_START, 0.15 * (1 + UNSEEN_START), 0.3, 0.3])
 
 
 def stepped(trainer: Trainer, steps: int = 3) -> dict[str, float]:
@@ -98,13 +80,11 @@ def stepped(trainer: Trainer, steps: int = 3) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_terms_are_there_where_they_are_asked_for(method: str, shared_tiny: Path, tmp_path: Path) -> None:
+def test_the_term_is_there_where_it_is_asked_for(method: str, shared_tiny: Path, tmp_path: Path) -> None:
     """What is near is the whole scene here, so that there is density in it."""
-    asked = {"unseen_loss_mult": 1.0, "occlusion_loss_mult": 1.0, "occlusion_range": 3.0, "unseen_patches": 2}
-    found = stepped(tiny_trainer(method, shared_tiny, tmp_path / "with", **asked))
-    assert found["unseen"] > 0
-    assert found["occlusion"] > 0
-    assert not {"unseen", "occlusion"} & stepped(tiny_trainer(method, shared_tiny, tmp_path / "without")).keys()
+    asked = {"occlusion_loss_mult": 1.0, "occlusion_range": 3.0}
+    assert stepped(tiny_trainer(method, shared_tiny, tmp_path / "with", **asked))["occlusion"] > 0
+    assert "occlusion" not in stepped(tiny_trainer(method, shared_tiny, tmp_path / "without"))
 
 
 @pytest.mark.medium
@@ -131,7 +111,7 @@ def test_matter_before_cameras_goes_away(shared_tiny: Path, tmp_path: Path) -> N
 
 def test_with_many_images_not_a_bit_changes(shared_tiny: Path, tmp_path: Path) -> None:
     """Ten images with alpha are not few: a run equals one with all terms switched off, random numbers included."""
-    runs = [{}, {"few_images": False}, {"unseen_loss_mult": 0.0, "open_levels_until": 0.0, "occlusion_loss_mult": 0.0}]
+    runs = [{}, {"few_images": False}, {"open_levels_until": 0.0, "occlusion_loss_mult": 0.0}]
     trainers = [tiny_trainer("instant-ngp", shared_tiny, tmp_path / str(i), **run) for i, run in enumerate(runs)]
     for trainer in trainers:
         stepped(trainer)

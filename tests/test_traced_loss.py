@@ -53,7 +53,6 @@ def test_steps_are_those_of_single_operations(
     [
         {"depth_loss_mult": 0.5},
         {"occlusion_loss_mult": 0.1, "few_images": True},
-        {"unseen_loss_mult": 0.1, "few_images": True},
         {"open_levels_until": 1.0, "few_images": True},
         {"background_model": "contraction"},
         {"gradient_scaling": True},

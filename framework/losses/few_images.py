@@ -1,8 +1,7 @@
 """Settings of ray methods for scenes with few images, and the decision when to use them.
 
-There are three regularisers, each with its own setting. Levels of the encoding open from coarse to fine (FreeNeRF, Yang
-et al. 2023), views between the training cameras should have smooth depth (RegNeRF, Niemeyer et al. 2022), and space
-right before cameras should be empty (FreeNeRF).
+There are two regularisers, each with its own setting, both from FreeNeRF (Yang et al. 2023). Levels of the encoding
+open from coarse to fine, and space right before cameras should be empty.
 """
 
 from __future__ import annotations
@@ -12,15 +11,12 @@ from typing import ClassVar, TypeVar
 
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice, Decision, fill
-from nerfloom.base.errors import ConfigError
 from nerfloom.data.scene import Scene
 
 MAX_FEW, MAX_FEW_WITH_ALPHA = 12, 8
 """Maximum number of training images that counts as few: in captures, and in images whose alpha marks empty space."""
 OCCLUSION = 0.01
 """Weight of the optical depth near cameras, as in FreeNeRF's settings."""
-UNSEEN_START, UNSEEN_STEPS = 10.0, 512
-"""Factor of the weight of unseen views at the first step, and the number of steps over which it falls to 1."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +25,6 @@ class FewImagesConfig(RayConfig):
 
     RANGES: ClassVar[dict[str, Range]] = {
         "open_levels_until": (0, 1),
-        "unseen_loss_mult": AT_LEAST_0,
-        "unseen_patches": (1, 2**14),
         "occlusion_loss_mult": AT_LEAST_0,
         "occlusion_range": AT_LEAST_0,
     }
@@ -41,10 +35,6 @@ class FewImagesConfig(RayConfig):
     open_levels_until: Auto[float] = AUTO
     """Fraction of the budget for opening the encoding's levels, from coarse to fine; 0 opens all at once. auto:
     0.5 with few images for vanilla-nerf, otherwise 0."""
-    unseen_loss_mult: float = 0.0
-    """Weight of the roughness of depth in views between the training cameras, such as 0.1; 0 disables such views."""
-    unseen_patches: int = 8
-    """Number of patches of 8 x 8 rays in such views per step."""
     occlusion_loss_mult: Auto[float] = AUTO
     """Weight of the optical depth right before cameras. auto: 0.01 with few images without alpha, otherwise 0."""
     occlusion_range: float = 1.2
@@ -63,12 +53,7 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
 
     Returns:
         The settings, and the decisions made; no decisions if there are many images.
-
-    Raises:
-        ConfigError: if unseen views are selected with normalised device coordinates.
     """
-    if config.unseen_loss_mult and scene.warped:
-        raise ConfigError("--unseen-loss-mult: unseen views do not work in normalised device coordinates")
     choices = (
         Choice("open_levels_until", open_until, "few images are explained by coarse shapes first"),
         Choice("occlusion_loss_mult", OCCLUSION * (not scene.has_alpha), "space right before a camera is empty"),
@@ -81,13 +66,3 @@ def decide_few_images(config: ConfigT, scene: Scene, open_until: float = 0.0) ->
         return fill(config, *(replace(choice, value=0.0) for choice in choices))[0], []
     config, parts = fill(config, *choices)
     return config, made + [part for part in parts if part.choice != "0"]
-
-
-def unseen_weight(config: FewImagesConfig, step: int) -> float:
-    """Return the weight of unseen views in a step; it falls linearly at first, as in RegNeRF.
-
-    Args:
-        step: number of training steps done.
-    """
-    share = min(step / UNSEEN_STEPS, 1.0)
-    return config.unseen_loss_mult * (UNSEEN_START * (1 - share) + share)

@@ -186,25 +186,3 @@ def density_before(samples: Samples, distance: float) -> Tensor:
         raise ValueError("density_before() needs samples whose density is attached")
     lengths = (samples.t_ends.clamp(max=distance) - samples.t_starts).clamp(min=0)
     return (samples.sigma * lengths).sum() / max(samples.num_rays, 1)
-
-
-def depth_roughness(weights: Tensor, samples: Samples, side: int) -> Tensor:
-    """Return the roughness of the depth of square patches of rays, after RegNeRF (Niemeyer et al. 2022), equation 8.
-
-    It is the mean squared difference between neighbours. RegNeRF uses the depth. This function uses the inverse depth,
-    which is linear in the image of a plane, relative to its mean in the patch. Neighbours are weighted by the opacity
-    of both.
-
-    Args:
-        weights: (N,) weights of the samples.
-        samples: N samples of P side^2 rays, patch by patch, row by row.
-        side: rays along an edge of a patch.
-    """
-    opacity = ray_sum(weights, samples)
-    inverse = ray_sum(weights / samples.t.clamp(min=MIN_DEPTH), samples) / opacity.clamp(min=MIN_OPACITY)
-    values, opaque = inverse.view(-1, side, side), opacity.detach().view(-1, side, side)
-    mean = (opaque * values).sum((1, 2), keepdim=True) / opaque.sum((1, 2), keepdim=True).clamp(min=MIN_OPACITY)
-    values = values / mean.detach().clamp(min=MIN_DEPTH)
-    down = opaque[:, 1:] * opaque[:, :-1] * values.diff(dim=1).square()
-    across = opaque[:, :, 1:] * opaque[:, :, :-1] * values.diff(dim=2).square()
-    return (down.sum() + across.sum()) / max(down.numel(), 1)

@@ -7,30 +7,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from nerfloom.cameras.unseen import unseen_patches
 from nerfloom.data.pixels.batch import PixelBatch
-from nerfloom.losses.few_images import unseen_weight
 from nerfloom.losses.functions import (
     density_before,
     depth_error,
-    depth_roughness,
     distance_likelihood,
     matter_before,
     mean_squared_error,
     normalised_distortion,
 )
 from nerfloom.losses.term import LossTerm, RenderedBatch
-from nerfloom.renderable import training_poses
 from nerfloom.samplers.proposal import half_edge
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
-
-PATCH = 8
-"""Rays along the edge of a patch of an unseen view, as in RegNeRF (Niemeyer et al. 2022)."""
-PATCH_IMAGE = 500
-"""Rays of a patch are one pixel apart in images up to this longer side, pixels; in larger images their distance grows
-in proportion."""
 
 
 class ColorError(LossTerm):
@@ -179,33 +169,5 @@ class MatterNearCameras(LossTerm):
         return torch.stack(before).sum() if before else None
 
 
-class UnseenRoughness(LossTerm):
-    """Roughness of depth in views between the training cameras: RegNeRF (Niemeyer et al. 2022), equation 8."""
-
-    def __init__(self) -> None:
-        super().__init__("unseen", "unseen_loss_mult")
-
-    def factor(self, config: Any, step: int) -> float:
-        return unseen_weight(config, step)
-
-    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
-        return batch.rays.camera_indices is not None
-
-    def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        batch, model = shown.batch, shown.model
-        poses = training_poses(model)
-        if not len(batch) or poses is None:
-            return None
-        rays = batch.rays[:: batch.rays_per_pixel][: model.config.unseen_patches].detached()
-        stride = max(model.scene.image_size / PATCH_IMAGE, 1.0)
-        unseen = model.render(unseen_patches(rays, poses, PATCH, stride), batch.background[0])
-        if unseen.weights is None or unseen.samples is None:
-            return None
-        return depth_roughness(unseen.weights, unseen.samples, PATCH)
-
-    def varies(self, config: Any) -> str | None:
-        return "the weight of unseen views changes from step to step" if config.unseen_loss_mult else None
-
-
-FEW_IMAGES = MatterNearCameras(), UnseenRoughness()
+FEW_IMAGES = (MatterNearCameras(),)
 """Terms of methods whose settings include `FewImagesConfig`."""

@@ -17,6 +17,7 @@ from torch import Tensor
 from benchmarks.operations import trainer_of
 from nerfloom.base.errors import ConfigError, DivergenceError
 from nerfloom.base.step_kind import StepKind
+from nerfloom.losses.terms import ColorError
 from nerfloom.model import Loss
 from nerfloom.samplers import proposal
 from nerfloom.testing.scenes import moving_ball
@@ -410,7 +411,6 @@ def test_reasons_are_said_once_each(said: list[str]) -> None:
     [
         ("nerfacto", {}, None),
         ("nerfacto", {"sampler": "occupancy"}, "the number of samples on a ray varies"),
-        ("nerfacto", {"few_images": True, "unseen_loss_mult": 0.1}, "the weight of unseen views changes"),
         ("nerfacto", {"few_images": True, "open_levels_until": 0.5}, "levels are still opening"),
         ("instant-ngp", {}, "the number of samples on a ray varies"),  # on the CPU
         ("kplanes", {}, "the number of samples on a ray varies"),
@@ -429,6 +429,18 @@ def test_methods_say_whether_their_steps_repeat(
         assert kind != kind_of_step(trainer.model, trainer.source, 0, (255, 1))
     else:
         assert words in str(kind.varies)
+
+
+def test_a_term_says_that_its_steps_do_not_repeat(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Ramp(ColorError):
+        def varies(self, config: Any) -> str:
+            return "the weight of a term changes"
+
+    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path)
+    monkeypatch.setattr(trainer.model, "losses", (Ramp(),))
+    assert kind_of_step(trainer.model, trainer.source, 0, (256, 1)).varies == "the weight of a term changes"
 
 
 def test_the_flag(shared_tiny: Path, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ CASES: dict[str, dict[str, Any]] = {
     "surface": {"method": "neus", "thin_gradients": 0.0, "eikonal_loss_mult": 0.0},
     "surface by a density": {"method": "volsdf", "thin_gradients": 0.0},
     "nested boxes": {"sampler": "occupancy"},
-    "few images": {"unseen_loss_mult": 0.1, "open_levels_until": 0.5, "occlusion_loss_mult": 0.01},
+    "few images": {"open_levels_until": 0.5, "occlusion_loss_mult": 0.01},
 }
 
 

@@ -30,11 +30,7 @@ SHARED_BY = 2
 
 
 def nothing_to_decide(config: Any, scene: Scene) -> tuple[Any, list[Decision]]:
-    """Return the settings unchanged and no decisions: the default of `Method.decide`.
-
-    Args:
-        config: the method's settings.
-    """
+    """Return the settings `config` unchanged and no decisions: the default of `Method.decide`."""
     return config, []
 
 

@@ -61,27 +61,13 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @abstractmethod
     def loss(self, batch: Any, step: int) -> Loss:
-        """Return the loss on a batch.
-
-        Args:
-            batch: a `PixelBatch` or a `ViewBatch`, according to `batches`.
-            step: number of training steps done.
-        """
+        """Return the loss on a `batch`, of the kind named by `batches`, after `step` training steps."""
 
     def before_step(self, step: int, progress: float) -> None:
-        """Apply schedules and update samplers; called before each training step.
-
-        Args:
-            step: number of training steps done.
-            progress: fraction of the training budget that is spent.
-        """
+        """Apply schedules and update samplers; called before training step `step`, at the spent fraction `progress`."""
 
     def step_kind(self, step: int) -> StepKind:
-        """Return the kind of a training step; by default steps cannot be replayed.
-
-        Args:
-            step: number of training steps done.
-        """
+        """Return the kind of training step `step`, counted from 0; by default steps cannot be replayed."""
         return StepKind(varies="the method does not say that its steps repeat")
 
     def read_counts(self) -> None:
@@ -164,11 +150,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
 @contextmanager
 def evaluating(model: nn.Module) -> Iterator[None]:
-    """Set evaluation mode within a `with` block, and restore the previous mode afterwards.
-
-    Args:
-        model: the model, or a part of one.
-    """
+    """Set a `model`, or a part of one, to evaluation mode within a `with` block, and restore its mode afterwards."""
     was_training = model.training
     model.eval()
     try:
@@ -189,11 +171,7 @@ class StartsFromImages(Protocol):
     """A model that initialises its parameters from the images, before the first step."""
 
     def start(self, dataset: Dataset) -> None:
-        """Initialise the parameters of a new model.
-
-        Args:
-            dataset: training images, on the model's device.
-        """
+        """Initialise the parameters of a new model from the training images `dataset`, on the model's device."""
 
 
 @runtime_checkable
@@ -201,8 +179,4 @@ class KeepsPace(Protocol):
     """A model that adapts sizes to the speed of its steps, in a run with a time budget."""
 
     def keep_pace(self, pace: Pace) -> None:
-        """Adapt sizes to the time of the last steps; called before each training step.
-
-        Args:
-            pace: the run before the step.
-        """
+        """Adapt sizes to the time of the last steps; called before each training step, with the run's `pace`."""

@@ -49,13 +49,7 @@ class OctreeConfig(
 
 
 class LeafTable(nn.Module):
-    """Learnt values of the leaves.
-
-    Args:
-        name: name of the learning rate in logs.
-        rate: learning rate.
-        width: number of values of a leaf.
-    """
+    """Learnt values of the leaves, `width` for each, with the learning rate `rate`, which logs call `name`."""
 
     def __init__(self, name: str, rate: float, width: int) -> None:
         super().__init__()
@@ -65,12 +59,7 @@ class LeafTable(nn.Module):
 
 
 class OctreeModel(Model[OctreeConfig], DrawsOctree):
-    """An octree with learnt density and colour; `set_octree` sets the positions of its leaves.
-
-    Args:
-        config: the settings.
-        scene: the scene.
-    """
+    """An octree with learnt density and colour, for `config` and `scene`; `set_octree` places its leaves."""
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
 

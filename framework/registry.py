@@ -46,13 +46,7 @@ CALLED = {"methods": "method", "dataparsers": "data format"}
 
 @dataclass(frozen=True)
 class Entry:
-    """A registered method or data format.
-
-    Args:
-        name: the name that users type.
-        module: full name of the module to import.
-        attribute: name of the object in the module.
-    """
+    """A registered method or data format by its `name`: the `attribute` of a `module`, given by its full name."""
 
     name: str
     module: str

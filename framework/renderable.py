@@ -173,21 +173,12 @@ def refined_cameras(model: Renderable, cameras: Cameras, training: bool) -> Came
 
 
 def with_refined_poses(model: Renderable, dataset: Dataset) -> Dataset:
-    """Return images of the data with their cameras where they stand in the scene of a model.
-
-    Args:
-        model: the model.
-        dataset: images with the poses of the data.
-    """
+    """Return the images `dataset` with their cameras where they stand in the scene of a `model`."""
     return replace(dataset, cameras=refined_cameras(model, dataset.cameras, dataset.training))
 
 
 def training_poses(model: Renderable) -> Tensor | None:
-    """Return where the training cameras stand in the scene, (M, 3, 4) poses; None if they are not known.
-
-    Args:
-        model: the model.
-    """
+    """Return where the training cameras stand in the scene of `model`, (M, 3, 4) poses; None if they are not known."""
     given = model.scene.camera_to_worlds
     return None if given is None else model.refined_poses(given, training=True)
 

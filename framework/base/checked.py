@@ -35,12 +35,7 @@ def checked(kind: type[T], values: Any) -> T:
 
 
 def is_instance_of(value: Any, hint: Any) -> bool:
-    """Return whether `value` is of the annotated type `hint`.
-
-    Args:
-        value: any object.
-        hint: a class, or a union, `Literal` or tuple of classes. A bool does not count as a number.
-    """
+    """Return whether `value` is of the type `hint`: a class, union, `Literal` or tuple. A bool is no number."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (Union, types.UnionType):
         return any(is_instance_of(value, argument) for argument in arguments)

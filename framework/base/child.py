@@ -7,10 +7,5 @@ SAFE = ("-P",) if sys.version_info >= (3, 11) else ()
 
 
 def python_command(module: str, *arguments: object) -> list[str]:
-    """Return the command line that runs a module as a program, from any working folder.
-
-    Args:
-        module: full name of the module, such as nerfloom.cli.train.
-        arguments: command-line arguments, converted to strings.
-    """
+    """Return the command line that runs a `module`, such as nerfloom.cli.train, with `arguments`, from any folder."""
     return [sys.executable, *SAFE, "-m", module, *map(str, arguments)]

@@ -31,11 +31,7 @@ console = Console(stderr=True, highlight=False, force_terminal=False if _IS_OFTE
 
 
 def say(message: str) -> None:
-    """Print a line to standard error, so that standard output can be piped.
-
-    Args:
-        message: plain text; it is not parsed as rich markup.
-    """
+    """Print a line to standard error, so that standard output can be piped. `message` is not parsed as rich markup."""
     console.print(printable(message), markup=False, soft_wrap=True)
 
 

@@ -85,11 +85,7 @@ def num_cores() -> int:
 
 
 def num_gpus(device_type: str) -> int:
-    """Return the number of GPUs that a process asks for: 1 if it computes with CUDA, else 0.
-
-    Args:
-        device_type: auto, cpu, cuda or mps.
-    """
+    """Return the number of GPUs that a process with this `device_type` asks for: 1 if it computes with CUDA, else 0."""
     return int(device_type == "cuda" or (device_type == "auto" and torch.cuda.is_available()))
 
 
@@ -190,12 +186,10 @@ def seed_step(seed: int, step: int, stream: int = 0) -> None:
 
 @contextmanager
 def shared_stream(seed: int, step: int, stream: int) -> Iterator[None]:
-    """Draw the same random numbers in all processes within a `with` block. No effect with a single process.
+    """Draw the same random numbers in all processes within a `with` block.
 
-    Args:
-        seed: the run's seed.
-        step: the step's number.
-        stream: number of the shared stream: BEFORE_STEP or AFTER_STEP.
+    `seed` is the run's, `stream` is BEFORE_STEP or AFTER_STEP of a `step`. There is no effect with a single
+    process.
     """
     if processes().count == 1:
         yield
@@ -206,13 +200,7 @@ def shared_stream(seed: int, step: int, stream: int) -> Iterator[None]:
 
 
 def stream_seed(seed: int, step: int, stream: int = 0) -> int:
-    """Return the seed of a random stream of one step, a well mixed integer of 63 bits.
-
-    Args:
-        seed: the run's seed.
-        step: the step's number.
-        stream: number of the stream.
-    """
+    """Return the seed of a random `stream` of a `step`, mixed with the run's `seed` into an integer of 63 bits."""
     state = 0x9E3779B97F4A7C15
     for value in (seed, step, stream) if stream else (seed, step):
         state = ((state ^ (value & 0xFFFFFFFFFFFFFFFF)) * 0xBF58476D1CE4E5B9) & 0xFFFFFFFFFFFFFFFF

@@ -7,11 +7,6 @@ from torch import Tensor
 
 
 def evenly_spaced(count: int, most: int) -> Tensor:
-    """Return at most `most` indices below `count`, (K,) int64, evenly spaced, including the first and the last.
-
-    Args:
-        count: number of items.
-        most: maximum number of indices.
-    """
+    """Return at most `most` indices below `count`, (K,) int64, evenly spaced, including the first and the last."""
     # float32 does not represent integers beyond 2^24 exactly, and indices of pixels run over all images.
     return torch.linspace(0, count - 1, min(count, most), dtype=torch.float64).long()

@@ -127,11 +127,7 @@ RENDERING = {
 
 
 def render_answer(flag: str) -> str | None:
-    """Return the answer to a flag of nerfstudio's ns-render that does not exist here; None for other words.
-
-    Args:
-        flag: the word as typed, possibly with =VALUE.
-    """
+    """Return the answer to a `flag` of nerfstudio's ns-render, possibly with =VALUE; None for other words."""
     name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
     answer = RENDERING.get(name.partition(".")[0]) if flag.startswith("--") else None
     return None if answer is None else f"--{name} is nerfstudio's; {answer}"
@@ -181,12 +177,9 @@ def _ours(flag: str, known: Collection[str]) -> str | None:
 
 
 def flag_answer(flag: str, method: str, known: Collection[str]) -> str | None:
-    """Return the answer to a flag of nerfstudio that does not exist here; None for other flags.
+    """Return the answer to a `flag` of nerfstudio that does not exist here; None for other flags.
 
-    Args:
-        flag: the flag as typed, possibly with =VALUE.
-        method: name of the method.
-        known: flags of this method, with their dashes.
+    The flag may have =VALUE. `known` are the flags of the `method`, with their dashes.
     """
     name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
     beginning = name.partition(".")[0]
@@ -208,11 +201,7 @@ def _equivalent(name: str) -> str:
 
 
 def format_answer(name: str) -> str | None:
-    """Return the answer to a data subcommand of nerfstudio; None for other words.
-
-    Args:
-        name: the word that a user typed as data format.
-    """
+    """Return the answer to the `name` of a data subcommand of nerfstudio; None for other words."""
     if name in FORMATS:
         return f"'{name}' is nerfstudio's; here the data format is called '{FORMATS[name]}'"
     if name in NO_FORMATS:

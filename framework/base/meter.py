@@ -18,11 +18,7 @@ def time_text(seconds: float) -> str:
 
 
 def left_text(seconds: float | None) -> str:
-    """Return the time left as text, such as ``3 min left``.
-
-    Args:
-        seconds: the duration; None if unknown, which is written as a dash.
-    """
+    """Return the time left in `seconds` as text, such as ``3 min left``, or with a dash if it is None."""
     return f"{UNKNOWN if seconds is None else time_text(seconds)} left"
 
 

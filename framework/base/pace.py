@@ -46,12 +46,7 @@ class StepTimes:
         return self._seconds.get(size)
 
     def learn(self, pace: Pace, size: int) -> None:
-        """Measure the steps since the last call.
-
-        Args:
-            pace: the run after these steps.
-            size: their size.
-        """
+        """Measure the steps of a `size` since the last call; `pace` is the run's after them."""
         if size != self._size:
             self._size, self._start = size, self._last
         if self._start is not None and pace.step - self._start.step >= pace.steps_per_read:

@@ -18,11 +18,7 @@ T = TypeVar("T")
 
 
 def to_plain(value: Any) -> Any:
-    """Convert a config to numbers, strings, lists and dictionaries, which the safe YAML dumper writes.
-
-    Args:
-        value: a config, or a setting's value.
-    """
+    """Convert a `value` of a config to numbers, strings, lists and dictionaries, which the safe YAML dumper writes."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Path):

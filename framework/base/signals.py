@@ -19,12 +19,7 @@ Handler = Callable[[int, FrameType | None], Any]
 
 
 class Stopped(KeyboardInterrupt):
-    """Interruption by a signal: SIGTERM, or Ctrl-C with a message.
-
-    Args:
-        number: the signal's number.
-        message: text for the user; may be empty.
-    """
+    """Interruption by the signal `number`: SIGTERM, or Ctrl-C with a `message` for the user."""
 
     def __init__(self, number: int = signal.SIGINT, message: str = "") -> None:
         super().__init__(message)

@@ -53,12 +53,7 @@ class BatchSize:
             self._measured, self._drawn = pace, 0
 
     def rays(self, samples: int | None, samples_per_ray: float) -> int:
-        """Return the number of rays of the next step.
-
-        Args:
-            samples: wanted number of samples; None for a configured number of rays.
-            samples_per_ray: mean over recent steps.
-        """
+        """Return the rays of the next step: for a number of `samples`, if not None, by recent `samples_per_ray`."""
         if samples is None:
             given = self.config.num_rays_per_batch
             wanted = min(max(round(self._most), min(MIN_BATCH, given)), given)

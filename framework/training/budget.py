@@ -30,10 +30,8 @@ def spent(config: TrainConfig, state: State) -> float:
 def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) -> str | None:
     """Return why training ends before the next step, as text; None if it continues.
 
-    Args:
-        config: settings, with the budget and the target.
-        state: state of the run.
-        stopped: numbers of the signals received; the first one takes precedence over all other reasons.
+    `config` has the budget and the target. `stopped` has the numbers of received signals; the first one takes
+    precedence over all other reasons.
     """
     if stopped:
         return "stopped by " + signal.Signals(stopped[0]).name
@@ -48,10 +46,5 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
 
 
 def evaluation_seconds(config: TrainConfig, state: State) -> float | None:
-    """Return the maximum time of an evaluation, seconds; None with `--eval all`.
-
-    Args:
-        config: settings of the run.
-        state: its state.
-    """
+    """Return the maximum seconds of an evaluation by the run's `config` and `state`; None with `--eval all`."""
     return None if config.eval == "all" else max(EVALUATION_SHARE * state.seconds, EVALUATION_SECONDS)

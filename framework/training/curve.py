@@ -125,12 +125,9 @@ def is_due(points: Sequence[Point], seconds: float, cost: float, *, last: bool =
 
 
 class FewImages:
-    """The few held-out images of a run that are evaluated between evaluations of all images.
+    """The few images of a held-out `dataset`, `limit` at most, that are evaluated between evaluations of all images.
 
-    Args:
-        dataset: the held-out images.
-        limit: maximum number of images; None for no limit.
-        rays_per_pixel: rays per rendered pixel.
+    Each rendered pixel has `rays_per_pixel` rays. Without a `limit`, there are `MAX_IMAGES`.
     """
 
     def __init__(self, dataset: Dataset, limit: int | None, rays_per_pixel: int) -> None:

@@ -128,10 +128,6 @@ def _processing(kind: str, path: Path) -> str:
 
 
 def processed_folder(path: Path) -> Path:
-    """Return the default output folder for processing a folder of images or a video: beside it.
-
-    Args:
-        path: folder of images, or video file.
-    """
+    """Return the default output folder for processing `path`, a folder of images or a video: beside it."""
     resolved = path if path.name not in ("", "..") else path.resolve()
     return resolved.with_name(f"{resolved.stem if resolved.is_file() else resolved.name}-processed")

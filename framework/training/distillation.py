@@ -83,12 +83,7 @@ class MatterPoints:
 
 
 def random_directions(count: int, like: Tensor) -> Tensor:
-    """Return unit vectors (count, 3), uniformly distributed.
-
-    Args:
-        count: number of vectors.
-        like: tensor that determines device and type.
-    """
+    """Return `count` unit vectors (count, 3), uniformly distributed, of the device and type of `like`."""
     return safe_normalize(torch.randn(count, 3, dtype=like.dtype, device=like.device))
 
 

@@ -68,11 +68,7 @@ class Recorder(Protocol):
 
 
 class CudaRecorder:
-    """CUDA graphs on their own stream, since autograd's nodes must run on the stream that created them.
-
-    Args:
-        device: the GPU.
-    """
+    """CUDA graphs on their own stream of a `device`; autograd's nodes must run on the stream that created them."""
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.stream = device, torch.cuda.Stream(device)
@@ -317,13 +313,7 @@ def make_graphs(
 
 
 def kind_of_step(model: Model[Any], source: BatchSource, step: int, batch: tuple[Hashable, ...]) -> StepKind:
-    """Return the kind of a whole training step, including the draw of its batch.
-
-    Args:
-        source: source of the batches.
-        step: number of training steps done.
-        batch: the requested sizes of the batch.
-    """
+    """Return the kind of training step `step`, with the draw of its batch of sizes `batch` from `source`."""
     if processes().count > 1:
         return StepKind(varies="several processes exchange their gradients")
     if source.varies is not None:

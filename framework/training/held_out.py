@@ -30,12 +30,10 @@ SECONDS_TO_A_TARGET = 15.0
 
 
 class HeldOut:
-    """Evaluations of held-out images between steps. Their time does not count as training.
+    """Evaluations of the held-out `dataset` between steps of `model`. Their time does not count as training.
 
-    Args:
-        model: the model in training.
-        dataset: the held-out images, or a few of them; None for no evaluation.
-        folder: folder of the learning curve; None to write none.
+    `dataset` may hold a few of the images, or be None for no evaluation. The learning curve is written into
+    `folder`, unless that is None.
     """
 
     def __init__(self, config: TrainConfig, model: Model[Any], dataset: Dataset | None, folder: Path | None) -> None:
@@ -56,12 +54,7 @@ class HeldOut:
         self._last = state.curve[-1][0] if state.curve else 0.0
 
     def evaluate_if_due(self, state: State, board: TensorBoard) -> None:
-        """Show one image or evaluate all of them, if due.
-
-        Args:
-            state: the run's state; its curve receives an evaluation of all images.
-            board: receives pictures and results.
-        """
+        """Show one image on `board` or evaluate all of them, if due; the curve of `state` receives the result."""
         config, step = self.config, state.step
         if self._given is None or config.max_eval_images == 0:
             return

@@ -229,11 +229,7 @@ class Loaded:
         return self.scaled(scale_of(found, self.scale, distance, unit))
 
     def scaled(self, scale: Scale) -> Loaded:
-        """Return this in another scale.
-
-        Args:
-            scale: the scale.
-        """
+        """Return this in another `scale`."""
         return replace(self, placement=scale.placed(self.input_placement), scale=scale)
 
     def keep_scale(self) -> None:

@@ -16,11 +16,7 @@ from nerfloom.kernels import native, triton_backend
 
 
 def machine(device: torch.device | None = None) -> dict[str, Any]:
-    """Return processor, cores, threads, memory (GB), device, kernels, versions and commit, as plain data.
-
-    Args:
-        device: device of the computation; the CPU if None.
-    """
+    """Return processor, cores, threads, memory, `device` (None: CPU), kernels, versions and commit, as plain data."""
     on_cuda = device is not None and device.type == "cuda"
     memory = machine_memory()
     return {
@@ -39,11 +35,7 @@ def machine(device: torch.device | None = None) -> dict[str, Any]:
 
 
 def kernels(device: torch.device | None = None) -> str:
-    """Return the variant of the compiled kernels used on a device, "triton", or "reference" for PyTorch alone.
-
-    Args:
-        device: device of the computation; the CPU if None.
-    """
+    """Return the variant of compiled kernels on `device` (None: the CPU), "triton", or "reference" for torch alone."""
     if device is None or device.type == "cpu":
         return native.variant()
     return "triton" if device.type == "cuda" and triton_backend.available() else "reference"

@@ -133,11 +133,7 @@ class Adam:
         return parameter.grad
 
     def finite(self, loss: Tensor) -> bool | Tensor:
-        """Return whether a loss and all gradients are finite; () bool if still on the device.
-
-        Args:
-            loss: a scalar.
-        """
+        """Return whether a scalar `loss` and all gradients are finite; () bool if still on the device."""
         return all_finite([loss.detach(), *(grad for p in self.parameters for grad in self._gradients(p))])
 
     def _gradients(self, parameter: Tensor) -> list[Tensor]:

@@ -97,13 +97,7 @@ def _check_cameras(method: str, drawn: tuple[str, ...] | None, dataset: Dataset)
 def profile_of(
     method: str, config: TrainConfig, model: Model[Any], dataset: Dataset, decided: Sequence[Decision]
 ) -> SceneProfile:
-    """Return the profile of the scene, with each setting chosen from the data and the reason.
-
-    Args:
-        method: the method's name.
-        dataset: the training images.
-        decided: decisions of the method.
-    """
+    """Return the profile of the scene in `dataset`, with the decisions `decided` for a `method` and their reasons."""
     scene, decisions = model.scene, []
     if dataset.opaque is not None and config.masks == "auto":
         cut = cuts_out(dataset.opaque, dataset.cameras)
@@ -155,12 +149,7 @@ def _warning_of_folds(dataset: Dataset) -> list[Decision]:
 
 
 def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None) -> None:
-    """Give the images to a model that renders from images: the training set, and source images of held-out scenes.
-
-    Args:
-        train_set: the training images.
-        eval_set: the held-out images; None if there are none.
-    """
+    """Give `train_set`, and source images of held-out scenes in `eval_set`, to a model that renders from images."""
     if isinstance(model, RendersFromImages):
         model.show_images(train_set)
         if eval_set is not None and eval_set.source_images is not None:

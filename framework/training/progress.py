@@ -81,11 +81,7 @@ def share_and_time(first: StepReport, last: StepReport) -> str:
 
 
 class ProgressBar:
-    """A progress bar on a terminal; elsewhere, a line every ten seconds.
-
-    Args:
-        title: text before the bar.
-    """
+    """A progress bar after a `title` on a terminal; elsewhere, a line every ten seconds."""
 
     def __init__(self, title: str) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(bar_width=16), TextColumn("{task.fields[state]}"))
@@ -125,13 +121,7 @@ class Rate:
         self._rays, self._seconds = 0, 0.0
 
     def count(self, rays: int, seconds: float, waited: bool) -> None:
-        """Count a step.
-
-        Args:
-            rays: number of its rays.
-            seconds: its duration.
-            waited: whether it waited for the device.
-        """
+        """Count a step of `rays` that took `seconds` and may have `waited` for the device."""
         self._rays += rays
         self._seconds += seconds
         if waited or self.per_second == 0:
@@ -141,11 +131,7 @@ class Rate:
 
 
 class TensorBoard:
-    """A writer of curves and images for TensorBoard.
-
-    Args:
-        folder: folder of the event files; None to write nothing.
-    """
+    """A writer of curves and images for TensorBoard into `folder`; None to write nothing."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
@@ -163,13 +149,7 @@ class TensorBoard:
                 self._writer.add_scalar(name, value, step)
 
     def step(self, report: StepReport, state: State, groups: Sequence[Mapping[str, Any]]) -> None:
-        """Write the report and the learning rates of a training step.
-
-        Args:
-            report: its report.
-            state: the state of the run.
-            groups: parameter groups of the optimiser, with their learning rates.
-        """
+        """Write the `report` of a training step, with the run's `state`, and learning rates of parameter `groups`."""
         values = {
             **{f"train/loss/{name}": value for name, value in report.losses.items()},
             "train/psnr": report.psnr,
@@ -181,13 +161,7 @@ class TensorBoard:
         self.scalars(values | rates, report.step)
 
     def image(self, name: str, image: Tensor, step: int) -> None:
-        """Write an image.
-
-        Args:
-            name: its tag.
-            image: (H, W, 3) colours in [0, 1].
-            step: number of training steps done.
-        """
+        """Write an `image` (H, W, 3) in [0, 1] with the tag `name`, after `step` training steps."""
         if self._folder is not None:
             self._writer.add_image(name, image.clamp(0, 1), step, dataformats="HWC")
 

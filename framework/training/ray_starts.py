@@ -59,11 +59,7 @@ def starts_checked(
 
 
 def nearest_shown(dataset: Dataset) -> Tensor:
-    """Return the distance (M,) from each camera that its image shows to be empty, according to its points.
-
-    Args:
-        dataset: M training images.
-    """
+    """Return the distance (M,) from each of M cameras that its image in `dataset` shows to be empty, by its points."""
     near = torch.full_like(dataset.cameras.fx, dataset.scene.near)
     return near if dataset.sparse_depth is None else near.maximum(before_points(dataset.cameras, dataset.sparse_depth))
 

@@ -64,13 +64,7 @@ def write_evaluation(
 
 
 def write_summary(path: Path, trainer: Trainer, outcome: Outcome) -> None:
-    """Write summary.json: steps, seconds and memory of training, and the machine.
-
-    Args:
-        path: file to write.
-        trainer: the trainer, after training.
-        outcome: the end of training.
-    """
+    """Write the steps, seconds and memory of `trainer`, its `outcome` and the machine to the JSON file `path`."""
     state = trainer.state
     write_report(
         path,

@@ -120,11 +120,7 @@ def _moved(parsed: ParsedScene, then: Placement) -> float:
 
 
 def run_folder(method: str, config: TrainConfig) -> Path:
-    """Return the folder of a new run: outputs/{experiment}/{method}/{timestamp}.
-
-    Args:
-        method: the method's name.
-    """
+    """Return the folder of a new run of `method`: outputs/{experiment}/{method}/{timestamp}."""
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
     timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
     return config.output_dir / experiment / method / timestamp
@@ -203,11 +199,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def finite_or_null(content: Any) -> Any:
-    """Return plain data with None for each non-finite number, since JSON has none.
-
-    Args:
-        content: plain data.
-    """
+    """Return plain `content` with None for each non-finite number, since JSON has none."""
     if isinstance(content, dict):
         return {name: finite_or_null(value) for name, value in content.items()}
     if isinstance(content, list | tuple):
@@ -216,12 +208,7 @@ def finite_or_null(content: Any) -> Any:
 
 
 def write_report(path: Path, content: Any) -> None:
-    """Write plain data as `write_json` does, but only warn on failure, so that training continues.
-
-    Args:
-        path: file to write.
-        content: plain data; numbers must be finite.
-    """
+    """Write finite plain `content` to `path` as `write_json` does, but only warn on failure: training continues."""
     try:
         write_json(path, content)
     except OSError as error:
@@ -229,10 +216,6 @@ def write_report(path: Path, content: Any) -> None:
 
 
 def write_transforms(run: Run, dataset: Dataset) -> None:
-    """Write dataparser_transforms.json in nerfstudio's format.
-
-    Args:
-        dataset: its data set, with the transform from the input's frame to the scene's.
-    """
+    """Write dataparser_transforms.json of a run in nerfstudio's format, from the placement of its `dataset`."""
     content = {"transform": dataset.transform.tolist(), "scale": dataset.scale}
     write_report(run.folder / TRANSFORMS, content)

@@ -57,13 +57,7 @@ class State:
         return min(-10 * float(torch.tensor(max(self.train_mse, 1e-12)).log10()), MAX_PSNR)
 
     def account(self, rays: int, samples_per_ray: float, seconds: float) -> None:
-        """Count a training step.
-
-        Args:
-            rays: number of its rays in all processes.
-            samples_per_ray: mean number of samples per ray; NaN if not known yet.
-            seconds: its duration.
-        """
+        """Count a step of `rays` in all processes that took `seconds`; `samples_per_ray` is NaN if not known yet."""
         self.step += 1
         self.seconds += seconds
         self.rays += rays

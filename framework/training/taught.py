@@ -57,12 +57,7 @@ def is_taught(step: int, share: float) -> bool:
 
 
 def unseen_cameras(cameras: Cameras, near: Tensor) -> Cameras:
-    """Return random cameras between and around given ones, with their lenses and sizes.
-
-    Args:
-        cameras: M training cameras.
-        near: (V,) int64 on the CPU, index of a camera for each.
-    """
+    """Return random cameras between and around those of indices `near` (V,), with lenses and sizes of `cameras`."""
     poses = unseen_poses(cameras.camera_to_worlds.cpu(), near)
     return replace(cameras[near], camera_to_worlds=poses.to(cameras.camera_to_worlds))
 

@@ -43,11 +43,7 @@ class Teacher:
         self.rotation, self.scale, self.shift = pupil.similarity_to(placement)
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Return cameras of the pupil's data in the teacher's scene, where its refined poses lead.
-
-        Args:
-            cameras: M cameras in the pupil's scene.
-        """
+        """Return `cameras` of the pupil's data in the teacher's scene, where its refined poses lead."""
         moved = moved_cameras(cameras, self.rotation, self.scale, self.shift)
         return refined_cameras(self.model, moved, training=False)
 

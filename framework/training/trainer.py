@@ -106,12 +106,7 @@ class Trainer:
 
     @classmethod
     def of(cls, run: Run, train_set: Dataset, eval_set: Dataset | None = None) -> Trainer:
-        """Return the trainer of a run; it writes into the run's folder.
-
-        Args:
-            run: method, settings and folder.
-            train_set, eval_set: its images.
-        """
+        """Return the trainer of `run` on images `train_set` and `eval_set`; it writes into the run's folder."""
         return cls(load_method(run.method), run.config, train_set, eval_set, run.folder)
 
     # -- checkpoints ------------------------------------------------------------------------------------------

@@ -99,10 +99,7 @@ class Method:
         return config, made
 
     def build(self, config: TrainConfig, scene: Scene) -> Model[Any]:
-        """Return the model, with newly initialised parameters.
-
-        Args:
-            config: the settings; open ones are decided first.
+        """Return the model for `config`, with open settings decided first, and new parameters.
 
         Raises:
             ConfigError: if the settings do not fit the scene or each other, if the model does not fit into memory, or

@@ -59,10 +59,7 @@ class Entry:
 
 @cache
 def registered(kind: Kind) -> dict[str, Entry]:
-    """Return all entries of a kind by name, sorted. An entry that two packages register differently has a `problem`.
-
-    Args:
-        kind: methods or data formats.
+    """Return all entries of a `kind`, methods or dataparsers, by name, sorted; conflicting ones have a `problem`.
 
     Raises:
         ConfigError: if the environment variable cannot be parsed.
@@ -135,11 +132,7 @@ def _source(module: str) -> Path | None:
 
 
 def entry_of(kind: Kind, name: str) -> Entry:
-    """Return the entry registered for a name.
-
-    Args:
-        kind: methods or data formats.
-        name: the name that a user typed.
+    """Return the entry of a `kind`, methods or dataparsers, that is registered for the `name` that a user typed.
 
     Raises:
         ConfigError: for an unknown name; the message suggests the nearest one, or the project with that method.
@@ -190,10 +183,7 @@ def _looks_old(error: BaseException) -> bool:
 
 
 def load_method(name: str) -> Method:
-    """Import a method by name.
-
-    Args:
-        name: a registered name.
+    """Import the method with the registered `name`.
 
     Raises:
         ConfigError: for an unknown name, or if its module cannot be imported or holds no method of this plugin
@@ -209,10 +199,7 @@ def load_method(name: str) -> Method:
 
 
 def load_dataparser(name: str) -> type[DataParser]:
-    """Import a data format by name.
-
-    Args:
-        name: a registered name.
+    """Import the data format with the registered `name`.
 
     Raises:
         ConfigError: for an unknown name, or if its module cannot be imported or holds no data format of this plugin

@@ -8,10 +8,7 @@ from typing import BinaryIO
 
 
 def uncompressed_size(file: Path | BinaryIO) -> int:
-    """Return the uncompressed size in bytes of all entries of a zip file, as its directory states it.
-
-    Args:
-        file: path, or binary file open for reading.
+    """Return the uncompressed size in bytes of all entries of the zip `file`, as its directory states it.
 
     Raises:
         zipfile.BadZipFile: if `file` is not a zip file. A damaged one may raise other errors.

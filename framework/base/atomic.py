@@ -11,11 +11,7 @@ from typing import BinaryIO
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Call `write(file)` on a temporary file beside `path`, flush it to disk and rename it.
-
-    Args:
-        path: file to write.
-        write: function that writes the content to an open binary file.
+    """Call `write(file)` on a temporary binary file beside `path`, flush it to disk and rename it.
 
     Raises:
         OSError: if the file cannot be written; `path` is then unchanged, and no temporary file is left.

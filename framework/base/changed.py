@@ -12,12 +12,7 @@ T = TypeVar("T")
 
 
 def changed(settings: T, given: Mapping[str, Any], what: str) -> T:
-    """Return settings with the given values.
-
-    Args:
-        settings: a dataclass.
-        given: new values by name; None keeps a value.
-        what: name of the object with these settings, for the message.
+    """Return the dataclass `settings` of `what` with the values that are `given` by name; None keeps a value.
 
     Raises:
         ConfigError: if there is no setting of a name.
@@ -28,11 +23,7 @@ def changed(settings: T, given: Mapping[str, Any], what: str) -> T:
 
 
 def refuse(useless: Mapping[str, Any], what: str) -> None:
-    """Refuse values that have no effect.
-
-    Args:
-        useless: the values by the name of their flag, with underscores; None for a value that is not given.
-        what: name of the object that does not use them, for the message.
+    """Refuse flags, `useless` values by name with underscores, that have no effect with `what`; None: not given.
 
     Raises:
         ConfigError: if a value is given.

@@ -12,11 +12,7 @@ T = TypeVar("T")
 
 
 def checked(kind: type[T], values: Any) -> T:
-    """Construct a dataclass from a dictionary of field values.
-
-    Args:
-        kind: the dataclass.
-        values: the field values by name; anything but a dictionary is refused.
+    """Construct the dataclass `kind` from a dictionary of field `values`; anything else is refused.
 
     Raises:
         ValueError: if `values` is not a dictionary, or a value is missing, unknown or not of its field's type.

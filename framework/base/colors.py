@@ -15,10 +15,7 @@ NAMES: dict[str, tuple[float, float, float]] = {
 
 
 def color_of(text: str) -> tuple[float, float, float]:
-    """Return the red, green and blue, 0 to 1, of a colour.
-
-    Args:
-        text: black, grey, white, or #RRGGBB in hexadecimal digits.
+    """Return the red, green and blue, 0 to 1, of a colour `text`: black, grey, white or hexadecimal #RRGGBB.
 
     Raises:
         ConfigError: if it is no such colour.

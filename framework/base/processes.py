@@ -104,10 +104,7 @@ def _started() -> Processes:
 
 
 def gathered(values: Sequence[float]) -> list[list[float]]:
-    """Return the numbers of all processes, one row per process.
-
-    Args:
-        values: numbers of this process; all processes pass the same number of them.
+    """Return the `values` of all processes, one row per process; all pass the same number of them.
 
     Raises:
         LostProcessError: if another process has ended.
@@ -138,11 +135,7 @@ def add_up(values: Tensor) -> Tensor:
 
 
 def from_first(content: Any, device: torch.device | str = "cpu") -> Any:
-    """Return the first process's `content`.
-
-    Args:
-        content: tensors and plain data, as in checkpoints; ignored in all but the first process.
-        device: device of the tensors in the other processes.
+    """Return the first process's `content`: tensors, on `device` in the others, and plain data, as in checkpoints.
 
     Raises:
         LostProcessError: if another process has ended.

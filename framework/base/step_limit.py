@@ -13,10 +13,7 @@ ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
 
 def limited_as_given(config: ConfigT, given: Collection[str]) -> ConfigT:
-    """Remove the default limit of steps if the user sets only a limit of seconds.
-
-    Args:
-        given: names of the settings that the user has set.
+    """Remove the default limit of steps if the settings `given` by the user only limit the seconds.
 
     Raises:
         FlagError: if neither steps nor seconds are limited; schedules need a limit.

@@ -44,12 +44,7 @@ class Ceilings:
 
     @classmethod
     def measured(cls, copied: int = 2**25, edge: int = 1024) -> Ceilings:
-        """Measure the limits on torch's default device, each as the best of eight runs.
-
-        Args:
-            copied: number of values to copy.
-            edge: rows and columns of the matrices.
-        """
+        """Measure the limits on torch's default device by `copied` values and `edge` rows, best of eight runs."""
         source = torch.rand(copied)
         target = torch.empty_like(source)
         a, b = torch.rand(edge, edge), torch.rand(edge, edge)

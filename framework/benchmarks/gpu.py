@@ -225,13 +225,7 @@ def _timed(
 
 
 def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:
-    """Return the plan of the training.
-
-    Args:
-        data: folder of the data set; the embedded scene if None.
-        seconds: seconds of training of each method.
-        folder: folder of runs and report.
-    """
+    """Return the plan of `seconds` of training per method, on `data` or the embedded scene, into `folder`."""
     conditions = Conditions(
         data=None if data is None else str(data.resolve()),
         data_flags=(),
@@ -247,11 +241,7 @@ def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:
 
 
 def reached(rows: Sequence[Compared]) -> list[dict[str, Any]]:
-    """Return the methods' results as plain data.
-
-    Args:
-        rows: rows of the comparison's table.
-    """
+    """Return the methods' results, the `rows` of the comparison's table, as plain data."""
     return [
         {
             "method": run.method,
@@ -267,10 +257,5 @@ def reached(rows: Sequence[Compared]) -> list[dict[str, Any]]:
 
 
 def psnr_at(curve: Curve, seconds: float) -> float | None:
-    """Return the PSNR, dB, of the last evaluation within `seconds`; None before the first.
-
-    Args:
-        curve: pairs of seconds of training and PSNR, in order.
-        seconds: seconds of training.
-    """
+    """Return the PSNR, dB, of the last point (seconds, PSNR) of a `curve` within `seconds`; None before the first."""
     return next((psnr for time, psnr in reversed(curve) if time <= seconds), None)

@@ -48,10 +48,7 @@ class Error:
 
 
 def measured(device: torch.device) -> list[Error]:
-    """Return the errors of all kernels on a device.
-
-    Args:
-        device: the GPU, or the CPU if Triton interprets.
+    """Return the errors of all kernels on `device`: a GPU, or the CPU if Triton interprets.
 
     Raises:
         ConfigError: if a Triton operation has no case or did not run.
@@ -102,12 +99,7 @@ def _computed(case: Case, device: torch.device, kind: torch.dtype) -> tuple[list
 
 
 def largest_error(value: Tensor, truth: Tensor) -> float:
-    """Return the maximum error relative to the largest value; infinity where only one of the two is finite.
-
-    Args:
-        value: computed values.
-        truth: true values, of the same shape.
-    """
+    """Return the maximum error of `value` over the largest `truth`; infinity where only one of the two is finite."""
     value, truth = value.detach().double().cpu(), truth.detach().double().cpu()
     if value.shape != truth.shape:
         return float("inf")
@@ -136,11 +128,7 @@ def interpreted() -> list[Error]:
 
 
 def as_table(rows: Sequence[Error]) -> Table:
-    """Return a table of errors, with a line for each kernel.
-
-    Args:
-        rows: the errors.
-    """
+    """Return a table of the errors `rows`, with a line for each kernel."""
     grid = Table(title="largest relative errors: value, gradient", title_justify="left", box=SIMPLE)
     for heading in ("kernel", *KINDS):
         grid.add_column(heading, justify="left" if heading == "kernel" else "right")

@@ -24,12 +24,7 @@ def layouts() -> list[tuple[str, PlanesLayout, int]]:
 
 
 def planes_of(table: Tensor, layout: PlanesLayout) -> list[Tensor]:
-    """Return each factor as an image (1, F, H, W), as in the code of K-Planes, group by group.
-
-    Args:
-        table: (E, F) entries of all factors.
-        layout: axes and resolutions of the factors.
-    """
+    """Return each factor of `layout` in `table` (E, F) as an image (1, F, H, W), as K-Planes' code has it, by group."""
     return [
         layout.factor(table, group, index).permute(2, 0, 1)[None].contiguous()
         for group, factors in enumerate(layout.axes)

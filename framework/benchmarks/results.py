@@ -11,10 +11,7 @@ from nerfloom.training.run import write_json
 
 
 def read_rows(file: Path) -> dict[str, Any]:
-    """Return the rows of a file of results by name; none if there is no such file.
-
-    Args:
-        file: the JSON file.
+    """Return the rows of a JSON `file` of results by name; none if there is no such file.
 
     Raises:
         ConfigError: if it is not a file of results.
@@ -28,12 +25,7 @@ def read_rows(file: Path) -> dict[str, Any]:
 
 
 def add_row(file: Path, name: str, result: Any) -> None:
-    """Add a row to a file of results; it replaces a row of that name.
-
-    Args:
-        file: the JSON file; it and its folder are created if missing.
-        name: name of the row.
-        result: plain data.
+    """Write plain data `result` as the row `name` of a JSON `file`, which is created with its folder if missing.
 
     Raises:
         ConfigError: if the file exists and holds something else.

@@ -36,13 +36,7 @@ class Times:
 
 
 def alternating(compiled: Run, reference: Run, repeats: int) -> Times:
-    """Run two implementations in turn, after a warm-up run of each.
-
-    Args:
-        compiled: the first implementation.
-        reference: the second implementation.
-        repeats: number of measured runs of each.
-    """
+    """Run `compiled` and `reference` in turn, `repeats` times each, after a warm-up run of each."""
     runs = [(compiled(), reference()) for _ in range(repeats + 1)][1:]
     ours, theirs = zip(*runs, strict=True)
     ratios = [sum(their) / sum(our) for our, their in runs]

@@ -46,10 +46,7 @@ class GpuFlags:
 
 
 def measure_gpu(flags: GpuFlags) -> None:
-    """Run the benchmark.
-
-    Args:
-        flags: its settings.
+    """Run the benchmark by its `flags`.
 
     Raises:
         ConfigError: if there is no GPU that this PyTorch can use.

@@ -38,12 +38,7 @@ def run_benchmark(
 
 
 def write_results(path: Path, content: dict[str, Any]) -> None:
-    """Write plain data as JSON, and print the path.
-
-    Args:
-        path: the file; its folder is created if missing.
-        content: the data.
-    """
+    """Write plain data `content` as JSON to `path`, in a folder that is created if missing, and print the path."""
     from nerfloom.training.run import write_json
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -148,11 +148,7 @@ def build(flags: BlocksFlags, run: Run, shared: tuple[str, ...], folder: Path) -
 
 
 def split(flags: BlocksFlags, parsed: ParsedScene) -> tuple[Block, ...]:
-    """Divide the cameras of training images into blocks, and print them.
-
-    Args:
-        flags: flags of the command.
-        parsed: the training images.
+    """Divide the cameras of the training images `parsed` into blocks by `flags`, and print them.
 
     Raises:
         ConfigError: if there is no block, or the scene cannot be divided.

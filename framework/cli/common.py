@@ -158,10 +158,7 @@ def make_room(path: Path) -> None:
 
 
 def check_weights(path: Path | None) -> None:
-    """Check a file of LPIPS weights, before any work.
-
-    Args:
-        path: the file; None for none.
+    """Check a file of LPIPS weights, if `path` is not None, before any work.
 
     Raises:
         ConfigError: if it cannot be used.

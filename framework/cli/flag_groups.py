@@ -76,11 +76,7 @@ def grouped_flags(
 
 
 def groups_of(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the title and the settings of each group; a setting belongs to the first class that declares it.
-
-    Args:
-        kind: the class of a method's settings.
-    """
+    """Yield title and settings of each group of a config class `kind`, each in that of the first class declaring it."""
     declared = {
         field.name: next(base for base in reversed(kind.__mro__) if field.name in inspect.get_annotations(base))
         for field in dataclasses.fields(kind)

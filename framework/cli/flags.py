@@ -69,12 +69,7 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
 
 
 def in_one_line(box: str, prog: str) -> str:
-    """Return tyro's error box as one line: what is wrong, and where to look.
-
-    Args:
-        box: the text of the box: a title, and sections between rules.
-        prog: the command, whose help shows all flags.
-    """
+    """Return tyro's error box `box` as one line: what is wrong, and where to look, in the help of `prog`."""
     title, *sections = _sections(box)
     what = " ".join(" ".join(sections[0] if sections else title).split()).removeprefix("Error parsing ")
     if what.startswith("Unrecognized options: "):

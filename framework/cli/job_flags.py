@@ -34,10 +34,7 @@ class JobFlags:
     """Address of a running Ray cluster, such as 10.0.0.1:6379 or auto. Default: one is started on this machine."""
 
     def chosen_launcher(self, folder: Path) -> Launcher:
-        """Return the launcher that the flags describe.
-
-        Args:
-            folder: folder of the jobs' files.
+        """Return the launcher that the flags describe, with the jobs' files in `folder`.
 
         Raises:
             ConfigError: if a flag's value is invalid, or a package is missing.

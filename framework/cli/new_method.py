@@ -93,11 +93,7 @@ def package_of(name: str) -> dict[str, str]:
 
 
 def write_package(name: str, folder: Path) -> None:
-    """Write the package of a new method.
-
-    Args:
-        name: the method's name.
-        folder: folder to write, new or empty.
+    """Write the package of a new method `name` to a `folder`, new or empty.
 
     Raises:
         ConfigError: if the folder is not empty or cannot be written.

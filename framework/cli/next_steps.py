@@ -10,12 +10,7 @@ from nerfloom.evaluation.video_suffixes import default_video
 
 
 def after_training(scene: Scene, folder: Path) -> list[str]:
-    """Return lines that say how to look at a run, film it and judge it.
-
-    Args:
-        scene: properties of its data, which decide on the camera path that suits them.
-        folder: folder of the run.
-    """
+    """Return lines that say how to look at the run in `folder`, film its `scene` along a fitting path, and judge it."""
     run = shlex.quote(str(folder))
     path = "spiral" if scene.warped else "interpolate" if scene.unbounded else "orbit"
     lines = ["next:"]

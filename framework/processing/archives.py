@@ -15,12 +15,7 @@ UNPACKED = "unpacked"
 
 
 def check_archive(archive: Path, place: Place, needs: str) -> None:
-    """Check that a zip file has a file to unpack, before anything is written.
-
-    Args:
-        archive: the zip file.
-        place: as in `unpack`.
-        needs: what the archive should have, for the message.
+    """Check that a zip file `archive` has what it `needs`, a file with a `place`, before anything is written.
 
     Raises:
         DataError: if it has none, is damaged, or has an unsafe path.

@@ -31,11 +31,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def tones(image: Image.Image) -> tuple[float, float]:
-    """Return the ends of the range of an image's brightness, from 0 to 1.
-
-    Args:
-        image: an image of any mode but floating point.
-    """
+    """Return the ends of the range of brightness, from 0 to 1, of an `image` of any mode but floating point."""
     levels, top = _levels(image)
     step = max(min(levels.shape) // SAMPLES, 1)
     low, high = np.percentile(levels[::step, ::step], ENDS)
@@ -43,11 +39,7 @@ def tones(image: Image.Image) -> tuple[float, float]:
 
 
 def stretched(image: Image.Image) -> Image.Image:
-    """Return an image's brightness with its range stretched to 0 to 255, in 8 bits.
-
-    Args:
-        image: an image of any mode but floating point; 16-bit pixels are stretched before rounding.
-    """
+    """Return an `image`'s brightness with its range stretched to 0 to 255, in 8 bits; 16 bits are rounded last."""
     levels, top = _levels(image)
     low, high = (end * top for end in tones(image))
     return Image.fromarray(((levels - low) / max(high - low, 1e-9) * 255).round().clip(0, 255).astype(np.uint8))

@@ -33,10 +33,7 @@ _WITH_FOCAL = re.compile(r"^(.*\S)\s+0\s+[\d.eE+-]+$")
 
 
 def find_list(file: Path) -> Path:
-    """Return the path of the list of images.
-
-    Args:
-        file: bundle.out.
+    """Return the path of the list of images of `file`, a bundle.out.
 
     Raises:
         DataError: if there is no list.
@@ -49,11 +46,7 @@ def find_list(file: Path) -> Path:
 
 
 def read_capture(file: Path, listed: Path) -> Capture:
-    """Read cameras and points.
-
-    Args:
-        file: bundle.out.
-        listed: list of the images, a line each, in the order of the cameras.
+    """Read cameras and points of `file`, a bundle.out; `listed` has the images' names in the cameras' order.
 
     Raises:
         DataError: if a file cannot be read, is truncated, or has an invalid number.

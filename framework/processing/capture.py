@@ -74,12 +74,7 @@ def relative_name(name: str) -> str:
 
 
 def camera_pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return a camera-to-world matrix (4, 4) with OpenGL axes.
-
-    Args:
-        rotation: (3, 3) camera-to-world, for a camera with x right, y down, z forward.
-        position: (3,) of the camera.
-    """
+    """Return camera-to-world (4, 4), OpenGL axes, from `rotation` (3, 3), y down, z ahead, and `position` (3,)."""
     pose = np.eye(4)
     pose[:3, :3] = rotation * [1, -1, -1]
     pose[:3, 3] = position
@@ -92,11 +87,7 @@ def for_size_of(lens: Lens) -> LensOf:
 
 
 def resized(lens: Lens, width: int, height: int) -> Lens:
-    """Return the lens of a resized image.
-
-    Args:
-        lens: lens of the image as the program had it.
-        width, height: size of the image file, pixels.
+    """Return the `lens` of an image for its file of `width` x `height` pixels.
 
     Raises:
         DataError: if the aspect ratio differs.
@@ -113,11 +104,7 @@ def resized(lens: Lens, width: int, height: int) -> Lens:
 
 
 def spread_of(cameras: list[PosedCamera]) -> tuple[np.ndarray, float]:
-    """Return the mean position (3,) of cameras, and the root mean square distance from it.
-
-    Args:
-        cameras: at least one.
-    """
+    """Return the mean position (3,) of `cameras`, at least one, and the root mean square distance from it."""
     positions = np.stack([camera.pose[:3, 3] for camera in cameras])
     centre = positions.mean(0)
     return centre, float(np.sqrt(np.square(positions - centre).sum(1).mean()))
@@ -140,11 +127,7 @@ def near_origin(cameras: list[PosedCamera]) -> np.ndarray:
 
 
 def check_points(capture: Capture, file: object) -> None:
-    """Check that points of another file are in the frame of the cameras.
-
-    Args:
-        capture: the capture with these points.
-        file: path of the points, for messages.
+    """Check that the points of `capture`, from another `file`, are in the frame of its cameras.
 
     Raises:
         DataError: if most of them are far from all cameras.

@@ -205,11 +205,7 @@ def undistort(report: Report, model: Path, images: Path, output: Path) -> None:
 
 
 def read_model(report: Report, folder: Path) -> Model:
-    """Read a model.
-
-    Args:
-        report: unused.
-        folder: folder with cameras.bin, images.bin and points3D.bin.
+    """Read a model from a `folder` with cameras.bin, images.bin and points3D.bin; `report` is unused.
 
     Raises:
         DataError: if the folder has no readable model.

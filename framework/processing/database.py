@@ -13,13 +13,7 @@ PAIR_BASE = 2**31 - 1
 
 
 def rows(database: Path, table: str, what: str = "COUNT(*)") -> int:
-    """Return a number from a table; 0 if the database is unreadable at the moment.
-
-    Args:
-        database: the database.
-        table: name of the table.
-        what: expression to select.
-    """
+    """Return a number `what` from a `table` of the `database`; 0 if it is unreadable at the moment."""
     if not database.is_file():
         return 0
     try:
@@ -36,12 +30,7 @@ def features(database: Path) -> dict[str, int]:
 
 
 def camera_of(database: Path, names: list[str]) -> int | None:
-    """Return the camera number of the first of some images that has one; None if there is none.
-
-    Args:
-        database: the database.
-        names: names of the images.
-    """
+    """Return the camera number, in `database`, of the first image in `names` that has one; None if there is none."""
     cameras = dict(_read(database, "SELECT name, camera_id FROM images"))
     return next((int(cameras[name]) for name in names if name in cameras), None)
 

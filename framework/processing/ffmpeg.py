@@ -23,10 +23,7 @@ R = TypeVar("R")
 
 
 def frame_count(path: Path) -> int:
-    """Return the number of frames that a video's container lists.
-
-    Args:
-        path: the video file.
+    """Return the number of frames that the container of the video `path` lists.
 
     Raises:
         DataError: if the file or ffmpeg is missing, or the file is not a readable video.
@@ -74,12 +71,7 @@ def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, lis
 
 
 def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield some frames of a video as (H, W, 3) uint8, upright.
-
-    Args:
-        path: the video file.
-        numbers: (K,) frame numbers in ascending order; the first frame is 0.
-    """
+    """Yield the frames `numbers` (K,), ascending from 0, of the video `path` as (H, W, 3) uint8, upright."""
     arguments = ["-i", str(path), "-map", "0:v:0", *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
     wanted = iter(track(numbers.tolist(), "Reading the frames", total=len(numbers)))
     number = next(wanted, None)

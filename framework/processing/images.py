@@ -159,12 +159,7 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
 
 
 def save(image: Image.Image, path: Path, options: dict[str, Any] | None = None) -> None:
-    """Write a JPEG of high quality, without alpha, or a PNG, depending on the path's suffix.
-
-    Args:
-        path: the file.
-        options: further options for Pillow.
-    """
+    """Write a JPEG of high quality, without alpha, or a PNG, by the suffix of `path`, with further Pillow `options`."""
     if path.suffix in _JPEG:
         image.convert("RGB").save(path, format="JPEG", quality=95, subsampling=0, **(options or {}))
     else:

@@ -39,11 +39,7 @@ class Kind(NamedTuple):
 
 
 def process(name: str, flags: OutputFlags) -> None:
-    """Write the data folder of an input.
-
-    Args:
-        name: the kind of input, a key of `KINDS`.
-        flags: flags of that kind.
+    """Write the data folder of an input of the kind `name`, a key of `KINDS`, by the `flags` of that kind.
 
     Raises:
         ConfigError: if a flag is out of range, or COLMAP is missing.

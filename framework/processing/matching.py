@@ -35,13 +35,7 @@ def choose_matching(method: str, count: int, exhaustive_limit: int, ordered: boo
 
 
 def choose_pairs(matching: str, names: list[str], state: Reconstruction) -> list[tuple[str, str]]:
-    """Return the pairs of names of images to match.
-
-    Args:
-        matching: exhaustive, sequential or retrieval.
-        names: names of the images.
-        state: the reconstruction, with features.
-    """
+    """Return the pairs of `names` to match by the rule `matching`, by the features of `state` where it needs them."""
     count, flags = len(names), state.flags
     if matching == "exhaustive":
         chosen = retrieval.all_pairs(count)
@@ -58,13 +52,7 @@ def choose_pairs(matching: str, names: list[str], state: Reconstruction) -> list
 
 
 def pairs_of(left: list[str], names: list[str], state: Reconstruction) -> list[tuple[str, str]]:
-    """Return more pairs for unregistered images: with all images, or with similar ones if there are many images.
-
-    Args:
-        left: names of the unregistered images.
-        names: names of all images.
-        state: the reconstruction, with features.
-    """
+    """Return more pairs for the images `left` of `state`: with all `names`, or with similar ones of many images."""
     chosen = set(left)
     if len(names) <= state.flags.exhaustive_limit:
         every = retrieval.all_pairs(len(names))

@@ -91,11 +91,7 @@ def read_capture(file: Path) -> Capture:
 
 
 def similarity_of(transform: Element | None, where: str) -> Similarity:
-    """Return the map that an element describes; the identity for None, and for the parts that are missing.
-
-    Args:
-        transform: the element `transform` of a chunk or component.
-        where: its name in messages, with its file.
+    """Return the map that a `transform` element describes, `where` in messages; what is missing is the identity.
 
     Raises:
         DataError: if a number is invalid.

@@ -42,11 +42,7 @@ class UnsupportedSensor(Exception):
 
 
 def lens_of(sensor: Element, where: str) -> Lens:
-    """Return the lens of a sensor.
-
-    Args:
-        sensor: the element of cameras.xml.
-        where: name of the sensor in messages, with its file.
+    """Return the lens of a `sensor` element of cameras.xml, named by `where` in messages.
 
     Raises:
         UnsupportedSensor: if the lens cannot be expressed, or was not calibrated.

@@ -39,10 +39,7 @@ SPHERICAL = ("spherical", "equirectangular")
 
 
 def find_reconstruction(project: Path) -> Path:
-    """Return the path of the reconstruction in a project's folder.
-
-    Args:
-        project: folder of OpenDroneMap or of OpenSfM.
+    """Return the path of the reconstruction in a `project` folder of OpenDroneMap or OpenSfM.
 
     Raises:
         DataError: if there is none.
@@ -57,10 +54,7 @@ def find_reconstruction(project: Path) -> Path:
 
 
 def read_capture(file: Path) -> Capture:
-    """Read the reconstruction with the most shots; those of others are left out, as they are not connected.
-
-    Args:
-        file: reconstruction.json.
+    """Read the reconstruction with the most shots in `file`; those of others are not connected and left out.
 
     Raises:
         DataError: if the file is not such a reconstruction, or has an invalid number.
@@ -97,12 +91,7 @@ def rotation_of(vector: np.ndarray) -> np.ndarray:
 
 
 def lens_of(camera: dict[str, Any], kind: str, where: str) -> Lens:
-    """Return the lens of a camera, for images of the size that it states.
-
-    Args:
-        camera: a camera of the reconstruction.
-        kind: its projection type, a supported one.
-        where: name of the camera in messages, with its file.
+    """Return the lens of a `camera` of a supported projection `kind`, `where` in messages, for its stated size.
 
     Raises:
         DataError: if a number is missing or invalid.

@@ -18,11 +18,7 @@ _OURS = re.compile(r"transforms\.json|sparse_pc\.ply|colmap|unpacked|(images|mas
 
 
 def check_apart(output: Path, data: Path) -> None:
-    """Check that input and output do not overlap.
-
-    Args:
-        output: the folder to write.
-        data: the folder or file to read.
+    """Check that the folder `output` to write and the input `data` do not overlap.
 
     Raises:
         DataError: if the output would overwrite the input or be inside it.
@@ -39,12 +35,7 @@ def _advice(output: Path) -> str:
 
 
 def claim(output: Path, data: Path, overwrite: bool) -> None:
-    """Create the output folder or, with `overwrite`, remove an earlier run's output.
-
-    Args:
-        output: the folder to write.
-        data: the folder or file to read.
-        overwrite: whether to replace an earlier run's output; other files are kept.
+    """Create the folder `output` or, with `overwrite`, remove an earlier run's output from it, but no input `data`.
 
     Raises:
         DataError: if the folder is not empty and `overwrite` is False, or if files to be removed contain `data`.
@@ -70,11 +61,7 @@ def claim(output: Path, data: Path, overwrite: bool) -> None:
 
 
 def begin(flags: ColmapFlags, sources: list[Path]) -> None:
-    """Claim the output folder and record the run's input; with `flags.resume`, continue a stopped run.
-
-    Args:
-        flags: the user's flags.
-        sources: the files to read, as in `unfinished.mark`.
+    """Claim the output folder and record the run's `sources`; with `flags.resume`, continue a stopped run.
 
     Raises:
         DataError: see `claim` and `unfinished.go_on`.
@@ -97,10 +84,6 @@ def lacks_masks(flags: ColmapFlags) -> bool:
 
 
 def ready(output: Path) -> str:
-    """Return the last line of a command: the data folder and the command to train on it.
-
-    Args:
-        output: the data folder.
-    """
+    """Return the last line of a command: the data folder `output` and the command to train on it."""
     words = ("ns-train", "gaussian-splatting", "--data", str(output), "--max-seconds", "300")
     return f"data folder: {output}; next: {shlex.join(words)}"

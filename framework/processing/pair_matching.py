@@ -37,12 +37,7 @@ def match(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def write_matches(database: Path, pairs: list[tuple[str, str]]) -> None:
-    """Match pairs of images and write the matches to COLMAP's database, for verification by COLMAP.
-
-    Args:
-        database: COLMAP's database with features.
-        pairs: pairs of names.
-    """
+    """Match `pairs` of names by features in COLMAP's `database`, and write the matches there, for COLMAP to verify."""
 
     @lru_cache(maxsize=64)
     def features(name: str) -> np.ndarray:

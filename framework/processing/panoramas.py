@@ -67,12 +67,7 @@ def write_views(folder: Path, sources: list[Path], work: Path, views: Views) -> 
 
 
 def view_names(names: Sequence[str], count: int) -> list[list[str]]:
-    """Return the names of the views of each panorama.
-
-    Args:
-        names: names of the panoramas.
-        count: number of views of each.
-    """
+    """Return the names of `count` views of each panorama in `names`."""
     made = output_names(
         Path(name).with_name(f"view_{number}_{Path(name).name}") for name in names for number in range(count)
     )
@@ -87,12 +82,7 @@ def panorama_lens(image: PreparedImage) -> Lens:
 
 
 def camera_parameters(side: int, angle: float) -> str:
-    """Return COLMAP's parameters of the camera PINHOLE of a view: fx, fy, cx, cy.
-
-    Args:
-        side: width and height of the view, pixels.
-        angle: angle of view, degrees.
-    """
+    """Return COLMAP's fx, fy, cx, cy of a square view of `side` pixels and an `angle` of view in degrees (PINHOLE)."""
     focal = side / 2 / math.tan(math.radians(angle) / 2)
     return f"{focal!r},{focal!r},{side / 2!r},{side / 2!r}"
 

@@ -19,11 +19,7 @@ from nerfloom.processing.transforms import Frame, Lens, content, write
 
 
 def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
-    """Return a lens without distortion.
-
-    Args:
-        size: width and height, pixels.
-        intrinsics: fx, fy, cx, cy, pixels.
+    """Return a lens without distortion, of width and height `size` and fx, fy, cx, cy `intrinsics`, pixels.
 
     Raises:
         TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
@@ -85,12 +81,7 @@ def write_folder(
 
 
 def cropped(lens: Lens, crop: int) -> Lens:
-    """Return the lens of images with `crop` pixels cut off at each side.
-
-    Args:
-        lens: lens of the uncropped images.
-        crop: pixels.
-    """
+    """Return the `lens` of images with `crop` pixels cut off at each side."""
     values = dict(lens.values)
     for key, change in (("w", 2 * crop), ("h", 2 * crop), ("cx", crop), ("cy", crop)):
         values[key] -= change

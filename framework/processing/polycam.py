@@ -63,8 +63,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
     """Return where a file of a zip file belongs in the folder of an export; None for files that are not needed.
 
-    Args:
-        parts: parts of its path in the zip file; the folder keyframes may be inside another one.
+    `parts` are those of its path in the zip file; the folder keyframes may be inside another one.
     """
     inside = parts[parts.index("keyframes") :] if "keyframes" in parts else ()
     return inside if len(inside) == 3 and inside[1] in FOLDERS and parts[0] != "__MACOSX" else None
@@ -80,12 +79,7 @@ def check(export: Path) -> None:
 
 
 def blur_score_of(camera: dict[str, Any], path: Path, unknown: float) -> float:
-    """Return Polycam's measure of an image's sharpness.
-
-    Args:
-        camera: content of the camera's JSON file.
-        path: the file, for messages.
-        unknown: the result if the file has no score.
+    """Return the sharpness of an image by Polycam from the content `camera` of `path`, or `unknown` without.
 
     Raises:
         DataError: if the score is not a number.
@@ -97,11 +91,7 @@ def blur_score_of(camera: dict[str, Any], path: Path, unknown: float) -> float:
 
 
 def pose_of(camera: dict[str, Any], path: Path) -> np.ndarray:
-    """Return the camera-to-world matrix (4, 4), OpenGL axes, z up, of a camera.
-
-    Args:
-        camera: content of the camera's JSON file.
-        path: the file, for messages.
+    """Return camera-to-world (4, 4), OpenGL axes, z up, from the content `camera` of the JSON file `path`.
 
     Raises:
         DataError: if the pose is incomplete.
@@ -116,11 +106,7 @@ def pose_of(camera: dict[str, Any], path: Path) -> np.ndarray:
 
 
 def lens_of(camera: dict[str, Any], path: Path) -> Lens:
-    """Return the lens of a camera.
-
-    Args:
-        camera: content of the camera's JSON file.
-        path: the file, for messages.
+    """Return the lens that the content `camera` of the JSON file `path` describes.
 
     Raises:
         DataError: if the lens is incomplete.

@@ -34,11 +34,7 @@ def write_pyramid(folder: Path, names: list[str], num_downscales: int, masks: bo
 
 
 def reduced(image: Image.Image, factor: int) -> Image.Image:
-    """Return an image reduced by an integer factor, with colours weighted by alpha, and at least one pixel large.
-
-    Args:
-        factor: side of a block, pixels.
-    """
+    """Return an `image` reduced by an integer `factor`, colours weighted by alpha, and at least one pixel large."""
     width, height = max(image.width // factor, 1), max(image.height // factor, 1)
     if min(image.size) < factor:
         return image.resize((width, height), Image.Resampling.BOX)

@@ -44,10 +44,7 @@ EXPORT = "export 'Internal/External camera parameters' from RealityCapture"
 
 
 def read_capture(file: Path) -> Capture:
-    """Read cameras from a CSV.
-
-    Args:
-        file: the CSV.
+    """Read cameras from the CSV `file`.
 
     Raises:
         DataError: if the file cannot be read, lacks a column, or has a number that is not one.
@@ -66,12 +63,7 @@ def read_capture(file: Path) -> Capture:
 
 
 def lens_for(values: dict[str, float], width: int, height: int) -> Lens:
-    """Return the lens of an image.
-
-    Args:
-        values: numbers by the names of columns.
-        width, height: size of the image, pixels.
-    """
+    """Return the lens of an image of `width` x `height` pixels, from the `values` of columns by their names."""
     longer = max(width, height)
     focal = values["f"] * longer / FILM
     return Lens(

@@ -60,11 +60,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
 
 
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return where a file of a recording belongs in the folder of an export; None for files that are not needed.
-
-    Args:
-        parts: parts of its path in the zip file.
-    """
+    """Return where a recording's file, at `parts` in the zip file, belongs in an export; None if it is not needed."""
     if parts == ("metadata",):
         return ("metadata.json",)
     if len(parts) == 2 and parts[0] == "rgbd" and parts[1].lower().endswith((".jpg", ".jpeg", ".png")):

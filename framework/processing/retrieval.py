@@ -98,11 +98,9 @@ def vocabulary(descriptors: np.ndarray, words: int, random: np.random.Generator,
 
 
 def aggregate(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the sums (W D,) of differences to the nearest centres, normalised to unit length per centre and in total.
+    """Return sums (W D,) of differences of (K, D) `descriptors` to the nearest `centres` (W, D), normalised.
 
-    Args:
-        descriptors: (K, D) local descriptors.
-        centres: (W, D) vocabulary.
+    The sum of each centre has unit length, and then the whole has.
     """
     sums = np.zeros_like(centres, dtype=np.float32)
     if len(descriptors):
@@ -113,12 +111,7 @@ def aggregate(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def read_descriptors(database: Path, names: list[str]) -> list[np.ndarray]:
-    """Read the local descriptors (K, 128) uint8 of images from COLMAP's database.
-
-    Args:
-        database: COLMAP's database.
-        names: names of the images; an unknown image has no descriptors.
-    """
+    """Return the (K, 128) uint8 descriptors of images in COLMAP's `database` by `names`; none for unknown names."""
     with closing(sqlite3.connect(database)) as connection:
         identities = dict(connection.execute("SELECT name, image_id FROM images"))
         query = "SELECT rows, cols, data FROM descriptors WHERE image_id = ?"

@@ -17,11 +17,7 @@ _TIME = re.compile(r"(19|20)\d{6}[_-]?\d{6}")
 
 
 def is_sequence(names: Sequence[PurePath]) -> bool:
-    """Return whether file names in a list are numbered or dated consecutively.
-
-    Args:
-        names: the names in natural order.
-    """
+    """Return whether file `names`, in natural order, are numbered or dated consecutively."""
     follows = [_follows(first, second) for first, second in pairwise(names)]
     return bool(follows) and sum(follows) >= MIN_CONSECUTIVE * len(follows)
 

@@ -61,11 +61,7 @@ def lines(summary: Summary) -> list[str]:
 
 
 def advice(matching: str) -> str:
-    """Return advice for images that cannot be connected.
-
-    Args:
-        matching: the rule for selecting pairs.
-    """
+    """Return advice for images that cannot be connected by the `matching` rule for pairs."""
     steps = [
         "take images with more overlap (two thirds or more with the next), sharp, in constant light",
         "set --max-num-features 16384 and --max-image-size 3200",

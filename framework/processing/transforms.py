@@ -83,11 +83,7 @@ def lens_of(model: str, width: int, height: int, parameters: Sequence[float]) ->
 
 
 def opengl_pose(world_to_camera: np.ndarray) -> np.ndarray:
-    """Convert a COLMAP pose to a camera-to-world matrix (4, 4) with OpenGL axes (y up, looking along -z).
-
-    Args:
-        world_to_camera: (3, 4) with y down.
-    """
+    """Return camera-to-world (4, 4), OpenGL axes (y up, looking along -z), of `world_to_camera` (3, 4) with y down."""
     rotation, translation = world_to_camera[:, :3], world_to_camera[:, 3]
     pose = np.eye(4)
     pose[:3, :3] = rotation.T * [1, -1, -1]
@@ -96,12 +92,7 @@ def opengl_pose(world_to_camera: np.ndarray) -> np.ndarray:
 
 
 def transformed(poses: np.ndarray, transform: np.ndarray) -> np.ndarray:
-    """Return camera-to-world poses after a change of the world's frame.
-
-    Args:
-        poses: (..., 4, 4).
-        transform: (3, 4) from the old frame to the new one.
-    """
+    """Return camera-to-world `poses` (..., 4, 4) after a change of the world's frame by `transform` (3, 4)."""
     return np.concatenate([transform, [[0.0, 0, 0, 1]]]) @ poses
 
 
@@ -157,13 +148,7 @@ def write(path: Path, value: dict[str, Any]) -> None:
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write a point cloud as an ascii PLY file.
-
-    Args:
-        path: the file.
-        points: (K, 3) positions.
-        colors: (K, 3) uint8.
-    """
+    """Write `points` (K, 3) with `colors` (K, 3) uint8 as an ascii PLY file `path`."""
     names = [*(f"property float {axis}" for axis in "xyz"), *(f"property uint8 {c}" for c in ("red", "green", "blue"))]
     header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *names, "end_header"]
     rows = [

@@ -32,23 +32,14 @@ def unfinished(output: Path) -> Path:
 
 
 def mark(flags: ColmapFlags, sources: list[Path]) -> None:
-    """Record a run's input.
-
-    Args:
-        flags: the user's flags.
-        sources: the files to read, below `flags.data`; for a video, that file alone.
-    """
+    """Record a run's input: its `flags`, and the `sources` to read below `flags.data`; of a video, that file alone."""
     work = unfinished(flags.output_dir)
     work.mkdir(parents=True, exist_ok=True)
     (work / STARTED).write_text(json.dumps(_state(flags, sources)), encoding="utf-8")
 
 
 def go_on(flags: ColmapFlags, sources: list[Path]) -> None:
-    """Check that this run can use the features and matches of the stopped run, and remove its other leftovers.
-
-    Args:
-        flags: the user's flags.
-        sources: the files to read, as in `mark`.
+    """Check that this run can use a stopped run's features and matches, by `flags` and `sources`, and remove the rest.
 
     Raises:
         DataError: if that run had other flags or other files.
@@ -81,12 +72,7 @@ def go_on(flags: ColmapFlags, sources: list[Path]) -> None:
 
 
 def frames_of(output: Path, video: Path, target: int) -> tuple[Path, list[Path]]:
-    """Return the folder of a video's frames and their paths in it; write the frames unless they exist.
-
-    Args:
-        output: the output folder.
-        video: the video file.
-        target: number of frames to write.
+    """Return the folder of `target` frames of a `video` and their paths in it; write them in `output` once.
 
     Raises:
         DataError: see `write_frames`.

@@ -49,22 +49,12 @@ class Unfolded:
 
 
 def thumbnails_of(images: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return the thumbnail of each image, by name.
-
-    Args:
-        images: folder of the images.
-        names: their names.
-    """
+    """Return the thumbnail of each image in the folder `images`, by its name in `names`."""
     return {name: thumbnail(read_image(images / name)) for name in names}
 
 
 def folded_pairs(model: Model, thumbnails: dict[str, np.ndarray]) -> list[tuple[str, str]]:
-    """Return the names of neighbours that look alike although their cameras look in very different directions.
-
-    Args:
-        model: the reconstruction.
-        thumbnails: thumbnail of each image, by name.
-    """
+    """Return neighbours of `model` that look alike by `thumbnails`, though their cameras look far apart, by name."""
     names = list(model.images)
     ahead = np.array([_ahead(model, name) for name in names]).reshape(-1, 3)
     pairs = folded_neighbours(names, ahead, np.array([thumbnails[name] for name in names]).reshape(len(names), -1))

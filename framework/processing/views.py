@@ -58,12 +58,7 @@ class View:
 
 
 def turned(right: float, up: float) -> np.ndarray:
-    """Return the rotation (3, 3) from the camera of a view to that of its image, OpenGL axes.
-
-    Args:
-        right: angle of the view to the right, degrees.
-        up: angle of the view upwards, degrees.
-    """
+    """Return the rotation (3, 3) from a view, `right` and `up` degrees off, to its image's camera, OpenGL axes."""
     a, b = math.radians(right), math.radians(up)
     around = np.array([[math.cos(a), 0, -math.sin(a)], [0, 1, 0], [math.sin(a), 0, math.cos(a)]])
     tilt = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
@@ -71,11 +66,7 @@ def turned(right: float, up: float) -> np.ndarray:
 
 
 def view_lens(lens: Lens, angle: float) -> Lens:
-    """Return the lens of the views of an image. At their centre a pixel is as large as at the image's.
-
-    Args:
-        lens: lens of the image.
-        angle: angle of view, degrees.
+    """Return the lens of views of `angle` degrees of an image of `lens`, whose central pixels are as large.
 
     Raises:
         DataError: if views would be too large.

@@ -75,10 +75,7 @@ class BlockPlan:
         ]
 
     def claim_folder(self, placement: Placement) -> None:
-        """Write the plan and all placements, so that a later call continues with the same blocks.
-
-        Args:
-            placement: placement of the input in the composed scene.
+        """Write the plan and all placements, with the composed scene's `placement`, so that a later call continues.
 
         Raises:
             ConfigError: if the folder has other blocks, or cannot be written.
@@ -144,10 +141,7 @@ def is_trained(run: Path) -> bool:
 
 
 def positions_of(parsed: ParsedScene) -> Tensor:
-    """Return the positions (M, 3) float64 of cameras in the input's frame.
-
-    Args:
-        parsed: M images.
+    """Return the positions (M, 3) float64 of the cameras of M images `parsed` in the input's frame.
 
     Raises:
         ConfigError: if the scene cannot be divided by the places of its cameras.

@@ -39,10 +39,7 @@ class TakesTeacher(Protocol):
     """A model that asks a teacher itself, before its first step."""
 
     def take_teacher(self, teacher: Teacher) -> None:
-        """Keep a teacher for `StartsFromImages.start`; this changes no parameters.
-
-        Args:
-            teacher: the teacher of `--teacher`.
+        """Keep the `teacher` of `--teacher` for `StartsFromImages.start`; this changes no parameters.
 
         Raises:
             ConfigError: if this teacher cannot be asked.

@@ -42,11 +42,7 @@ def source_of(
 
 
 def scene_of(parsed: ParsedScene, config: TrainConfig) -> Scene:
-    """Return the description of a scene, after decoding a few images.
-
-    Args:
-        parsed: the training images.
-        config: the settings of reading them.
+    """Return the description of the scene of the training images `parsed`, after decoding a few by `config`.
 
     Raises:
         ConfigError: if rays are in normalised device coordinates.

@@ -176,10 +176,7 @@ class Adam:
 
     @torch.no_grad()
     def change_rows(self, change: RowChange) -> None:
-        """Replace rows of a parameter and of its state; the state of fresh rows is zero.
-
-        Args:
-            change: the parameter, its kept rows, and the rows to append.
+        """Replace rows of a parameter and of its state by `change`; the state of fresh rows is zero.
 
         Raises:
             ValueError: if this optimiser does not hold the parameter.
@@ -230,11 +227,7 @@ class Adam:
 
 
 def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
-    """Return Adam over the model's parameter groups, each with its initial learning rate as `initial_lr`.
-
-    Args:
-        model: the model; `Model.groups` gives the parameter groups.
-        config: the run's settings, which are the groups' defaults.
+    """Return Adam over the parameter groups of `model`, with defaults of `config` and rates as `initial_lr`.
 
     Raises:
         ConfigError: if the parameters and Adam's state need more memory than the machine has.

@@ -185,11 +185,7 @@ def read_run(path: Path) -> Run:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write plain data as indented JSON, atomically.
-
-    Args:
-        path: file to write.
-        content: plain data; numbers must be finite.
+    """Write finite plain `content` as indented JSON to `path`, atomically.
 
     Raises:
         OSError: if the file cannot be written.

@@ -77,10 +77,7 @@ def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = 
 
 
 def check_data(data: Path) -> None:
-    """Check that a folder of data, or a part of one, exists.
-
-    Args:
-        data: path of the folder or of its part.
+    """Check that the folder `data`, or a part of one, exists.
 
     Raises:
         DataError: if it does not exist; the message suggests the nearest name in the same folder.
@@ -90,11 +87,7 @@ def check_data(data: Path) -> None:
 
 
 def check_writable(folder: Path, what: str) -> None:
-    """Check that an existing or new folder can be written to. Leaves nothing there.
-
-    Args:
-        folder: the folder.
-        what: what is written there, for the message.
+    """Check that `folder`, new or existing, can be written to; `what` is for the message. Leaves nothing there.
 
     Raises:
         ConfigError: if nothing can be written there.

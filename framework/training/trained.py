@@ -58,11 +58,7 @@ def load_trained(
 
 
 def load_parameters(run: Run, checkpoint: Path | None = None) -> Loaded:
-    """Load the trained model of a run whose settings are known.
-
-    Args:
-        run: the run.
-        checkpoint: checkpoint to load; None for the newest readable one.
+    """Load the trained model of `run`, with known settings, from `checkpoint` or the newest readable one.
 
     Raises:
         ConfigError: if the settings do not fit.
@@ -87,11 +83,7 @@ def load_parameters(run: Run, checkpoint: Path | None = None) -> Loaded:
 
 
 def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, Any], device: torch.device) -> Model[Any]:
-    """Return the model of a checkpoint, in evaluation mode.
-
-    Args:
-        checkpoint: content of the checkpoint, with the model's scene.
-        device: device of the model.
+    """Return the model of a `checkpoint`, which has its scene, in evaluation mode on `device`.
 
     Raises:
         CheckpointError: if the checkpoint has no scene, no model can be built with the settings, or its parameters have
@@ -112,11 +104,7 @@ def restored_model(method: Method, config: TrainConfig, checkpoint: dict[str, An
 
 
 def restore_model(model: Model[Any], checkpoint: dict[str, Any], method: str | None = None) -> None:
-    """Load a checkpoint's parameters into a model.
-
-    Args:
-        checkpoint: content of the checkpoint.
-        method: name of the model's method; None to accept any method's checkpoint.
+    """Load the parameters of a `checkpoint` into `model`; a `method` that is not None must be the checkpoint's.
 
     Raises:
         CheckpointError: if the checkpoint is of another method, or its parameters have other names or sizes.

@@ -289,12 +289,7 @@ def placed_cameras(images: PosedImages, placement: Placement) -> Cameras:
 
 
 def _check_intrinsics(images: PosedImages, sizes: Tensor) -> None:
-    """Refuse invalid cameras, and cameras of another aspect ratio than their image.
-
-    Args:
-        images: the images.
-        sizes: (M, 2) width and height of the image files.
-    """
+    """Refuse `images` with invalid cameras, or of another aspect ratio than their files' `sizes` (M, 2)."""
     numbers = (images.intrinsics, images.sizes, sizes)
     for path, values, stated, actual in zip(images.paths, *(part.tolist() for part in numbers), strict=True):
         if not all(map(math.isfinite, values)) or min(values[:2]) <= 0 or min(stated) <= 0:
@@ -315,12 +310,7 @@ def _check_intrinsics(images: PosedImages, sizes: Tensor) -> None:
 
 
 def _check_range(images: PosedImages, intrinsics: Tensor) -> None:
-    """Refuse cameras with intrinsics beyond the range of float32.
-
-    Args:
-        images: the images.
-        intrinsics: (M, 4) fx, fy, cx, cy in pixels of the image files.
-    """
+    """Refuse `images` with `intrinsics` (M, 4) fx, fy, cx, cy, pixels, beyond the range of float32."""
     usable = (intrinsics[:, :2] > 1 / MAX_MAGNITUDE).all(-1) & (intrinsics.abs() < MAX_MAGNITUDE).all(-1)
     if not bool(usable.all()):
         first = int(usable.int().argmin())

@@ -76,12 +76,7 @@ def read_images(path: Path, model: Path, images: str, masks: str, split: Split) 
 
 
 def tracks_of(sparse: SparseModel, intrinsics: Tensor) -> Tracks | None:
-    """Return the tracks of a reconstruction in its own frame; None if it has no points.
-
-    Args:
-        sparse: the reconstruction of M images.
-        intrinsics: (M, 4) fx, fy, cx, cy of the images used for the reconstruction.
-    """
+    """Return the tracks of `sparse` in its own frame, by (M, 4) `intrinsics` of its images; None without points."""
     if not len(sparse.points):
         return None
     images, seen = sparse.sightings.unbind(-1)

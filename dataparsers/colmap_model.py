@@ -68,12 +68,7 @@ class SparseModel:
 
 
 def find_models(path: Path, locations: Sequence[str] = LOCATIONS) -> list[Path]:
-    """Return the reconstructions in some folders and below, in the order of the folders. Never raises.
-
-    Args:
-        path: the data folder.
-        locations: subfolders to search; the data folder itself, ".", is not searched below.
-    """
+    """Return the reconstructions in subfolders `locations` of `path` and below them, in order. Never raises."""
     models: list[Path] = []
     for location in locations:
         levels = 0 if location == "." else MAX_DEPTH

@@ -71,11 +71,7 @@ def _bright(random: np.random.Generator) -> Colour:
 
 
 def cast(seed: int) -> list[Part]:
-    """Return the people and things of a data set, standing at the origin at height 0.
-
-    Args:
-        seed: seed of sizes and colours.
-    """
+    """Return the people and things of the data set of a `seed`, standing at the origin at height 0."""
     random = np.random.default_rng([seed, 1])
     found = []
     for _ in range(NUM_PEOPLE):

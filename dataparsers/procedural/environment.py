@@ -59,11 +59,7 @@ def _total(kappa: Tensor) -> Tensor:
 
 
 def make_environment(seed: int) -> Environment:
-    """Return an environment of random lamps.
-
-    Args:
-        seed: seed of their directions, widths and colours.
-    """
+    """Return an environment of lamps with random directions, widths and colours of a `seed`."""
     random = np.random.default_rng(seed)
     height = random.uniform(-0.9, 1.0, NUM_LAMPS)
     azimuth = random.uniform(0, 2 * math.pi, NUM_LAMPS)

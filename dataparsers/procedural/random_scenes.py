@@ -35,12 +35,7 @@ MAX_REACH = 1.35
 
 
 def random_parts(seed: int, scene: int) -> Parts:
-    """Return the solids of a scene; they are matte and may intersect.
-
-    Args:
-        seed: seed of the data set.
-        scene: index of the scene.
-    """
+    """Return the solids of scene `scene` of a data set with a `seed`; they are matte and may intersect."""
     random = np.random.default_rng([seed, scene])
     return {f"solid {index}": _random_part(random) for index in range(random.integers(MIN_SOLIDS, MAX_SOLIDS + 1))}
 
@@ -61,12 +56,7 @@ def _plain(colour: Colour, p: Tensor) -> Tensor:
 
 
 def scene_numbers(split: str, num_scenes: int) -> range:
-    """Return the indices of a split's scenes; no scene is in two splits.
-
-    Args:
-        split: train, val or test.
-        num_scenes: number of training scenes.
-    """
+    """Return the indices of the scenes of a `split`, given `num_scenes` to train on; no scene is in two splits."""
     if split == "train":
         return range(num_scenes)
     first = num_scenes + (UNSEEN["val"] if split == "test" else 0)

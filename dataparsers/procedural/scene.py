@@ -25,13 +25,7 @@ _RED, _TEAL, _OCHRE, _BRASS = (0.60, 0.045, 0.05), (0.0, 0.20, 0.24), (0.80, 0.3
 
 
 def smoothstep(low: float, high: float, x: Tensor) -> Tensor:
-    """Interpolate smoothly from 0 to 1 by a cubic.
-
-    Args:
-        low: argument below which the result is 0.
-        high: argument above which the result is 1. If `high` is less than `low`, the function decreases.
-        x: arguments, of any shape.
-    """
+    """Interpolate `x` smoothly by a cubic, from 0 at `low` to 1 at `high`, which may be less than `low`."""
     t = ((x - low) / (high - low)).clamp(0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -383,12 +377,7 @@ def trace(origins: Tensor, directions: Tensor, time: float | Tensor = 0.0) -> Hi
 
 @torch.no_grad()
 def inside(points: Tensor, time: float | Tensor = 0.0) -> Tensor:
-    """Return whether points lie inside a solid, (N,) bool.
-
-    Args:
-        points: (N, 3) scene units.
-        time: in [0, 1], a number or (N,).
-    """
+    """Return whether `points` (N, 3), scene units, lie inside a solid at a `time` in [0, 1] or (N,), as (N,) bool."""
     p = points.T.contiguous()
     return _distance(_poses(time, p), p) < 0.0
 

@@ -45,11 +45,7 @@ class Shape(Protocol):
         """
 
     def closest(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, ...]:
-        """Return the parameters of the points closest to the solid, or deepest inside it.
-
-        Args:
-            offset, direction: the lines.
-        """
+        """Return the parameters of the points on lines (`offset`, `direction`) closest to or deepest in the solid."""
 
 
 def _enter_interval(near: Tensor, far: Tensor, start: Tensor) -> Tensor:
@@ -122,12 +118,7 @@ class Box(Shape):
 
 @dataclass(frozen=True)
 class BoredBox(Shape):
-    """A cuboid with a round hole along z.
-
-    Args:
-        half: half the length of its edges along x, y and z.
-        radius: radius of the hole, less than half the edges along x and y.
-    """
+    """A cuboid of half edges `half` along x, y and z, with a round hole of a smaller `radius` along z."""
 
     half: tuple[float, float, float]
     radius: float

@@ -70,11 +70,7 @@ SOLIDS: Parts = {
 
 
 def surface(deviation: float = DEVIATION) -> Triangles:
-    """Return the surface of all solids.
-
-    Args:
-        deviation: maximum distance of the triangles from the surface, scene units.
-    """
+    """Return the surface of all solids, by triangles at most `deviation` from it, scene units."""
     local = {
         "sphere": of_sphere(_BALL, deviation),
         "cuboid": of_box(_BOX),
@@ -93,12 +89,7 @@ def _placed(found: Triangles, part: Part) -> Triangles:
 
 
 def poses_around(count: int, turn: float = 0.0) -> list[npt.NDArray[np.float64]]:
-    """Return camera-to-world matrices (4, 4) of cameras evenly spaced on a whole sphere, by a Fibonacci lattice.
-
-    Args:
-        count: number of cameras.
-        turn: rotation of the lattice about z, radians.
-    """
+    """Return `count` camera-to-world matrices (4, 4) on a sphere, by a Fibonacci lattice turned by `turn` radians."""
     heights = 1 - 2 * (np.arange(count) + 0.5) / count
     azimuths = turn + math.pi * (3.0 - math.sqrt(5.0)) * np.arange(count)
     return [camera_pose(float(a), math.asin(h)) for a, h in zip(azimuths, heights, strict=True)]

@@ -96,12 +96,7 @@ def _ground(p: Tensor) -> Tensor:
 
 
 def street(houses: int, seed: int) -> dict[str, Part]:
-    """Return the solids of a street by name. None of them is shiny.
-
-    Args:
-        houses: number of houses on each side.
-        seed: seed of their sizes and colours.
-    """
+    """Return the solids, none shiny, of a street by name: `houses` on each side, sizes and colours of a `seed`."""
     random, length = np.random.default_rng([seed, 10]), houses * LOT
     slab = Box((length / 2 + 2.0, FACE + 2.5, 0.05))
     parts = {"ground": Part(slab, (0.0, 0.0, -0.05), 0.0, _ground, 0.0, shadow=False)}
@@ -158,13 +153,7 @@ def street_poses(split: str, count: int, houses: int, seed: int) -> list[npt.NDA
 
 
 def traffic(pose: npt.NDArray[np.float64], count: int, random: np.random.Generator) -> dict[str, Part]:
-    """Return cars near a camera, in both lanes. Where there is no room for one, it is left out.
-
-    Args:
-        pose: (4, 4) camera-to-world matrix.
-        count: number of cars.
-        random: source of their places and colours.
-    """
+    """Return up to `count` cars near the camera `pose` (4, 4), in both lanes, with `random` places and colours."""
     found: dict[str, Part] = {}
     for number in range(count):
         x, y = float(pose[0, 3]) + random.uniform(-_NEAR, _NEAR), math.copysign(_LANE, random.uniform(-1, 1))

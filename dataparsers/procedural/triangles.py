@@ -35,12 +35,7 @@ def joined(parts: Sequence[Triangles]) -> Triangles:
 
 
 def of_sphere(shape: Sphere, deviation: float) -> Triangles:
-    """Return the surface of a ball: a grid of its latitudes and longitudes.
-
-    Args:
-        shape: the ball.
-        deviation: maximum distance of the triangles from the surface.
-    """
+    """Return the surface of the ball `shape` as a grid of latitudes and longitudes, at most `deviation` from it."""
     count = 2 * _divisions(shape.radius, deviation / 2)
     latitude = torch.linspace(-math.pi / 2, math.pi / 2, count // 2 + 1, dtype=torch.float64)
     longitude = _angles(count)

@@ -144,12 +144,9 @@ def visible_parts(
 
 
 def camera_pose(azimuth: float, elevation: float, radius: float = RADIUS) -> npt.NDArray[np.float64]:
-    """Return the camera-to-world matrix (4, 4) of a camera that looks at the origin.
+    """Return the camera-to-world matrix (4, 4) of a camera that looks at the origin from a distance `radius`.
 
-    Args:
-        azimuth: angle around z, radians.
-        elevation: angle above the horizon, radians.
-        radius: distance from the origin, scene units.
+    `azimuth` around z and `elevation` above the horizon are in radians, the radius in scene units.
     """
     back = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]

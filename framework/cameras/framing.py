@@ -29,13 +29,7 @@ def perspective(poses: Tensor, width: int, height: int, fov: Tensor | float) -> 
 
 
 def size_of(size: tuple[int, int], width: int | None, height: int | None) -> tuple[int, int]:
-    """Return width and height of resized images; what is None follows from the other one and the aspect ratio.
-
-    Args:
-        size: width and height before, pixels.
-        width: new width, pixels.
-        height: new height, pixels.
-    """
+    """Return (width, height) `size` resized to `width` and `height`; what is None keeps the aspect ratio."""
     before_width, before_height = size
     if width is None:
         width = before_width if height is None else max(round(before_width * height / before_height), 1)

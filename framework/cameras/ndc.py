@@ -93,11 +93,7 @@ class NdcCameras(Cameras):
 
 
 def middle_frame(poses: Tensor) -> Tensor:
-    """Return the transform (3, 4) from the scene's frame to that of a camera with mean position and mean axes.
-
-    Args:
-        poses: (M, 3, 4) camera-to-world.
-    """
+    """Return the transform (3, 4) from the scene to a camera with mean position and axes of `poses` (M, 3, 4)."""
     back = torch.nn.functional.normalize(poses[:, :, 2].mean(0), dim=0)
     up = poses[:, :, 1].mean(0)
     up = torch.nn.functional.normalize(up - (up @ back) * back, dim=0)
@@ -132,13 +128,7 @@ def find_ndc(poses: Tensor, corners: Tensor, nears: Tensor) -> Ndc:
 
 
 def ndc_box(ndc: Ndc, poses: Tensor, corners: Tensor) -> Tensor:
-    """Return the smallest box (2, 3) in normalised device coordinates that holds everything that M cameras see.
-
-    Args:
-        ndc: the coordinates.
-        poses: (M, 3, 4) as in `find_ndc`.
-        corners: (M, 4, 3) as in `find_ndc`.
-    """
+    """Return the smallest box (2, 3) in `ndc` of all that cameras see, with `poses` and `corners` as in `find_ndc`."""
     origins = poses[:, None, :, 3].expand_as(corners).reshape(-1, 3)
     directions = torch.nn.functional.normalize(corners.reshape(-1, 3), dim=-1)
     zero = torch.zeros_like(origins[:, 0])

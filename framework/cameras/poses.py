@@ -181,12 +181,7 @@ def place(
 
 
 def rotation_between(start: Tensor, end: Tensor) -> Tensor:
-    """Return the smallest rotation (3, 3) between two directions; the identity if one of them is zero.
-
-    Args:
-        start: (3,) direction to be rotated.
-        end: (3,) its direction after the rotation.
-    """
+    """Return the smallest rotation (3, 3) from direction `start` (3,) to `end`; the identity if one is zero."""
     identity = torch.eye(3, dtype=start.dtype)
     if not bool(start.norm() > 0) or not bool(end.norm() > 0):
         return identity
@@ -218,10 +213,9 @@ def nearest_point(origins: Tensor, directions: Tensor) -> Tensor:
 
 
 def looked_at(poses: Tensor) -> Tensor | None:
-    """Return the point (3,) float64 that cameras look at, nearest to all their axes; None if it is behind most of them.
+    """Return the point (3,) float64 nearest to the axes of M cameras; None if it is behind most of them.
 
-    Args:
-        poses: (M, 3, 4) camera-to-world, OpenGL axes.
+    `poses` are (M, 3, 4) camera-to-world, with OpenGL axes.
     """
     precise = poses.double().cpu()
     origins, ahead = precise[:, :, 3], -precise[:, :, 2]

@@ -47,11 +47,7 @@ class PoseRefinement(nn.Module):
         self.tangents = nn.Parameter(torch.zeros(count, 6))
 
     def motions(self, chosen: slice = slice(None)) -> Tensor:
-        """Return the motions (M, 3, 4), exponentials of the (M, 6) translations and rotation vectors.
-
-        Args:
-            chosen: the cameras; all if not given.
-        """
+        """Return the motions (M, 3, 4) of the cameras `chosen`, or all: exponentials of (M, 6) numbers."""
         return rigid_motions(self.tangents[chosen], self.group == "SE3")
 
     def forward(self, rays: Rays) -> Rays:
@@ -74,12 +70,7 @@ class PoseRefinement(nn.Module):
         return replace(rays, origins=origins + motions[:, :, 3], directions=directions)
 
     def pose(self, index: int, given: Tensor) -> Tensor:
-        """Return the refined pose (3, 4) of a training camera, with a gradient.
-
-        Args:
-            index: index of the training camera.
-            given: (3, 4) its given pose.
-        """
+        """Return the refined pose of training camera `index`, `given` as (3, 4), with a gradient."""
         return self._moved(given[None], slice(index, index + 1))[0]
 
     @torch.no_grad()

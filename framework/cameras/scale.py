@@ -42,19 +42,11 @@ class Scale:
         return bool(self.unit)
 
     def placed(self, placement: Placement) -> Placement:
-        """Return the placement of the input in this scale.
-
-        Args:
-            placement: placement of the input in its own unit.
-        """
+        """Return the `placement` of the input, in its own unit, in this scale."""
         return placement.after(torch.eye(4), self.factor)
 
     def unplaced(self, placement: Placement) -> Placement:
-        """Return the placement of the input in its own unit; the inverse of `placed`.
-
-        Args:
-            placement: placement of the input in this scale.
-        """
+        """Return the `placement` of the input, in this scale, in its own unit; the inverse of `placed`."""
         return placement.before(torch.eye(4), self.factor)
 
     def words(self) -> str:

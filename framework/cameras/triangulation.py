@@ -63,12 +63,7 @@ def point_covariance(jacobians: Tensor, pixel_error: float) -> Tensor:
 
 
 def reading_error(jacobians: Tensor, pixel_error: float) -> float:
-    """Return the length of `pixel_error` pixels in the sharpest image, at the point; infinite without an image.
-
-    Args:
-        jacobians: (N, 2, 3) derivatives of the point's projections.
-        pixel_error: standard deviation of columns and rows, pixels.
-    """
+    """Return the length of `pixel_error` in the sharpest image at a point, by `jacobians` (N, 2, 3); inf for N = 0."""
     if not len(jacobians):
         return math.inf
     return pixel_error / float(jacobians.double().square().sum((1, 2)).div(2).sqrt().max())

@@ -59,12 +59,7 @@ class View:
 
 
 def views(folders: Sequence[tuple[str, Path]], count: int = MAX_VIEWS) -> list[View]:
-    """Return views that all contenders have rendered, evenly spaced.
-
-    Args:
-        folders: each contender's label and folder of renders and held-out images.
-        count: maximum number of views.
-    """
+    """Return at most `count` views, evenly spaced, that are in each contender's folder of `folders`, by label."""
     names = [
         {file.name.removesuffix(IMAGE_SUFFIX) for file in folder.glob("*" + IMAGE_SUFFIX)} for _, folder in folders
     ]
@@ -102,11 +97,7 @@ def _view(name: str, folders: Sequence[tuple[str, Path]]) -> View | None:
 
 
 def worst_square(errors: np.ndarray) -> tuple[int, int, int]:
-    """Return top, left and side of the square crop with the largest sum of errors.
-
-    Args:
-        errors: (H, W).
-    """
+    """Return top, left and side of the square crop with the largest sum of `errors` (H, W)."""
     height, width = errors.shape
     side = min(max(min(height, width) // CROP_SHARE, MIN_CROP), height, width)
     sums = np.pad(errors, ((1, 0), (1, 0))).cumsum(0).cumsum(1)

@@ -109,12 +109,7 @@ class Measured:
 
 
 def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
-    """Return the measurements of a planned run; None if it is not finished or its images are not finite.
-
-    Args:
-        planned: the run.
-        conditions: the conditions of the comparison.
-    """
+    """Return the measurements of a `planned` run under `conditions`; None if unfinished or its images not finite."""
     summary, evaluation = read_json(planned.folder / "summary.json"), read_json(planned.evaluation)
     if not isinstance(summary, dict) or not isinstance(evaluation, dict):
         return None
@@ -239,13 +234,7 @@ class Row:
 
 
 def rows_of(labels: Sequence[str], runs: Sequence[Measured], failures: dict[str, list[str]]) -> list[Row]:
-    """Return a row for each contender.
-
-    Args:
-        labels: labels of the contenders, in the order of the rows.
-        runs: measurements of all finished runs.
-        failures: label -> reasons of failures.
-    """
+    """Return a row for each contender in `labels`, from all finished `runs` and reasons of `failures` by label."""
     return [
         Row(label, tuple(run for run in runs if run.label == label), tuple(failures.get(label, ()))) for label in labels
     ]

@@ -78,12 +78,9 @@ class Cell:
 
 
 def write_report(plan: Plan, rows: Sequence[Row], sharing: str | None = None) -> Path:
-    """Write all four files, and return the path of report.html.
+    """Write all four files of `plan` and `rows`, and return the path of report.html.
 
-    Args:
-        plan: the comparison.
-        rows: results of the contenders.
-        sharing: what else machines did during a run, as a sentence; None if each run was alone.
+    `sharing` is a sentence on what else machines did during a run; None if each run was alone.
     """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)
@@ -139,12 +136,7 @@ def _content(plan: Plan, rows: Sequence[Row], runs: Sequence[Measured]) -> dict[
 
 
 def condition_lines(conditions: Conditions, repeats: int, runs: Sequence[Measured]) -> list[str]:
-    """Return the conditions shared by all runs, as sentences.
-
-    Args:
-        repeats: number of seeds for each contender.
-        runs: measurements of all finished runs.
-    """
+    """Return the `conditions` of `runs` with `repeats` seeds as sentences."""
     counts = sorted({run.views for run in runs})
     evaluated = " or ".join(map(str, counts)) or "all"
     lines = [
@@ -186,11 +178,7 @@ def _of_all(conditions: Conditions) -> str:
 
 
 def measured(rows: Sequence[Row]) -> list[Column]:
-    """Return the columns with a value for some contender; all of them if no contender has finished.
-
-    Args:
-        rows: results of the contenders.
-    """
+    """Return the columns with a value for some contender of `rows`; all of them if none has finished."""
     return [c for c in COLUMNS if any(row.mean(c.figure) is not None for row in rows)] or list(COLUMNS)
 
 
@@ -221,11 +209,7 @@ def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def console_table(rows: Sequence[Row]) -> Table:
-    """Return the table of results for a terminal, with a line for each measurement, because labels are long.
-
-    Args:
-        rows: results of the contenders.
-    """
+    """Return the table of `rows` for a terminal, with a line for each measurement, because labels are long."""
     result = Table("", *(row.label for row in rows))
     columns = measured(rows)
     cells = [row["cells"] or [Cell(row["instead"])] * len(columns) for row in table(rows)]
@@ -253,21 +237,13 @@ def _best(column: Column, value: float, others: Sequence[float]) -> bool:
 
 
 def levels(rows: Sequence[Row]) -> list[int]:
-    """Return the integer PSNRs, dB, that contenders reached after their first evaluation; at most the highest sixteen.
-
-    Args:
-        rows: results of the contenders.
-    """
+    """Return the integer PSNRs, dB, that `rows` reached after their first evaluation; at most the highest sixteen."""
     reached = {level for row in rows for run in row.runs for level in run.seconds_to}
     return sorted(reached)[-16:]
 
 
 def level_table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the rows of the table of seconds of training to each of `levels`.
-
-    Args:
-        rows: results of the contenders.
-    """
+    """Return the table of the seconds of training of `rows` to each of `levels`."""
     result = []
     for index, row in enumerate(rows):
         cells = [Cell(_when(row, level)) for level in levels(rows)]
@@ -293,11 +269,7 @@ def machines(runs: Sequence[Measured]) -> list[str]:
 
 
 def markdown(content: dict[str, Any]) -> str:
-    """Return the report as Markdown, without images.
-
-    Args:
-        content: content of the report.
-    """
+    """Return the report's `content` as Markdown, without images."""
     lines = [f"# {content['title']}", "", content["when"], "", *(f"- {line}" for line in content["conditions"]), ""]
     lines += _markdown_table(["method", *content["columns"]], content["rows"])
     lines += [

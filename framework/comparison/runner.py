@@ -30,12 +30,7 @@ def run_all(plan: Plan, launcher: Launcher) -> dict[PlannedRun, Failure]:
 
 
 def job_of(planned: PlannedRun, conditions: Conditions) -> Job:
-    """Return a run as a job.
-
-    Args:
-        planned: the run.
-        conditions: the conditions of the comparison.
-    """
+    """Return a `planned` run under `conditions` as a job."""
     config = planned.folder / "config.yml"
     train = Step(tuple(planned.train_command(conditions)), config, tuple(planned.resume_command()))
     return Job(
@@ -49,12 +44,7 @@ def job_of(planned: PlannedRun, conditions: Conditions) -> Job:
 
 
 def is_done(planned: PlannedRun, judges_surface: bool = False) -> bool:
-    """Return whether a run is completely trained and evaluated, with finite images.
-
-    Args:
-        planned: the run.
-        judges_surface: whether its surface must have been judged too.
-    """
+    """Return whether a `planned` run is trained and judged, its surface too if `judges_surface`, with finite images."""
     summary, evaluation = read_json(planned.folder / "summary.json"), read_json(planned.evaluation)
     if not isinstance(summary, dict) or summary.get("interrupted") is not False or not isinstance(evaluation, dict):
         return False

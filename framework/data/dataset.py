@@ -143,12 +143,7 @@ class Dataset:
         return pixels.view(height, width, -1)
 
     def view(self, index: int, stride: int = 1) -> View:
-        """Return the camera of image `index`, with its time and scene.
-
-        Args:
-            index: index of the image.
-            stride: distance between the rows and columns in use.
-        """
+        """Return the camera of image `index` with time and scene, at every `stride`-th row and column."""
         view = replace(View.of(self.cameras, index, self.times, stride), image=index if self.training else None)
         return view if self.scene_indices is None else replace(view, scene=int(self.scene_indices[index]))
 
@@ -173,11 +168,7 @@ class Dataset:
         return read_normals(path, width, height).to(self.device) @ turn.T
 
     def drawing(self, pixels: PixelSet) -> Dataset:
-        """Return the data set with `drawn` restricted to some pixels; unchanged if that would leave none.
-
-        Args:
-            pixels: pixels to draw from.
-        """
+        """Return the data set with `drawn` restricted to `pixels`; unchanged if that would leave none."""
         pixels = pixels.to(self.pixels.device)
         if self.drawn is not None:
             pixels = PixelSet.shared([pixels, self.drawn], 2)
@@ -186,12 +177,7 @@ class Dataset:
         return replace(self, drawn=pixels if self.mapped is not None else pixels.listed())
 
     def to(self, device: torch.device | str, with_pixels: bool = True) -> Dataset:
-        """Return the data set on a device.
-
-        Args:
-            device: the device of batches.
-            with_pixels: whether to move pixels in memory as well. If not, drawn pixels are copied batch by batch.
-        """
+        """Return the data set with batches on `device`; without `with_pixels`, drawn pixels are copied there."""
         with_pixels = with_pixels and self.mapped is None
         return replace(
             self,

@@ -144,13 +144,7 @@ def may_be_transparent(path: Path) -> bool:
 
 
 def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
-    """Return the error for an unreadable image, with advice instead of the decoder's message.
-
-    Args:
-        path: the file.
-        error: the decoder's error, of any type.
-        what: name of the file in the message, such as "the mask".
-    """
+    """Return the error for an unreadable image, `what` in the message, at `path`, with advice for `error`."""
     name = f"{what} {path}".lstrip()
     try:
         size = path.stat().st_size

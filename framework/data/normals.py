@@ -22,11 +22,7 @@ ENDING = "_normal.png"
 
 
 def normals_beside(images: Sequence[Path]) -> tuple[Path | None, ...] | None:
-    """Return the normal image beside each image, None for an image without one; None if no image has one.
-
-    Args:
-        images: image files.
-    """
+    """Return the normal image beside each of `images`, or None; None if no image has one."""
     found = tuple(path.with_name(path.stem + ENDING) for path in images)
     known = tuple(path if path.is_file() else None for path in found)
     return known if any(known) else None

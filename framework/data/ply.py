@@ -244,12 +244,7 @@ def write_points(file: Path, positions: Tensor, colors: Tensor, normals: Tensor 
 
 
 def coordinate_columns(file: Path, positions: Tensor) -> list[tuple[str, np.ndarray]]:
-    """Return the columns x, y and z of positions: float32, or float64 with a note where float32 is too coarse.
-
-    Args:
-        file: path of the PLY file, for the message.
-        positions: (K, 3) float64.
-    """
+    """Return x, y, z of `positions` (K, 3) as float32, or float64 with a note on `file` if that is too coarse."""
     if local_origin(positions) is None:
         return list(zip("xyz", positions.float().numpy().T, strict=True))
     say(f"{file.name}: {in_full(positions)}")

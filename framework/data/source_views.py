@@ -27,13 +27,7 @@ def images_of(dataset: Dataset, scene: int | None) -> Tensor:
 
 
 def other_images(dataset: Dataset, images: Tensor, pose: Tensor) -> Tensor:
-    """Return the images that were not taken with a given pose, so that no view is rendered from itself.
-
-    Args:
-        dataset: the images.
-        images: (K,) indices, on the CPU.
-        pose: (3, 4) camera-to-world.
-    """
+    """Return `images` (K,), on the CPU, without those of the given pose `pose` (3, 4) in `dataset`."""
     same = (dataset.cameras.camera_to_worlds == pose).flatten(1).all(-1).cpu()
     return images[~same[images]]
 

@@ -84,24 +84,14 @@ class BatchSource(ABC):
         return source
 
     def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:  # noqa: B027, most have nothing to learn
-        """Record the errors of a rendered batch.
-
-        Args:
-            request: the step's request.
-            batch: the batch, from `draw`.
-            rgb: rendered colours, with the shape of `batch.rgb`.
-        """
+        """Record the errors of colours `rgb`, rendered for a `batch` that was drawn for `request`."""
 
     def state(self) -> Tensor | None:
         """Return the learnt state for a checkpoint; None if the source learns nothing."""
         return None
 
     def restore(self, state: Tensor | None) -> None:  # noqa: B027, likewise
-        """Restore the learnt state from a checkpoint.
-
-        Args:
-            state: the result of `BatchSource.state`; None if the checkpoint has none.
-        """
+        """Restore the learnt `state` from a checkpoint; None if the checkpoint has none."""
 
 
 class PixelSource(BatchSource):
@@ -237,13 +227,7 @@ class ViewSource(BatchSource):
 
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
-    """Return the source of a model's training batches.
-
-    Args:
-        kind: kind of the batches: `Model.batches`.
-        dataset: the training images, on the device.
-        config: the settings of the run.
-    """
+    """Return the source of training batches of a `kind` (`Model.batches`) from `dataset`, by `config`."""
     background = training_background(config.background, dataset.scene.has_alpha)
     if kind == "views":
         return ViewSource(dataset, background, config.machine.seed)

@@ -39,11 +39,7 @@ class Sightings:
         return len(self.images)
 
     def of_images(self, chosen: Tensor) -> Sightings:
-        """Return the sightings in some images, which are renumbered.
-
-        Args:
-            chosen: (S,) int64 images, without repetitions.
-        """
+        """Return the sightings in the images `chosen` (S,) int64, each once, which are renumbered."""
         kept, images = _renumbered(self.images, chosen)
         return Sightings(images, self.points[kept], self.deviations[kept])
 
@@ -58,20 +54,12 @@ class Observations:
     """(O,) int64 point of each observation."""
 
     def of_images(self, chosen: Tensor) -> Observations:
-        """Return the observations in some images, which are renumbered.
-
-        Args:
-            chosen: (S,) int64 images.
-        """
+        """Return the observations in the images `chosen` (S,) int64, which are renumbered."""
         kept, images = _renumbered(self.images, chosen)
         return Observations(images, self.points[kept])
 
     def of_points(self, chosen: Tensor) -> Observations:
-        """Return the observations of some points, which are renumbered.
-
-        Args:
-            chosen: (K,) bool, the points.
-        """
+        """Return the observations of the points `chosen` (K,) bool, which are renumbered."""
         kept = chosen[self.points]
         return Observations(self.images[kept], (chosen.cumsum(0) - 1)[self.points[kept]])
 
@@ -96,20 +84,12 @@ class Tracks:
     """(K,) int64 index in `DOUBTS` of the reason not to use a point's distances; 0 to use them."""
 
     def of_images(self, chosen: Tensor) -> Tracks:
-        """Return all points, and the sightings in some images, which are renumbered.
-
-        Args:
-            chosen: (S,) int64 images, without repetitions.
-        """
+        """Return all points, and the sightings in images `chosen` (S,) int64, each once, renumbered."""
         kept, images = _renumbered(self.images, chosen)
         return replace(self, images=images, seen=self.seen[kept], angles=self.angles[kept])
 
     def without(self, images: Tensor) -> Tracks:
-        """Return all points, without the sightings in some images.
-
-        Args:
-            images: (M,) bool, the images to leave out.
-        """
+        """Return all points, without the sightings in `images` (M,) bool."""
         kept = ~images[self.images]
         return replace(self, images=self.images[kept], seen=self.seen[kept], angles=self.angles[kept])
 
@@ -154,11 +134,7 @@ class Tracks:
         return self._known(distance_deviations(self, centers), centers)
 
     def sightings(self, centers: Tensor) -> Sightings:
-        """Return the sightings with accurate distances (`known_distances`).
-
-        Args:
-            centers: (M, 3) positions of the cameras.
-        """
+        """Return the sightings from camera positions `centers` (M, 3) with accurate distances (`known_distances`)."""
         deviations = distance_deviations(self, centers)
         known = self._known(deviations, centers)
         return Sightings(self.images[known], self.points[self.seen[known]].float(), deviations[known].float())
@@ -170,11 +146,9 @@ class Tracks:
 
 
 def doubts_about(lengths: Tensor, errors: Tensor) -> Tensor:
-    """Return the reason in `DOUBTS` not to use each point's distances, (K,) int64; 0 to use them.
+    """Return the reason in `DOUBTS` against each point's distances, (K,) int64, or 0.
 
-    Args:
-        lengths: (K,) number of images that observe each point.
-        errors: (K,) mean reprojection error of each point, pixels.
+    `lengths` (K,) are numbers of images that observe a point, `errors` (K,) mean reprojection errors in pixels.
     """
     doubts = torch.where(errors > MAX_ERROR, 3, 0)
     doubts[lengths < MIN_TRACK_LENGTH] = 2

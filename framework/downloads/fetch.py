@@ -91,12 +91,7 @@ def fetch(source: Source, file: Path) -> None:
 
 
 def digest(file: Path, algorithm: str) -> str:
-    """Return a checksum of a file in hexadecimal.
-
-    Args:
-        file: file to read.
-        algorithm: "sha256" or "md5".
-    """
+    """Return the checksum of a `file` by `algorithm`, "sha256" or "md5", in hexadecimal."""
     summed = hashlib.new(algorithm, usedforsecurity=False)
     with file.open("rb") as opened, track_bytes(f"checking {file.name}", file.stat().st_size) as advance:
         while chunk := opened.read(CHUNK):

@@ -70,11 +70,7 @@ def reduce_to(edited: Edited, count: int) -> Edited:
 
 
 def set_degree(edited: Edited, degree: int) -> Edited:
-    """Remove the harmonics above a degree.
-
-    Args:
-        degree: highest degree that is kept, 0 to 3.
-    """
+    """Remove the harmonics above `degree`, 0 to 3."""
     return replace(edited, gaussians=with_degree(edited.gaussians, degree))
 
 

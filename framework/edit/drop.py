@@ -15,20 +15,12 @@ OUTSIDE = 0.01
 
 
 def drop_faint(edited: Edited, min_opacity: float = 0.02) -> Edited:
-    """Remove Gaussians of low opacity.
-
-    Args:
-        min_opacity: minimum opacity, 0 to 1.
-    """
+    """Remove Gaussians of lower opacity than `min_opacity`, 0 to 1."""
     return edited.kept(torch.sigmoid(edited.gaussians.logits) >= min_opacity)
 
 
 def drop_large(edited: Edited, max_size: float) -> Edited:
-    """Remove large Gaussians.
-
-    Args:
-        max_size: maximum standard deviation along the longest axis, in the unit of coordinates.
-    """
+    """Remove Gaussians with a larger standard deviation than `max_size` along any axis, in the unit of coordinates."""
     return edited.kept(edited.gaussians.log_scales.exp().amax(-1) <= max_size)
 
 

@@ -21,12 +21,7 @@ from nerfloom.training.loaded import Loaded
 
 
 class Redrawn(Renderable):
-    """A model that draws other Gaussians instead of its own.
-
-    Args:
-        model: a model that can render given Gaussians.
-        gaussians: N Gaussians, float32, in the frame of its scene.
-    """
+    """A `model` that draws other `gaussians` (N, float32, in the frame of its scene) instead of its own."""
 
     def __init__(self, model: Renderable, gaussians: Gaussians) -> None:
         self.scene, self._model, self._gaussians = model.scene, model, gaussians
@@ -57,12 +52,7 @@ class HeldOut:
 
     @classmethod
     def of(cls, loaded: Loaded, max_images: int) -> HeldOut | None:
-        """Return the held-out photographs of a run or a file; None if they are not known, or show other moments.
-
-        Args:
-            loaded: the run or file.
-            max_images: maximum number of photographs, evenly spaced.
-        """
+        """Return up to `max_images` held-out photographs of `loaded`; None if unknown or of other moments."""
         model = loaded.model
         if loaded.source is None or model.scene.moving or not isinstance(model, RendersGaussians) or max_images < 1:
             return None

@@ -22,11 +22,7 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 def move(edited: Edited, by: Vector) -> Edited:
-    """Move Gaussians.
-
-    Args:
-        by: the shift.
-    """
+    """Move Gaussians by the shift `by`."""
     return edited.moved(Similarity(torch.eye(3, dtype=torch.float64), 1.0, vector(by)))
 
 

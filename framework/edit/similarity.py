@@ -25,11 +25,7 @@ class Similarity(NamedTuple):
 
 
 def vector(values: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
-    """Return coordinates as a tensor float64.
-
-    Args:
-        values: three coordinates, or those of several points.
-    """
+    """Return three coordinates `values`, or those of several points, as a tensor float64."""
     return torch.tensor(values, dtype=torch.float64)
 
 
@@ -51,23 +47,12 @@ def direction(values: Sequence[float], name: str) -> Tensor:
 
 
 def about(center: Tensor, rotation: Tensor | None = None, scale: float = 1.0) -> Similarity:
-    """Return the similarity that turns and scales space about a point, which stays.
-
-    Args:
-        center: (3,) float64 the point.
-        rotation: (3, 3) float64; None for none.
-        scale: new units per old unit.
-    """
+    """Return the similarity that turns by `rotation` (3, 3), if any, and scales by `scale` about `center` (3,)."""
     turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
     return Similarity(turn, scale, center - scale * (turn @ center))
 
 
 def axis_rotation(axis: Tensor, degrees: float) -> Tensor:
-    """Return the rotation (3, 3) about an axis, by Rodrigues' formula.
-
-    Args:
-        axis: (3,) float64 unit vector.
-        degrees: angle; counter-clockwise where the axis points to the viewer.
-    """
+    """Return the rotation (3, 3) by `degrees` about the unit vector `axis` (3,) float64, by Rodrigues' formula."""
     angle, cross = math.radians(degrees), cross_matrix(axis)
     return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)

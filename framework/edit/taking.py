@@ -40,11 +40,7 @@ def take_steps(edited: Edited, steps: Sequence[Step], held_out: HeldOut | None =
 
 
 def looks_different(before: Edited, after: Edited) -> bool:
-    """Return whether photographs tell edits apart: not if Gaussians have only been moved together with the cameras.
-
-    Args:
-        before, after: Gaussians before and after a step.
-    """
+    """Return whether photographs tell `before` from `after`: not if Gaussians only moved with the cameras."""
     return len(before) != len(after) or before.gaussians.degree != after.gaussians.degree
 
 

@@ -31,20 +31,12 @@ MAX_CANDIDATES = 32
 
 
 def appearance_of(model: Renderable) -> Appearance | None:
-    """Return the appearance vectors of the training images; None if the model has none.
-
-    Args:
-        model: a model of any method.
-    """
+    """Return the appearance vectors of the training images; None if `model` has none."""
     return model.appearance if isinstance(model, HasAppearance) else None
 
 
 def right_half(image: Tensor) -> Tensor:
-    """Return the right half (H, W - W // 2, ...) of an image, used for metrics.
-
-    Args:
-        image: (H, W, ...) image.
-    """
+    """Return the right half of an `image` (H, W, ...), the columns from W / 2 rounded down, used for metrics."""
     return image[:, image.shape[1] // 2 :]
 
 
@@ -111,12 +103,7 @@ def nearest_camera(scene: Scene, view: View) -> int:
 
 @contextmanager
 def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]:
-    """Render views other than training images with an appearance vector, within a `with` block.
-
-    Args:
-        model: the model.
-        vector: (D,) appearance vector; None to change nothing.
-    """
+    """Let `model` render other views than training images with a `vector` (D,), or None, within a `with` block."""
     appearance = appearance_of(model)
     with nullcontext() if appearance is None or vector is None else appearance.shown(vector):
         yield

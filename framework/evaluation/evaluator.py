@@ -56,12 +56,7 @@ class Measured:
 
 
 def measure(rgb: Tensor, target: Tensor, kept: Tensor | None) -> Measured:
-    """Compute the PSNR of the kept pixels, and the SSIM over windows of kept pixels only.
-
-    Args:
-        rgb, target: (H, W, 3) rendered and true image in [0, 1].
-        kept: (H, W) bool, pixels that count; None for all.
-    """
+    """Compute PSNR of pixels, and SSIM of windows, of `rgb` and `target` (H, W, 3) in `kept` (H, W); None for all."""
     judged = (rgb, target) if kept is None else (rgb[kept], target[kept])
     return Measured(psnr(*judged), quick_ssim(rgb, target, kept) if min(rgb.shape[:2]) >= WINDOW else None)
 
@@ -84,25 +79,14 @@ def measure_view(model: Renderable, dataset: Dataset, index: int, background: Te
 
 
 def views_to_judge(dataset: Dataset, half: bool = False) -> list[int]:
-    """Return the indices of the images to evaluate: not source images, and with some kept pixels.
-
-    Args:
-        dataset: the images.
-        half: whether only the right half counts.
-    """
+    """Return the indices of `dataset` to evaluate: no source images, and with kept pixels, in the right `half`."""
     given = dataset.source_images
     judged = range(len(dataset)) if given is None else (~given).nonzero()[:, 0].tolist()
     return [index for index in judged if _has_kept_pixels(dataset, index, half)]
 
 
 def timed_view(model: Renderable, view: View, background: Tensor) -> tuple[Picture, float]:
-    """Render a view; return the rendered image and the seconds that it took.
-
-    Args:
-        model: the trained model.
-        view: the view, on the model's device.
-        background: (3,) colour behind transparent pixels.
-    """
+    """Render a `view` over a `background` (3,) by `model`; return the picture and the seconds that it took."""
     start = time.perf_counter()
     picture = model.render_view(view, background)
     wait_for(model.device)

@@ -26,22 +26,13 @@ def heat(values: Tensor) -> Tensor:
 
 
 def error_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return an image (H, W, 3) uint8 of the absolute error, averaged over channels, in the colours of `heat`.
-
-    Args:
-        prediction, target: (H, W, 3) uint8 rendered and true image.
-    """
+    """Return the mean absolute error of (H, W, 3) uint8 `prediction` and `target` in the colours of `heat`."""
     error = np.abs(prediction.astype(np.float32) - target).mean(-1) / 255
     return to_uint8(heat(torch.from_numpy(error) / ERROR_AT_WHITE))
 
 
 def write_image(path: Path, image: Tensor) -> None:
-    """Write an image, with 8 bits per channel.
-
-    Args:
-        path: file to write; its extension is the format, and its folder is created if missing.
-        image: (H, W, 3) colours in [0, 1].
-    """
+    """Write an `image` (H, W, 3) in [0, 1] to `path`, its extension the format, with 8 bits per channel."""
     _write(path, to_uint8(image))
 
 

@@ -41,12 +41,7 @@ Lpips = Callable[[Tensor, Tensor, Tensor | None], float]
 
 @dataclass(frozen=True)
 class Layer:
-    """A convolution of AlexNet, and the weights of its features.
-
-    Args:
-        kernel: (O, I, H, W) weights of the convolution.
-        bias: (O,) its biases.
-    """
+    """A convolution of AlexNet: `kernel` (O, I, H, W) and `bias` (O,), and the weights of its features."""
 
     kernel: Tensor
     bias: Tensor
@@ -101,12 +96,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
 
 
 def features(layers: list[Layer], image: Tensor) -> list[Tensor]:
-    """Return the features of each layer, divided by their norm at each position: (O, h, w) each.
-
-    Args:
-        layers: AlexNet's layers.
-        image: (H, W, 3) colours in [0, 1], on the same device.
-    """
+    """Return the features (O, h, w) of each of AlexNet's `layers` on an `image` (H, W, 3), of norm 1 everywhere."""
     mean, deviation = (image.new_tensor(values) for values in (MEAN, DEVIATION))
     found, values = [], ((2 * image - 1 - mean) / deviation).permute(2, 0, 1)[None]
     for index, (layer, stride, padding) in enumerate(zip(layers, STRIDES, PADDING, strict=True)):

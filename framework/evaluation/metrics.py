@@ -24,11 +24,7 @@ MIN_SIDE_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
 
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
-    """Compute the peak signal-to-noise ratio in dB for a peak of 1; 100 for identical images.
-
-    Args:
-        prediction, target: colours in [0, 1], of the same shape.
-    """
+    """Compute the PSNR of `prediction` against `target`, colours in [0, 1], dB; 100 for identical images."""
     error = (to_float64(prediction) - to_float64(target)).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
     return float(-10 * error.log10())
 
@@ -123,11 +119,7 @@ def ms_ssim(prediction: Tensor, target: Tensor, kept: Tensor | None = None) -> f
 
 
 def windows_of_scales(kept: Tensor) -> list[Tensor]:
-    """Return the windows that count at each of the five scales, finest first: (h - 10, w - 10) bool each.
-
-    Args:
-        kept: (H, W) bool, pixels that count, at least 176 x 176.
-    """
+    """Return the windows (h - 10, w - 10) bool within `kept`, (H, W) from 176 x 176, at five scales, finest first."""
     windows = []
     for _ in EXPONENTS:
         windows.append(windows_inside(kept))

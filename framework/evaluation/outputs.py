@@ -126,22 +126,12 @@ def distance_range(frames: Iterable[Arrays], name: str) -> tuple[float, float]:
 
 
 def largest_distance(frames: Iterable[Arrays], name: str) -> float:
-    """Return the largest finite distance of opaque pixels in all frames; 0 if there are none.
-
-    Args:
-        frames: arrays of the frames.
-        name: name of the output, a distance or another number.
-    """
+    """Return the largest finite output `name` of opaque pixels in all `frames`; 0 if there are none."""
     return max((float(opaque_distance(kept, name).max(initial=0)) for kept in frames), default=0.0)
 
 
 def opaque_distance(kept: Arrays, name: str) -> np.ndarray:
-    """Return distances (H, W) float32; 0 where less than half of the light comes from a surface.
-
-    Args:
-        kept: arrays of the frame.
-        name: name of the output, a distance or another number.
-    """
+    """Return the output `name` (H, W) float32 in `kept`; 0 where less than half of the light comes from a surface."""
     seen = (kept["accumulation"] >= OPAQUE) & np.isfinite(kept[name])
     return np.where(seen, kept[name], 0).astype(np.float32)
 

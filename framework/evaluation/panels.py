@@ -37,12 +37,7 @@ class Panel:
 
 
 def view_panels(prediction: Tensor, target: Tensor, picture: Picture) -> list[Panel]:
-    """Return panels of the true image, render, error, depth, opacity and further outputs of a view.
-
-    Args:
-        prediction, target: (H, W, 3) rendered and true image in [0, 1].
-        picture: the rendered view.
-    """
+    """Return panels of `target`, `prediction`, error, depth, opacity and further outputs of a `picture`."""
     ramp = torch.linspace(0, 1, 256)
     error = (prediction - target).abs().mean(-1) / ERROR_AT_WHITE
     panels = [
@@ -78,12 +73,7 @@ def as_colors(picture: Picture, output: Output) -> tuple[Tensor, tuple[str, str]
 
 
 def depth_range(depth: Tensor, solid: Tensor) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the finite depths of solid pixels; 0 and 0 if there are none.
-
-    Args:
-        depth: (H, W) distances, scene units.
-        solid: (H, W) bool, pixels that count; if none is set, all count.
-    """
+    """Return the 2nd and 98th percentile of finite `depth` (H, W) in `solid`, if any pixel is; 0 and 0 if none."""
     values = depth[solid] if bool(solid.any()) else depth.flatten()
     values = values[torch.isfinite(values)].double().sort().values
     if not len(values):
@@ -113,10 +103,9 @@ def viridis(values: Tensor) -> Tensor:
 
 
 def composed(panels: Sequence[Panel]) -> Tensor:
-    """Compose panels in a row, with labels above and colour bars below, as an image (H', W', 3) in [0, 1].
+    """Compose `panels` of equal size in a row, with labels and colour bars, as an image (H', W', 3) in [0, 1].
 
-    Args:
-        panels: panels of equal size. Small panels are enlarged by a whole number, without interpolation.
+    Small panels are enlarged by a whole number, without interpolation.
     """
     height, width = panels[0].image.shape[:2]
     factor = max(-(-MIN_WIDTH // width), 1)

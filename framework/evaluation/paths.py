@@ -144,12 +144,7 @@ def orbit(
 
 
 def around(scene: Scene, count: int = 8) -> Cameras:
-    """Return pinhole cameras on a circle around the box of a scene that comes without any, looking down a little.
-
-    Args:
-        scene: the scene, +z up.
-        count: number of cameras.
-    """
+    """Return `count` pinhole cameras around the box of `scene`, +z up and without any, looking down a little."""
     middle, reach = scene.box.mean(0).cpu(), AROUND * float((scene.box[1] - scene.box[0]).max())
     angles = torch.arange(count) * (2 * torch.pi / count)
     height = torch.full((count,), math.sin(ABOVE))
@@ -305,11 +300,7 @@ def spiral(cameras: Cameras, along: Tensor, focus: float, radius: float | None =
 
 
 def middle_pose(cameras: Cameras) -> Tensor:
-    """Return the mean pose (3, 4) of cameras that look the same way; the pose of the first camera for others.
-
-    Args:
-        cameras: M cameras.
-    """
+    """Return the mean pose (3, 4) of M `cameras` that look the same way; the first camera's for others."""
     if not look_same_way(cameras):
         return cameras.camera_to_worlds[0]
     mean = cameras.camera_to_worlds.double().mean(0)
@@ -322,13 +313,7 @@ def look_same_way(cameras: Cameras) -> bool:
 
 
 def focus_distance(model: Renderable, camera: Cameras, background: Tensor) -> float:
-    """Return the median rendered distance of one camera's picture, scene units.
-
-    Args:
-        model: the trained model.
-        camera: one camera, on the model's device.
-        background: (3,) colour behind the scene.
-    """
+    """Return the median distance, scene units, in the picture of one `camera` by `model` over `background` (3,)."""
     stride = max(int(max(camera.widths[0], camera.heights[0])) // FOCUS_PIXELS, 1)
     picture = model.render_view(View.of(camera, 0, _first_time(model), stride), background)
     depths = picture.median_depth[picture.accumulation > 0.5]

@@ -134,13 +134,7 @@ def usable(surface: Surface, name: str) -> tuple[Surface, list[str]]:
 
 
 def drawn(surface: Surface, count: int, seed: int = 0) -> Samples:
-    """Return points of a surface: evenly by area on a mesh, the same in every run; all or `count` of given points.
-
-    Args:
-        surface: the surface.
-        count: number of points.
-        seed: seed of the points.
-    """
+    """Return `count` points of `surface`: by area on a mesh, by `seed`; all or some of given points."""
     if surface.faces is None:
         chosen = torch.arange(len(surface.points))
         if len(chosen) > count:

@@ -49,13 +49,7 @@ class ViewFiles:
         """Reason why files could not be written; None if there was no problem."""
 
     def take(self, index: int, psnr: float, judged: Judged) -> None:
-        """Write the files of a view, or remember it if it is the worst so far.
-
-        Args:
-            index: index of the view.
-            psnr: its PSNR, dB.
-            judged: its images.
-        """
+        """Write the files of view `index`, from `judged`, or keep them if its `psnr` in dB is the worst so far."""
         if self._with_worst and psnr < self._lowest:
             self._lowest, self._worst = psnr, judged
         if index in self._views:

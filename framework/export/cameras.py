@@ -36,12 +36,7 @@ def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) ->
 
 
 def input_poses(cameras: Cameras, placement: Placement) -> Tensor:
-    """Return camera-to-world matrices (M, 3, 4) float64 in the frame of the input, with orthonormal rotations.
-
-    Args:
-        cameras: M cameras in the scene's frame.
-        placement: the transform from the input's frame to the scene's.
-    """
+    """Return the M poses (3, 4) of `cameras` in the input's frame by `placement`, float64, rotations orthonormal."""
     poses = placement.original_poses(cameras.camera_to_worlds.cpu())
     return torch.cat([orthonormal(poses[:, :, :3]), poses[:, :, 3:]], -1)
 
@@ -76,12 +71,7 @@ class PosedFiles:
 
 
 def posed_files(scenes: Mapping[str, ParsedScene], placement: Placement) -> PosedFiles:
-    """Return the images of all splits; an image of several splits comes once, with the camera of the first.
-
-    Args:
-        scenes: split -> its images and cameras.
-        placement: the input's in the scene.
-    """
+    """Return the images of all splits of `scenes` by their `placement`, each once, with its first camera."""
     files: dict[Path, int] = {}
     chosen: list[tuple[str, int]] = []
     splits: dict[str, tuple[int, ...]] = {}

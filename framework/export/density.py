@@ -189,13 +189,7 @@ class LatticeDensity:
 
 
 class LatticeDistance(LatticeDensity):
-    """The signed distance of a model at lattice points; cells that the renderer skips are outside.
-
-    Args:
-        model: the model in evaluation mode, which has a signed distance.
-        lattice: the points.
-        time: time in [0, 1] of a scene that moves.
-    """
+    """The signed distance of `model` at points of `lattice` at a `time`; cells that are skipped are outside."""
 
     _skipped = math.inf
 

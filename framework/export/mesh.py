@@ -29,11 +29,7 @@ class Mesh:
     """The texture of its faces; None if there is none."""
 
     def with_faces(self, kept: Tensor) -> Mesh:
-        """Return the mesh of some of its faces, with the vertices that they use, without texture.
-
-        Args:
-            kept: (F,) bool.
-        """
+        """Return the mesh of its faces `kept` (F,) bool, with the vertices that they use, without texture."""
         faces = self.faces[kept]
         used = torch.zeros(len(self.vertices), dtype=torch.bool)
         used[faces.reshape(-1)] = True

@@ -190,12 +190,7 @@ def fused_mesh(
 
 
 def in_input(mesh: Mesh, placement: Placement) -> Mesh:
-    """Return a mesh in the frame and units of the input.
-
-    Args:
-        mesh: a mesh in scene coordinates.
-        placement: the input's in the scene.
-    """
+    """Return a `mesh` in scene coordinates in the frame and units of the input, which has a `placement`."""
     normals = None if mesh.normals is None else placement.original_directions(mesh.normals).float()
     return replace(mesh, vertices=placement.original_points(mesh.vertices), normals=normals)
 

@@ -226,12 +226,7 @@ def _part(model: RendersRays, dataset: Dataset, cameras: Cameras, seconds: float
 
 
 def cropped(camera: Cameras, share: float) -> Cameras:
-    """Return the camera of a random part of an image.
-
-    Args:
-        camera: one camera.
-        share: of its width and height.
-    """
+    """Return one `camera` for a random part of its image, a `share` of its width and height."""
     sizes = [max(int(share * int(side[0])), 1) for side in (camera.widths, camera.heights)]
     free = [int(side[0]) - size for side, size in zip((camera.widths, camera.heights), sizes, strict=True)]
     left, top = (int(torch.randint(room + 1, ())) for room in free)
@@ -258,12 +253,7 @@ def _order(cameras: Cameras) -> Iterator[tuple[Cameras, int]]:
 
 
 def between(cameras: Cameras, index: int) -> Cameras | None:
-    """Return a camera half way from one to the nearest other one; None if that looks elsewhere.
-
-    Args:
-        cameras: M cameras.
-        index: number of the first.
-    """
+    """Return a camera half way from number `index` of M `cameras` to the nearest; None if that looks elsewhere."""
     poses = cameras.camera_to_worlds.double()
     distances = (poses[:, :, 3] - poses[index, :, 3]).norm(dim=-1)
     distances[index] = torch.inf

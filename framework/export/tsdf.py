@@ -195,12 +195,7 @@ class FusedDistance:
         return torch.where(weights > 0, total / weights, torch.nan)
 
     def colors(self, vertices: Tensor, normals: Tensor) -> Tensor:
-        """Return the mean colour (V, 3) of vertices in the views that see them, NaN where none does.
-
-        Args:
-            vertices: (V, 3) scene coordinates.
-            normals: (V, 3) unit normals.
-        """
+        """Return the mean colour (V, 3) of `vertices` with `normals` (V, 3) in the views that see them, else NaN."""
         vertices, total = vertices.float(), torch.zeros(len(vertices), 3)
         weights = torch.zeros(len(vertices))
         for view in self.views:

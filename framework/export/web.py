@@ -118,12 +118,7 @@ def pinhole(cameras: Cameras) -> Cameras:
 
 
 def shown_cameras(count: int, start: int) -> list[int]:
-    """Return the numbers of the cameras in a page: at most MAX_CAMERAS, evenly spaced, and `start` among them.
-
-    Args:
-        count: number of all cameras.
-        start: number of the camera from which the page starts.
-    """
+    """Return the numbers of at most MAX_CAMERAS of `count` cameras in a page, evenly spaced, and `start`."""
     if count <= MAX_CAMERAS:
         return list(range(count))
     chosen = [rank * count // MAX_CAMERAS for rank in range(MAX_CAMERAS)]
@@ -150,12 +145,7 @@ def camera_rows(cameras: Cameras, names: Sequence[str], turn: Tensor) -> list[li
 
 
 def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
-    """Return the position that cameras look at: nearest to all their axes, and in front of most of them.
-
-    Args:
-        cameras: M cameras.
-        turn: (3, 3) rotation of the scene.
-    """
+    """Return the position nearest to the axes of M `cameras`, after the scene's `turn`, in front of most of them."""
     point = looked_at(cameras.camera_to_worlds)
     if point is None:
         poses = cameras.camera_to_worlds.double().cpu()
@@ -202,12 +192,7 @@ def check_size(max_megabytes: float) -> None:
 
 
 def page(payload: bytes, facts: PageFacts) -> str:
-    """Return the page of an SPZ file.
-
-    Args:
-        payload: content of the file.
-        facts: further data of the page.
-    """
+    """Return the page of an SPZ file with the content `payload`, and further `facts`."""
     folder = files("nerfloom.export") / "page"
     plain = json.dumps(asdict(facts), separators=(",", ":"), allow_nan=False)
     parts = {

@@ -53,11 +53,9 @@ def nested_boxes(box: Tensor, levels: int) -> Tensor:
 
 
 def cell_corners(cells: Tensor, resolution: int) -> Tensor:
-    """Return the lower corners (K, 3) of cells of a grid, in cells along x, y and z.
+    """Return the lower corners (K, 3) of `cells` (K,), in cells along x, y and z; (x, y, z) is (x n + y) n + z.
 
-    Args:
-        cells: (K,) int64 indices; cell (x, y, z) has (x n + y) n + z.
-        resolution: number n of cells along each axis.
+    n is the `resolution`, the number of cells along each axis.
     """
     return torch.stack([cells // resolution**2, cells // resolution % resolution, cells % resolution], dim=-1)
 
@@ -78,12 +76,7 @@ def box_around_cells(inside: Tensor, box: Tensor, margin: int = 0) -> Tensor | N
 
 
 def cubic_vertices(voxels: float, box: Tensor) -> tuple[int, ...]:
-    """Return the number of vertices along each axis of a grid of cubic voxels over a box, at least 2.
-
-    Args:
-        voxels: approximate number of voxels.
-        box: (2, 3) minimum and maximum corner, scene units.
-    """
+    """Return the vertices along each axis of a grid of about `voxels` cubes over a `box` (2, 3), at least 2."""
     size = (box[1] - box[0]).tolist()
     edge = (math.prod(size) / voxels) ** (1 / 3)
     return tuple(max(round(length / edge), 2) for length in size)

@@ -77,12 +77,7 @@ class Distortion:
 
     @classmethod
     def of(cls, model: str, lens: Tensor) -> Distortion:
-        """Return the distortion of M lenses.
-
-        Args:
-            model: a projection of `DISTORTED`.
-            lens: (M, K) coefficients, in the order of `LENSES[model]`.
-        """
+        """Return the distortion of M lenses of a `model` in `DISTORTED`, with coefficients `lens` (M, K)."""
         precise = lens.to(_precise_dtype(lens))
         coefficients = precise
         if model == "fisheye":
@@ -211,12 +206,7 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
 
 
 def iterations_needed(u: Tensor, v: Tensor, lenses: Distortion) -> int:
-    """Return the number of iterations after which `undistort` finds no further positions, plus one.
-
-    Args:
-        u, v: (R,) distorted coordinates.
-        lenses: the R lenses, one for each point.
-    """
+    """Return the iterations after which `undistort` finds no more positions `u, v` (R,) of R `lenses`, plus one."""
     found = undistort(u, v, lenses)[2]
     for count in range(1, MAX_ITERATIONS):
         if bool((undistort(u, v, replace(lenses, iterations=count))[2] | ~found).all()):
@@ -305,11 +295,7 @@ def project(model: str, local: Tensor, lenses: Distortion | None) -> tuple[Tenso
 
 
 def panorama(width: float, height: float) -> tuple[float, float, float, float]:
-    """Return fx, fy (pixels per radian), cx and cy (pixels) of an equirectangular image of all directions.
-
-    Args:
-        width, height: size of the image, pixels.
-    """
+    """Return fx, fy (pixels per radian), cx, cy of an equirectangular image of `width` x `height` pixels."""
     return width / (2 * math.pi), height / math.pi, width / 2, height / 2
 
 

@@ -73,11 +73,7 @@ class Points:
         return frames(self.axes) * torch.cat([deviations, deviations[:, 1:]], dim=-1)[:, None]
 
     def sized(self, deviation: float) -> Points:
-        """Return points with Gaussians; points without Gaussians become balls.
-
-        Args:
-            deviation: standard deviation of the balls, scene units.
-        """
+        """Return points with Gaussians; points without become balls of a standard `deviation`, scene units."""
         if self.variances is not None:
             return self
         axes = torch.zeros_like(self.positions)

@@ -211,19 +211,9 @@ class Samples:
         return None if rays.times is None else rays.times[self.ray_indices]
 
     def evaluated(self, sigma: Tensor, features: Tensor) -> Samples:
-        """Return the samples with density and features attached.
-
-        Args:
-            sigma: (N,) density.
-            features: (N, F) the field's features.
-        """
+        """Return the samples with density `sigma` (N,) and the field's `features` (N, F) attached."""
         return replace(self, sigma=sigma, features=features)
 
     def with_alpha(self, alpha: Tensor, features: Tensor) -> Samples:
-        """Return the samples with opacity and features attached.
-
-        Args:
-            alpha: (N,) opacity of each interval.
-            features: (N, F) the field's features.
-        """
+        """Return the samples with opacity `alpha` (N,) of intervals and the field's `features` (N, F)."""
         return replace(self, alpha=alpha, features=features)

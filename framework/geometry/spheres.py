@@ -74,12 +74,7 @@ class InvertedRays(Rays):
 
     @classmethod
     def of(cls, rays: Rays, sphere: Tensor) -> InvertedRays:
-        """Return the part of R rays that is behind a sphere; its length is 0 if the ray ends earlier.
-
-        Args:
-            rays: the rays, between their near and their far ends.
-            sphere: (4,) centre and radius.
-        """
+        """Return the part of R `rays` behind a `sphere` (4,), centre and radius; of length 0 if they end earlier."""
         middles, nearest = nearest_to_centre(rays.origins, rays.directions, sphere)
         with torch.no_grad():  # the ends of intervals have no gradient
             _, leave = intersect_sphere(rays.origins, rays.directions, sphere)
@@ -93,12 +88,7 @@ class InvertedRays(Rays):
         return cls(**{**values, "origins": nearest, "nears": nears, "fars": fars})
 
     def points(self, ray_indices: Tensor, t: Tensor) -> Tensor:
-        """Return points (N, 4) of the inverted sphere: a direction of length 1, and 1/r.
-
-        Args:
-            ray_indices: (N,) index of the ray of each point.
-            t: (N,) values of u = 1 - 1/r.
-        """
+        """Return points (N, 4), unit direction and 1/r, of rays `ray_indices` (N,) at `t` (N,), u = 1 - 1/r."""
         nearest, inverse = self.origins.index_select(0, ray_indices), 1 - t
         square = 1 - inverse.square() * nearest.square().sum(-1)
         # Clamped: for a ray that misses the sphere this is 0 at the start, where the root has an infinite gradient.

@@ -10,10 +10,9 @@ from torch import Tensor
 
 
 def area_vectors(corners: Tensor) -> Tensor:
-    """Return vectors (F, 3) normal to triangles, counterclockwise seen from their tips, as long as twice their areas.
+    """Return vectors (F, 3) normal to triangles of `corners` (F, 3, 3), as long as twice their areas.
 
-    Args:
-        corners: (F, 3, 3) corners.
+    Triangles are counterclockwise seen from the vectors' tips.
     """
     a, b, c = corners.unbind(1)
     return torch.linalg.cross(b - a, c - a)

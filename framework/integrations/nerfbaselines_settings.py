@@ -16,11 +16,7 @@ WORDS = {"true": True, "false": False, "none": None, "null": None}
 
 
 def parse_overrides(overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert overrides to nested plain values.
-
-    Args:
-        overrides: values by name, with dots for nesting; text, as from a command line, is parsed.
-    """
+    """Convert `overrides` by name, with dots for nesting, to nested plain values; text is parsed."""
     nested: dict[str, Any] = {}
     for key, value in overrides.items():
         *groups, name = key.split(".")

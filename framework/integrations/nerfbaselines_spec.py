@@ -25,13 +25,7 @@ LICENSES = [{"name": "Apache-2.0"}]
 
 
 def _spec(method: str, method_class: str, **metadata: Any) -> dict[str, Any]:
-    """Return the specification of a method.
-
-    Args:
-        method: its name in Nerfloom's registry.
-        method_class: name of its class in `nerfloom.integrations.nerfbaselines`.
-        metadata: entries shown on nerfbaselines' pages.
-    """
+    """Return the specification of `method` with the class `method_class` and the `metadata` of nerfbaselines' pages."""
     return {
         "id": f"nerfloom-{method}",
         "method_class": f"nerfloom.integrations.nerfbaselines:{method_class}",

@@ -111,12 +111,7 @@ def _end_with_parent() -> Callable[[], object] | None:
 
 
 def reason(code: int, log: Path) -> str:
-    """Return why a command failed: the signal that ended it, or the last line of its output.
-
-    Args:
-        code: its exit status, or minus the number of a signal.
-        log: file of its output.
-    """
+    """Return why a command failed, by its exit status `code` or minus a signal, or the last line of its `log`."""
     number = -code if code < 0 else code - 128
     if number in signal.valid_signals():
         name = signal.Signals(number).name

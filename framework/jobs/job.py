@@ -32,12 +32,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Resources:
-    """Needs of a job on the machine that runs it.
-
-    Args:
-        cores: number of CPU cores; None for all of a machine.
-        gpus: number of GPUs.
-    """
+    """Needs of a job on a machine: CPU `cores`, all if None, and `gpus`."""
 
     cores: int | None = None
     gpus: int = 0

@@ -43,12 +43,7 @@ class Launcher(ABC):
 
 
 class Ledger:
-    """The state of a launcher's jobs, told to the user in a line at every change.
-
-    Args:
-        jobs: the jobs.
-        on_finished: called with each finished job.
-    """
+    """The state of a launcher's `jobs`, told at every change; `on_finished` is called with each finished job."""
 
     def __init__(self, jobs: Sequence[Job], on_finished: Callable[[Job], None]) -> None:
         self.failures: dict[Job, Failure] = {}
@@ -72,11 +67,7 @@ class Ledger:
         say(f"{self._numbers[job]} {job.title}: {job.description}")
 
     def ended(self, job: Job, reason: str | None) -> None:
-        """Report the end of a job.
-
-        Args:
-            reason: why it failed; None if its commands succeeded.
-        """
+        """Report the end of a `job`, with the `reason` if it failed, else None."""
         if reason is None and job.finished():
             self._on_finished(job)
             return

@@ -59,12 +59,7 @@ class Slurm(Launcher):
 
 
 def script(jobs: Sequence[Job], at_once: int | None) -> str:
-    """Return the script that runs jobs as an array.
-
-    Args:
-        jobs: the jobs, with a task of the array each.
-        at_once: maximum number of simultaneous jobs; None for no limit.
-    """
+    """Return the script that runs `jobs` as tasks of an array, at most `at_once` at a time if not None."""
     cores, gpus = (max(getattr(job.resources, name) or 0 for job in jobs) for name in ("cores", "gpus"))
     whole = any(job.resources.cores is None for job in jobs)
     limit = "" if at_once is None else f"%{at_once}"

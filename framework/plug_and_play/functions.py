@@ -27,11 +27,7 @@ UNIT_TOLERANCE = 1e-3
 
 
 class DensityOnly(Field):
-    """A field of density without colour, from a user-defined function, for samplers, which need density only.
-
-    Args:
-        sigma_fn: a `SigmaFunction`; None for a field that is empty everywhere.
-    """
+    """A field of density from a user's `sigma_fn`, or empty everywhere if that is None, for samplers."""
 
     def __init__(self, sigma_fn: SigmaFunction | None) -> None:
         super().__init__()

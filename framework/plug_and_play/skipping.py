@@ -104,11 +104,7 @@ class OccupancyGrid(nn.Module):
             self.update(step, sigma_fn)
 
     def carve(self, kept: Tensor) -> None:
-        """Mark cells as empty permanently; later updates do not change them.
-
-        Args:
-            kept: (n, n, n) bool along x, y, z, False for cells to mark as empty.
-        """
+        """Mark cells outside `kept` (n, n, n) bool along x, y, z as empty, permanently."""
         self.marcher.carve(kept.reshape(-1).to(self.marcher.occupied.device))
 
 

@@ -66,7 +66,7 @@ def turned(right: float, up: float) -> np.ndarray:
 
 
 def view_lens(lens: Lens, angle: float) -> Lens:
-    """Return the lens of views of `angle` degrees of an image of `lens`, whose central pixels are as large.
+    """Return the lens of views of `angle` degrees of an image of `lens`; pixels at the centre are as large as there.
 
     Raises:
         DataError: if views would be too large.

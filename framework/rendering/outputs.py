@@ -34,28 +34,15 @@ class Output:
         return (3,) if self.kind in ("color", "direction") else ()
 
     def averaged(self, values: Tensor, rays_per_pixel: int) -> Tensor:
-        """Return the value of each pixel, computed from its rays.
-
-        Args:
-            values: (R, *shape) values of rays; rays of a pixel are consecutive.
-            rays_per_pixel: number of rays of a pixel.
-        """
+        """Return the value of each pixel from `values` (R, *shape) of `rays_per_pixel` consecutive rays."""
         return values if rays_per_pixel == 1 else values.view(-1, rays_per_pixel, *self.shape).mean(1)
 
     def finished(self, values: Tensor) -> Tensor:
-        """Return values (P, *shape) of pixels in their final form: directions are normalised.
-
-        Args:
-            values: values of pixels.
-        """
+        """Return `values` (P, *shape) of pixels in their final form: directions are normalised."""
         return safe_normalize(values.float()) if self.kind == "direction" else values.float()
 
     def pictured(self, values: Tensor) -> Tensor:
-        """Return values (..., *shape) as colours or grey in [0, 1]; distances and scalars are returned unchanged.
-
-        Args:
-            values: values of pixels.
-        """
+        """Return `values` (..., *shape) as colours or grey in [0, 1]; distances and scalars are unchanged."""
         return (values + 1) / 2 if self.kind == "direction" else values
 
 
@@ -70,11 +57,5 @@ NORMALS = Output("normals", "direction")
 
 
 def empty(outputs: tuple[Output, ...], count: int, device: torch.device) -> dict[str, Tensor]:
-    """Return zeros (count, *shape) for outputs, by name.
-
-    Args:
-        outputs: the outputs.
-        count: number of pixels.
-        device: device of the result.
-    """
+    """Return zeros (count, *shape) on `device` for each of `outputs`, by name, for `count` pixels."""
     return {output.name: torch.zeros(count, *output.shape, device=device) for output in outputs}

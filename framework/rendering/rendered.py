@@ -60,11 +60,7 @@ class Rendered:
         return self.extras.get("coarse")
 
     def over(self, coarse: Rendered) -> Rendered:
-        """Attach the coarse level to these values, and add up the numbers of evaluations.
-
-        Args:
-            coarse: the coarse level of the same rays.
-        """
+        """Attach the `coarse` level of the same rays, and add up the numbers of evaluations."""
         extras = {**self.extras, "coarse": coarse}
         return replace(self, extras=extras, num_samples=self.num_samples + coarse.num_samples)
 
@@ -118,11 +114,7 @@ class Picture:
     """Number of rays that were cast for the image; 0 if the method casts none."""
 
     def of(self, name: str) -> Tensor:
-        """Return the values (H, W, ...) of an output.
-
-        Args:
-            name: name of the output.
-        """
+        """Return the values (H, W, ...) of the output `name`."""
         return self.extras[name] if name in self.extras else getattr(self, name)
 
     @property

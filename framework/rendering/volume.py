@@ -91,13 +91,7 @@ def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
 
 
 def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
-    """Return samples with density or alpha, and features; samples that already have them are returned unchanged.
-
-    Args:
-        rays: R rays.
-        samples: N samples along the rays.
-        field: the field to evaluate.
-    """
+    """Return `samples` of `rays` with what `field` has there: density or alpha, and features; done ones unchanged."""
     if samples.features is not None and (samples.sigma is not None or samples.alpha is not None):
         return samples
     points = sample_points(rays, samples, field.footprint)
@@ -165,12 +159,9 @@ def volume_render(
 
 
 def mean_distance(moments: Tensor, opacity: Tensor, fars: Tensor) -> Tensor:
-    """Return the mean distance (R,) of the visible light of rays; the far end for transparent rays.
+    """Return the mean distance (R,) of the light of rays, from weighted sums of distances; `fars` if transparent.
 
-    Args:
-        moments: (R,) sums of weight times distance.
-        opacity: (R,) sums of the weights.
-        fars: (R,) far ends of the rays, scene units.
+    `moments` (R,) are sums of weight times distance, `opacity` (R,) sums of weights.
     """
     visible = opacity > 1e-6
     mean = moments / torch.where(visible, opacity, torch.ones_like(moments))

@@ -51,23 +51,14 @@ class Sampler(nn.Module, ABC):
         """
 
     def step_kind(self, step: int) -> StepKind:
-        """Return the kind of training step: what sampling computes besides values of tensors.
-
-        Args:
-            step: number of training steps done.
-        """
+        """Return the kind of training step `step`: what sampling computes besides values of tensors."""
         return StepKind(varies="the number of samples on a ray varies")
 
     def read_counts(self) -> None:
         """Read counts from the device and adapt sizes; called when the device is waited for anyway."""
 
     def loss(self, samples: Samples, weights: Tensor) -> Tensor | None:
-        """Return the loss () that trains the sampler itself; None if it does not learn in this step.
-
-        Args:
-            samples: N samples that the sampler returned for a batch.
-            weights: (N,) rendering weights of these samples.
-        """
+        """Return the loss () that trains the sampler by `weights` (N,) of its N `samples`; None in other steps."""
         return None
 
 

@@ -42,13 +42,7 @@ def beside(cells: Tensor, resolution: int, parts: int, in_time: bool) -> Tensor:
 
 
 def densities_at(density: DensityFunction, positions: Tensor, times: Tensor | None = None) -> Tensor:
-    """Return the density (N,) at positions, evaluated in chunks, because allocating large results is slow.
-
-    Args:
-        density: the density.
-        positions: (N, 3) scene coordinates.
-        times: (N,) in [0, 1]; None for a static scene.
-    """
+    """Return the `density` (N,) at `positions` (N, 3) and `times`, in chunks, as large results are slow to allocate."""
     parts = positions.split(CHUNK)
     part_times = [None] * len(parts) if times is None else times.split(CHUNK)
     return torch.cat([density(Points(part, t))[0] for part, t in zip(parts, part_times, strict=True)])

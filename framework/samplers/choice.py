@@ -117,11 +117,7 @@ SamplingConfigT = TypeVar("SamplingConfigT", bound=SamplingConfig)
 
 
 def sampler_choice(config: SamplingConfig, unbounded: bool) -> Choice:
-    """Return the sampler that `--sampler auto` selects.
-
-    Args:
-        unbounded: whether the scene may extend beyond the box.
-    """
+    """Return the sampler that `--sampler auto` selects for a scene that may be `unbounded`."""
     reason = "there may be something outside the box" if unbounded else "the scene ends at its box"
     return Choice("sampler", "proposal" if unbounded else config.bounded_sampler, reason)
 

@@ -189,12 +189,7 @@ def _refined(distance: DistanceFunction, rays: Rays, entered: _Paths, exact: flo
 
 
 class FirstCrossing(WrappingSampler):
-    """Samples of another sampler, or in evaluation those where a ray meets a surface, up to the first that covers it.
-
-    Args:
-        sampler: knows which cells are occupied.
-        traces: whether pictures are traced; otherwise they have the other sampler's samples.
-    """
+    """Samples of `sampler`, or with `traces` in evaluation those where a ray meets a surface, to the covering one."""
 
     sampler: OccupancySampler
 

@@ -88,13 +88,7 @@ class HierarchicalSampler(Sampler):
 
 
 def stratified_edges(rays: Rays, count: int, jitter: bool) -> Tensor:
-    """Return the edges (R, count + 1) of intervals that divide rays from their near to their far end.
-
-    Args:
-        rays: R rays with near and far ends.
-        count: number of intervals per ray.
-        jitter: True to move each inner edge by up to half an interval either way, False for equal lengths.
-    """
+    """Return edges (R, count + 1) of `count` intervals of `rays`, equal or, with `jitter`, moved by up to half."""
     place = torch.arange(count + 1, device=rays.nears.device, dtype=rays.nears.dtype).expand(len(rays), -1)
     if jitter:
         moved = place[:, 1:-1] + torch.rand_like(place[:, 1:-1]) - 0.5

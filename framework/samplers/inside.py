@@ -19,12 +19,7 @@ from nerfloom.samplers.wrapping import WrappingSampler
 
 
 class InsideSphere(WrappingSampler):
-    """Samples of another sampler, clipped where rays leave a sphere.
-
-    Args:
-        sampler: chooses the samples between the near and the far end of each ray.
-        sphere: (4,) centre and radius, scene units.
-    """
+    """Samples of `sampler` along rays clipped where they leave a `sphere` (4,), centre and radius, scene units."""
 
     sphere: Tensor
 
@@ -56,12 +51,7 @@ def make_foreground_sampler(
 
 
 def inside_foreground(config: BackgroundConfig, scene: Scene, sampler: Sampler) -> Sampler:
-    """Return a sampler of the scene's foreground, clipped to the sphere if the settings have one.
-
-    Args:
-        scene: properties of the whole scene, not of its foreground.
-        sampler: chooses samples in the box of the foreground.
-    """
+    """Return `sampler` of the foreground's box, clipped to the sphere if the settings of the `scene` have one."""
     if config.background_model != "sphere":
         return sampler
     return InsideSphere(sampler, foreground_sphere(config, scene))

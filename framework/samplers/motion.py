@@ -39,11 +39,7 @@ def vertices_in_time(scene: Scene) -> int:
 
 
 def slices_choice(scene: Scene, sampler: str) -> Choice:
-    """Return the number of time slices of the occupancy grid that suits the scene.
-
-    Args:
-        sampler: the chosen sampler.
-    """
+    """Return the number of time slices of the grid of the chosen `sampler` that suits the scene."""
     shown = scene.moving and scene.has_alpha and not scene.unbounded and sampler == "occupancy"
     count = min(max(scene.num_times // TIMES_A_SLICE, 1), MAX_SLICES) if shown else 1
     reason = f"the images have {scene.num_times} times"

@@ -215,11 +215,7 @@ def propose(
 
 
 def density_of(proposal: Field) -> DensityFunction | GridDensity:
-    """Return the density of a proposal; in the kernels' form if it is a small network on a hash grid.
-
-    Args:
-        proposal: the field.
-    """
+    """Return the density of a field `proposal`; in the kernels' form if it is a small network on a hash grid."""
     known = proposal.grid_density() if isinstance(proposal, HasGridDensity) else None
     return proposal.density if known is None else known
 

@@ -35,12 +35,7 @@ class Sizes(NamedTuple):
 
 
 class SampleCapacity:
-    """Capacity for the steps of a march.
-
-    Args:
-        runs: maximum number of runs of steps on a ray.
-        steps: maximum number of steps on a ray.
-    """
+    """Capacity for the steps of a march of at most `runs` runs and `steps` steps on a ray."""
 
     def __init__(self, runs: int, steps: int) -> None:
         self.per_ray: tuple[float, float, float] = float(runs), float(steps), float(steps)
@@ -63,12 +58,9 @@ class SampleCapacity:
         return Sizes(runs, candidates, kept if usual is None else min(kept, MAX_KEPT * max(usual, SLOTS_MULTIPLE)))
 
     def note(self, rays: int, needed: tuple[Tensor, Tensor, Tensor], left_out: Tensor) -> None:
-        """Record on the device what a step needed, without waiting.
+        """Record on the device what a step of `rays` `needed` (runs, candidates, samples) and `left_out`.
 
-        Args:
-            rays: number of rays.
-            needed: numbers () of runs, of candidates and of kept samples.
-            left_out: () number of dropped rays.
+        All numbers are () tensors but `rays`; nothing waits for them.
         """
         per_ray = torch.stack(needed).float() / rays
         if self._needed is None or self._counted is None or self._needed.device != per_ray.device:

@@ -15,13 +15,7 @@ it."""
 
 
 def stratified_points(rays: Rays, count: int, jitter: bool) -> Tensor:
-    """Return distances (R, count) along rays, one in each of `count` bins of equal length.
-
-    Args:
-        rays: R rays with near and far ends.
-        count: number of bins per ray.
-        jitter: True for a random distance in each bin, False for its middle.
-    """
+    """Return distances (R, count), one in each of `count` equal bins of `rays`: the middle, or random with `jitter`."""
     within = rays.nears.new_full((len(rays), count), 0.5)
     within = torch.rand_like(within) if jitter else within
     fraction = (torch.arange(count, device=rays.nears.device) + within) / count
@@ -38,11 +32,7 @@ def samples_from_points(points: Tensor) -> Samples:
 
 
 class UniformSampler(Sampler):
-    """One sample in each of `count` bins of equal length between the near and far end of every ray.
-
-    Args:
-        count: samples per ray.
-    """
+    """One sample in each of `count` bins of equal length between the near and far end of every ray."""
 
     def __init__(self, count: int) -> None:
         super().__init__()

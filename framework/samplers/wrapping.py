@@ -11,11 +11,7 @@ from nerfloom.samplers.base import Sampler
 
 
 class WrappingSampler(Sampler):
-    """A sampler that updates another one, and learns as it does. Subclasses say what becomes of its samples.
-
-    Args:
-        sampler: the other sampler.
-    """
+    """A sampler that updates another `sampler`, and learns as it does. Subclasses change its samples."""
 
     def __init__(self, sampler: Sampler) -> None:
         super().__init__()

@@ -23,11 +23,7 @@ BLOCK = 4
 
 
 class CovisibleSpace(nn.Module):
-    """Space that enough training images show, by cells of nested boxes; all of space until `exclude` is called.
-
-    Args:
-        box: (2, 3) corners of the smallest box, scene units.
-    """
+    """Space that enough images show, by nested boxes from `box` (2, 3); all of space until `exclude` is called."""
 
     box: Tensor
     excluded: Tensor
@@ -52,23 +48,13 @@ class CovisibleSpace(nn.Module):
         self.excluded[:-1] = torch.cat(seen) < least
 
     def forward(self, rays: Rays) -> Rays:
-        """Return rays that start where they first meet space that enough images show; unchanged if they never do.
-
-        Args:
-            rays: R rays; R may be 0.
-        """
+        """Return `rays` from where they first meet space that enough images show; unchanged if they never do."""
         return replace(rays, nears=first_covisible(rays, self.box, self.excluded))
 
 
 @torch.no_grad()
 def share_cut_off(space: CovisibleSpace, rays: Rays, distances: Tensor) -> float:
-    """Return the fraction of rays that would start behind their known point.
-
-    Args:
-        space: excluded cells.
-        rays: R rays.
-        distances: (R,) known distances along the rays, scene units.
-    """
+    """Return the fraction of `rays` that would start in `space` behind their known `distances` (R,), scene units."""
     return float((space(rays).nears > distances).double().mean())
 
 

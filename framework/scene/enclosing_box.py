@@ -49,11 +49,7 @@ def enclosing_box(cameras: Cameras, opaque: Sequence[Tensor], within: Tensor | N
 
 
 def is_larger(opaque: Sequence[Tensor]) -> bool:
-    """Return whether matter is larger than the images: in `MIN_SHARE_LARGER` of them it touches opposite borders.
-
-    Args:
-        opaque: for each image, the pixels (H, W) bool that are not fully transparent.
-    """
+    """Return whether matter, `opaque` (H, W) in each image, touches opposite borders of `MIN_SHARE_LARGER`."""
     across = [bool(mask[:, 0].any() & mask[:, -1].any() | mask[0].any() & mask[-1].any()) for mask in opaque]
     return sum(across) >= MIN_SHARE_LARGER * len(across)
 

@@ -37,12 +37,7 @@ class SceneProfile:
 
     @classmethod
     def of(cls, dataset: Dataset, decisions: list[Decision]) -> SceneProfile:
-        """Compute the profile of training data.
-
-        Args:
-            dataset: the training images.
-            decisions: the decisions to list.
-        """
+        """Compute the profile of the training images `dataset`, with `decisions` to list."""
         cameras, alpha = dataset.cameras, dataset.scene.has_alpha
         kept, total = dataset.kept, int(dataset.cameras.offsets[-1])
         transparent = sum(int((dataset.image(index)[..., 3] == 0).sum()) for index in range(len(dataset) * alpha))

@@ -38,12 +38,9 @@ BALLS = 128
 
 @torch.no_grad()
 def motion_bound(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> MotionBound | None:
-    """Return how far matter may move, including `SAFETY_FACTOR`; None if there are too few images or times.
+    """Return how far matter may move, with `SAFETY_FACTOR`, by `silhouettes` at `times` (M,); None if too few.
 
-    Args:
-        silhouettes: silhouettes of the M training images.
-        box: (2, 3) minimum and maximum corner of what the images show.
-        times: (M,) times of the images, in [0, 1].
+    `box` (2, 3) has the minimum and maximum corner of what the images show.
     """
     silhouettes = silhouettes.closed_if_whole()
     images = silhouettes.at_full_size

@@ -30,13 +30,7 @@ class Result:
 
 
 def settings_of(run: Run, budget: Budget, scene: Scene) -> dict[str, Any]:
-    """Return the settings of the plain run as plain values, without paths.
-
-    Args:
-        run: the method and its settings.
-        budget: length of the run.
-        scene: properties of the plain images.
-    """
+    """Return the settings of the plain `run` on `scene` within `budget` as plain values, without paths."""
     method = load_method(run.method)
     config = shortened(run.config, budget, method, scene)
     config, _ = method.decided(config, scene)

@@ -90,12 +90,7 @@ def directions(count: int, turn: float = 0.0) -> Tensor:
 
 
 def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
-    """Return images of the ball.
-
-    Args:
-        positions: (M, 3) float64 camera positions, all at the same distance from the centre, scene units.
-        field_of_view: angle of view of the images, degrees.
-    """
+    """Return images of the ball from `positions` (M, 3) float64 at one distance, of `field_of_view` degrees."""
     cameras = cameras_at(positions, field_of_view, SIZE)
     pixels = as_decoded(photograph(cameras))
     distance, reach = float(positions.norm(dim=-1).max()), HALF_SIZE * 3**0.5

@@ -71,12 +71,7 @@ class Trial:
 
 
 class StressedSource(BatchSource):
-    """A source of batches that a condition changes.
-
-    Args:
-        source: source of the unchanged batches.
-        condition: the condition, with the number of rays per step and the change of batches.
-    """
+    """A `source` of batches that a `condition` changes: the number of rays per step, or the batches."""
 
     def __init__(self, source: BatchSource, condition: Condition) -> None:
         self.source, self.condition, self.dataset = source, condition, source.dataset
@@ -156,12 +151,7 @@ def shortened(config: TrainConfig, budget: Budget, method: Method, scene: Scene)
 
 
 def blank_psnr(model: Model[Any], test: Dataset) -> float:
-    """Return the mean PSNR of images that show only the background, dB; masked-out pixels count too.
-
-    Args:
-        model: the model, with its background.
-        test: the test images.
-    """
+    """Return the mean PSNR, dB, of `test` images that show only the background of `model`, masked pixels included."""
     background = model.background
     images = (composite(test.image(index).float() / 255, background) for index in range(len(test)))
     return fmean(psnr(background.expand_as(image), image) for image in images)

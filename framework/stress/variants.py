@@ -53,13 +53,7 @@ def mean_color(image: Tensor) -> Tensor:
 
 
 def with_distractors(dataset: Dataset, share: float, seed: int = 0) -> Dataset:
-    """Return `dataset` with opaque discs of one colour in its images, each at another place and of another colour.
-
-    Args:
-        dataset: the images.
-        share: share of each image's pixels that discs cover, at least.
-        seed: seed of places, sizes and colours.
-    """
+    """Return `dataset` with opaque discs of one colour over a `share` of each image, by `seed`."""
     generator, images = torch.Generator().manual_seed(seed), []
     for index in range(len(dataset)):
         image = dataset.image(index).clone()

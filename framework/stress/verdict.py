@@ -91,13 +91,7 @@ def _not_applicable(condition: Condition, why: str) -> Verdict:
 
 
 def verdict_of(condition: Condition, trial: Trial, plain: float | None) -> Verdict:
-    """Return the verdict on a run.
-
-    Args:
-        condition: condition of the run.
-        trial: result of the run.
-        plain: PSNR of the plain run, dB; None if it has none.
-    """
+    """Return the verdict on a `trial` under a `condition`, given the `plain` run's PSNR, dB, or None."""
     lost = None if plain is None or trial.psnr is None else plain - trial.psnr
     reason = None
     if trial.error is not None:

@@ -34,13 +34,7 @@ def trace(origins: Tensor, unit_directions: Tensor, centers: Tensor | None = Non
 
 
 def cameras_at(positions: Tensor, field_of_view: float, size: int) -> Cameras:
-    """Return cameras that look at the origin, with +z up.
-
-    Args:
-        positions: (M, 3) camera positions, scene units.
-        field_of_view: horizontal and vertical angle of view, degrees.
-        size: width and height of the images, pixels.
-    """
+    """Return cameras at `positions` (M, 3), of `field_of_view` degrees and `size` pixels, to the origin, +z up."""
     target, up = torch.zeros(3, dtype=positions.dtype), torch.tensor([0.0, 0.0, 1.0], dtype=positions.dtype)
     poses = torch.stack([look_at(position, target, up) for position in positions]).float()
     focal = torch.full((len(positions),), size / 2 / math.tan(math.radians(field_of_view) / 2))

@@ -45,12 +45,7 @@ SHOWN_EVERY = 9
 
 
 class Learner:
-    """A model in training on one scene, with the trainer's steps.
-
-    Args:
-        dataset: images of the scene.
-        seed: random seed of the initial parameters.
-    """
+    """A model in training on `dataset`, with parameters of a `seed` and the trainer's steps."""
 
     def __init__(self, method: Method, config: TrainConfig, dataset: Dataset, seed: int) -> None:
         torch.manual_seed(seed)
@@ -74,22 +69,13 @@ class Learner:
     # -- learning ---------------------------------------------------------------------------------------------
 
     def batch(self, rays_per_pixel: int = 1) -> Any:
-        """Return the batch of the next step.
-
-        Args:
-            rays_per_pixel: rays through each pixel, if the batch is of pixels.
-        """
+        """Return the batch of the next step, with `rays_per_pixel` if it is of pixels."""
         seed_step(SEED, self.done)
         count = min(self.model.config.num_rays_per_batch, MAX_PIXELS) if self.model.batches == "pixels" else 0
         return self.source.draw(Request(self.done, count, rays_per_pixel))
 
     def rendered(self, rays: Rays, background: Tensor) -> Rendered:
-        """Render rays as in the next training step; the model must cast rays.
-
-        Args:
-            rays: R rays.
-            background: (R, 3) or (3,) colour behind transparent rays.
-        """
+        """Render `rays` over `background`, (R, 3) or (3,), as in the next step; the model must cast rays."""
         self.model.train()
         self.model.before_step(self.done, self.done / BUDGET)
         return self.rays_model.render(rays, background)
@@ -101,12 +87,7 @@ class Learner:
         return self.model
 
     def loss(self, batch: Any, bfloat16: bool = False) -> Loss:
-        """Return the loss of a batch in the next step.
-
-        Args:
-            batch: pixels or views, as required by the model's loss.
-            bfloat16: whether networks run in bfloat16.
-        """
+        """Return the loss of `batch`, as the model needs it, in the next step, with networks in `bfloat16` or not."""
         return forward(self.model, batch, self.done, self.done / BUDGET, bfloat16)
 
     def step(self) -> None:
@@ -119,11 +100,7 @@ class Learner:
         self.backward(self.loss(self.batch()))
 
     def backward(self, loss: Loss) -> None:
-        """Compute the gradients of a loss, for `descend`.
-
-        Args:
-            loss: loss of a batch.
-        """
+        """Compute the gradients of the `loss` of a batch, for `descend`."""
         total = loss.total
         self.has_gradient = total.requires_grad
         backward(total, self.optimizer)
@@ -149,25 +126,13 @@ class Learner:
 
     @torch.no_grad()
     def show(self, rays: Rays, background: Tensor, seed: int = SEED) -> Rendered:
-        """Render rays as in an evaluation, without a training camera.
-
-        Args:
-            rays: R rays.
-            background: (R, 3) or (3,) colour behind transparent rays.
-            seed: random seed.
-        """
+        """Render `rays` over `background`, (R, 3) or (3,), as in an evaluation, with a random `seed`."""
         self.model.eval()
         seed_step(seed, 0)
         return self.rays_model.render(replace(rays, camera_indices=None), background)
 
     def picture(self, index: int = 0, background: float = 1.0, seed: int = SEED) -> Picture:
-        """Render every STRIDE-th row and column of a view, as in an evaluation.
-
-        Args:
-            index: index of the view's image.
-            background: grey level behind transparent pixels, in [0, 1].
-            seed: random seed.
-        """
+        """Render every STRIDE-th row and column of view `index` over grey `background`, with a random `seed`."""
         seed_step(seed, 0)
         return self.model.render_view(self.dataset.view(index, STRIDE), torch.full((3,), background))
 
@@ -189,12 +154,7 @@ class Learner:
 
 
 class MethodUnderTest:
-    """A method under test, with its settings and scenes.
-
-    Args:
-        name: the method's name in messages.
-        config: the method's settings; its defaults if None.
-    """
+    """A method under test, called `name` in messages, with `config` or its defaults, and its scenes."""
 
     def __init__(self, method: Method, name: str, config: TrainConfig | None) -> None:
         self.method, self.name = method, name
@@ -214,12 +174,7 @@ class MethodUnderTest:
         return scenes
 
     def learner(self, dataset: Dataset | None = None, seed: int = SEED) -> Learner:
-        """Return a fresh model on a scene.
-
-        Args:
-            dataset: images of the scene; None for the static scene.
-            seed: random seed of the initial parameters.
-        """
+        """Return a fresh model, of a random `seed`, on `dataset`, or on the static scene if that is None."""
         return Learner(self.method, self.config, dataset or self.still, seed)
 
     @cached_property

@@ -31,11 +31,7 @@ def ball_in_a_box(size: int = SIZE) -> Dataset:
 
 
 def ball_under_a_sky(size: int = SIZE) -> Dataset:
-    """Return images of a ball at the origin before a sky at infinity: without alpha, in an unbounded scene.
-
-    Args:
-        size: width and height of the images, pixels.
-    """
+    """Return images of `size` pixels of a ball before a sky at infinity: no alpha, and unbounded."""
     rays = _rays(size)
     colors, hits = _ball(rays, torch.zeros(3))
     return _dataset(torch.where(hits[:, None] > 0, colors, 0.5 + 0.4 * rays.directions), size, unbounded=True)

@@ -106,11 +106,7 @@ class PathSettings(FileSettings, ViewSettings):
         return None if self.background is None else color_of(self.background)
 
     def target(self, output: Path) -> Path:
-        """Return the file or folder that is written.
-
-        Args:
-            output: file or folder that the user has named.
-        """
+        """Return the file or folder that is written for the user's `output`."""
         return output
 
 

@@ -142,12 +142,7 @@ def _interpolated(settings: InterpolateSettings, loaded: Loaded) -> Views:
 
 
 def about(walk: Walk, count: int) -> list[str]:
-    """Return sentences about the cameras that a walk leaves out, and about its jumps.
-
-    Args:
-        walk: the walk.
-        count: number of all cameras.
-    """
+    """Return sentences about those of `count` cameras that a `walk` leaves out, and about its jumps."""
     said = []
     if left := count - sum(map(len, walk.stretches)):
         said.append(f"the path leaves out {left} of {count} photographs, which are far from all others")
@@ -200,12 +195,7 @@ def _spiral(settings: SpiralSettings, loaded: Loaded) -> Views:
 
 
 def in_scene(length: float | None, loaded: Loaded) -> float | None:
-    """Return a length in scene units; None for None.
-
-    Args:
-        length: the length, in the unit of exports.
-        loaded: what is rendered.
-    """
+    """Return a `length` in the unit of exports in scene units of `loaded`; None for None."""
     return None if length is None else length / loaded.unit
 
 

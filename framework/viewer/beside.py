@@ -78,12 +78,7 @@ def joined(left: Arrays, right: Arrays, divider: float) -> Arrays:
 
 
 def with_divider(picture: np.ndarray, divider: float | None) -> np.ndarray:
-    """Return a picture (H, W, 3) uint8 with a line of two pixels at the divider.
-
-    Args:
-        picture: the picture.
-        divider: width of the part left of it, as a fraction of the whole; None for no line.
-    """
+    """Return a `picture` (H, W, 3) uint8 with a line of two pixels at the fraction `divider`; None for none."""
     if divider is None:
         return picture
     column = round(divider * picture.shape[1])

@@ -54,12 +54,7 @@ class Browser:
         return True
 
     def waiting(self, step: int, now: float) -> Waiting:
-        """Return the browser's claim to be served.
-
-        Args:
-            step: training step of the model.
-            now: time, `time.monotonic`.
-        """
+        """Return the browser's claim to be served at time `now`, by `time.monotonic`, and training step `step`."""
         old = step != self.step and now - self.served_at >= RENEWAL
         new = self.wanted is not None and self.wanted != self.drawn
         return Waiting(new, self.drawn is not None and (bool(self.pieces) or old), self.asked_at, self.served_at)
@@ -92,11 +87,7 @@ class Browser:
         self.pieces = refinement(speed, self.drawn.width, self.drawn.height, 1, rays, seconds)
 
     def refine(self, kept: Arrays) -> None:
-        """Show the next piece of `pieces`.
-
-        Args:
-            kept: arrays of the piece.
-        """
+        """Show the next piece of `pieces`, with the arrays `kept`."""
         assert self.drawn is not None
         piece = self.pieces.pop(0)
         width, height = self.drawn.width, self.drawn.height

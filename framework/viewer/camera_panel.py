@@ -19,13 +19,7 @@ SIZE = 0.06
 
 
 class CameraPanel:
-    """Controls of one browser for the photographs' cameras.
-
-    Args:
-        client: the browser.
-        photographs: the training images.
-        move: moves the browser's camera.
-    """
+    """Controls of one browser `client` for the cameras of `photographs`; `move` moves the browser's camera."""
 
     def __init__(self, client: viser.ClientHandle, photographs: Photographs, move: Move) -> None:
         self._client, self._photographs, self._move = client, photographs, move

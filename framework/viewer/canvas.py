@@ -12,12 +12,7 @@ from nerfloom.viewer.request import smaller
 
 
 def enlarged(kept: Arrays, width: int, height: int) -> dict[str, np.ndarray]:
-    """Return a coarse picture at full size; each pixel becomes a block.
-
-    Args:
-        kept: arrays of the coarse picture.
-        width, height: size of the whole picture, pixels.
-    """
+    """Return coarse arrays `kept` at the full size of `width` x `height` pixels; each pixel becomes a block."""
     found = {}
     for name, values in kept.items():
         rows, columns = values.shape[:2]
@@ -26,13 +21,7 @@ def enlarged(kept: Arrays, width: int, height: int) -> dict[str, np.ndarray]:
 
 
 def paste(canvas: Mapping[str, np.ndarray], kept: Arrays, piece: Piece) -> None:
-    """Write a piece into a full-size picture.
-
-    Args:
-        canvas: the picture, changed in place.
-        kept: arrays of the piece, with the names of the canvas.
-        piece: rows at a stride.
-    """
+    """Write the arrays `kept` of a `piece`, rows at a stride, into the full-size `canvas`, in place."""
     for name, whole in canvas.items():
         height, width = whole.shape[:2]
         columns, rows = smaller(width, height, piece.stride)

@@ -38,13 +38,7 @@ class CommandPanel:
         self._download.on_click(lambda _: self._send())
 
     def run(self, module: str, arguments: Sequence[object], written: Callable[[], Path]) -> None:
-        """Run a command to its end, and offer its file.
-
-        Args:
-            module: module of the command, such as nerfloom.cli.render.
-            arguments: its arguments.
-            written: function that returns the file that it has written.
-        """
+        """Run a `module` of a command with `arguments` to its end, and offer the file that `written()` returns."""
         last = ""
 
         def tell(line: str, percent: int | None) -> None:

@@ -26,12 +26,7 @@ class Commands:
         self._lock = threading.Lock()
 
     def start(self, module: str, arguments: Sequence[object]) -> subprocess.Popen[str] | None:
-        """Start a command, and return its process; None if another command is running, or the viewer ends.
-
-        Args:
-            module: module of the command, such as nerfloom.cli.render.
-            arguments: its arguments.
-        """
+        """Start a `module` with `arguments`; return its process, or None if another runs or the viewer ends."""
         with self._lock:
             if self._is_closed or (self._process is not None and self._process.poll() is None):
                 return None
@@ -55,12 +50,7 @@ class Commands:
 
 
 def follow(process: subprocess.Popen[str], tell: Tell) -> int:
-    """Print the messages of a command on the viewer's terminal until it ends, and return its exit status.
-
-    Args:
-        process: the command, as `Commands.start` returns it.
-        tell: function that is called with each line that it prints.
-    """
+    """Print and `tell` each line of a `process` of `Commands.start` until it ends, and return its exit status."""
     assert process.stderr is not None
     with process.stderr:
         for line in filter(None, map(str.strip, process.stderr)):

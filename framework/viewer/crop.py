@@ -41,12 +41,7 @@ class CroppedCameras(Cameras):
 
 
 def cropped(rays: Rays, crop: Crop) -> Rays:
-    """Return rays that start and end within a crop; rays that miss it have length 0.
-
-    Args:
-        rays: R rays.
-        crop: the box and the distances.
-    """
+    """Return `rays` that start and end within `crop`, a box and distances; rays that miss it have length 0."""
     box, corners = crop.box, rays.origins.new_tensor([crop.box.low, crop.box.high])
     enter, leave = intersect_box(box.along(rays.origins), box.along(rays.directions), corners)
     missed = leave <= enter
@@ -101,23 +96,13 @@ def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor
 
 
 def meaning(model: Renderable) -> str:
-    """Return a description of a crop's effect on pictures of a model.
-
-    Args:
-        model: the model.
-    """
+    """Return a description of a crop's effect on pictures of `model`."""
     if isinstance(model, RendersGaussians):
         return BY_CENTERS
     return BY_RAYS if isinstance(model, RendersRays) else BY_DEPTH
 
 
 def within(points: Tensor, camera: Cameras, crop: Crop) -> Tensor:
-    """Return whether points (N, 3) lie within a crop, (N,) bool.
-
-    Args:
-        points: scene coordinates.
-        camera: one camera; the crop's distances are measured from it.
-        crop: the box and the distances.
-    """
+    """Return whether `points` (N, 3) lie within `crop`, with distances from `camera`, as (N,) bool."""
     distances = (points - camera.camera_to_worlds[0, :, 3]).norm(dim=-1)
     return crop.box.contains(points) & (distances >= crop.near) & (distances <= crop.far)

@@ -180,12 +180,7 @@ def edges(box: Box) -> np.ndarray:
 
 
 def middle(box: Box, face: Face) -> Vector:
-    """Return the centre of a face of a box.
-
-    Args:
-        box: a box that is parallel to the axes.
-        face: axis and side.
-    """
+    """Return the centre of a `face`, axis and side, of a `box` that is parallel to the axes."""
     x, y, z = ((low + high) / 2 for low, high in zip(box.low, box.high, strict=True))
     return replaced((x, y, z), face[0], (box.low, box.high)[face[1]][face[0]])
 

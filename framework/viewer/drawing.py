@@ -93,12 +93,7 @@ def number_kept(kept: Arrays) -> str | None:
 
 
 def colored(kept: Arrays, ends: tuple[float, float] | None = None) -> np.ndarray:
-    """Return the picture (H, W, 3) uint8 of an output's arrays.
-
-    Args:
-        kept: arrays of the piece.
-        ends: numbers at the ends of the colours, if the output is a number; found from `kept` if None.
-    """
+    """Return the picture (H, W, 3) uint8 of arrays `kept`, numbers between `ends`, or their own if None."""
     name = number_kept(kept)
     if name is None:
         return shown_output(kept, next(iter(kept)), {})

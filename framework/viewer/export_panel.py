@@ -92,10 +92,5 @@ class ExportPanel:
 
 
 def newest(folder: Path, suffix: str) -> Path:
-    """Return the file in a folder that was written last.
-
-    Args:
-        folder: the folder, with such a file.
-        suffix: its suffix.
-    """
+    """Return the file with a `suffix` in a `folder`, which has one, that was written last."""
     return max(folder.glob(f"*{suffix}"), key=lambda file: file.stat().st_mtime_ns)

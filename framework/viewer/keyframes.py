@@ -54,12 +54,7 @@ class Editor:
         return replace(self, keyframes=(*self.keyframes[:index], keyframe, *self.keyframes[index + 1 :]))
 
     def path(self, width: int, height: int, placement: Placement | None) -> CameraPath | None:
-        """Return the path's frames; None if it has fewer than two cameras.
-
-        Args:
-            width, height: size of the images, pixels.
-            placement: placement of the input in the scene.
-        """
+        """Return the path's frames of `width` x `height` pixels by `placement`; None with fewer than two cameras."""
         count = len(self.keyframes)
         if count < 2:
             return None

@@ -21,11 +21,6 @@ class Key(NamedTuple):
 
 
 def add_keys(client: viser.ClientHandle, keys: Iterable[Key]) -> None:
-    """Make keys known to a browser.
-
-    Args:
-        client: the browser.
-        keys: the keys.
-    """
+    """Make `keys` known to the browser `client`."""
     for key in keys:
         client.gui.add_command(key.label, hotkey=key.key).on_trigger(lambda _, action=key.action: action())

@@ -11,12 +11,7 @@ from nerfloom.training.trained import load_parameters
 
 
 def newer_checkpoint(folder: Path, seen: Path | None) -> Path | None:
-    """Return the newest checkpoint in a run's folder, unless it is the one already seen.
-
-    Args:
-        folder: the run's folder.
-        seen: checkpoint loaded or tried last; None if there was none.
-    """
+    """Return the newest checkpoint in a run's `folder`, unless it was `seen` before."""
     try:
         newest = list_checkpoints(folder / FOLDER)[-1:]
     except OSError:
@@ -25,12 +20,7 @@ def newer_checkpoint(folder: Path, seen: Path | None) -> Path | None:
 
 
 def reloaded(loaded: Loaded, checkpoint: Path) -> Loaded | str:
-    """Return a run with the parameters of a newer checkpoint, or the reason why they cannot be read.
-
-    Args:
-        loaded: the run that is looked at.
-        checkpoint: file of the newer parameters.
-    """
+    """Return the run `loaded` with parameters of a newer `checkpoint`, or the reason why it cannot be read."""
     try:
         return load_parameters(loaded.run, checkpoint)
     except (NerfloomError, OSError) as error:

@@ -38,12 +38,7 @@ class Speed:
     """Number of rays, and seconds."""
 
     def with_one(self, rays: int, seconds: float) -> Speed:
-        """Return the speed with one more measurement.
-
-        Args:
-            rays: number of rays of a picture; its number of pixels for methods that cast none.
-            seconds: drawing time.
-        """
+        """Return the speed with one more picture of `rays`, or of pixels without rays, drawn in `seconds`."""
         return Speed((*self.measured, (max(rays, 1), max(seconds, 1e-6)))[-KEPT_MEASUREMENTS:])
 
     def line(self) -> tuple[float, float]:

@@ -120,12 +120,7 @@ class Page:
             self.show_curve(*curve(loaded.folder))
 
     def show_curve(self, seconds: list[float], psnr: list[float]) -> None:
-        """Show a learning curve.
-
-        Args:
-            seconds: seconds of training of each point.
-            psnr: PSNR of held-out images at each point, dB.
-        """
+        """Show a learning curve: `psnr` of held-out images, dB, after `seconds` of training."""
         if len(seconds) < 2:
             return
         data = (np.array(seconds), np.array(psnr))

@@ -21,12 +21,7 @@ MEAN = "mean of all images"
 
 
 class Panel:
-    """Controls of one browser for its picture.
-
-    Args:
-        client: the browser.
-        queue: draws its pictures.
-    """
+    """Controls of one browser `client` for its picture, which `queue` draws."""
 
     def __init__(self, client: viser.ClientHandle, queue: RenderQueue) -> None:
         self._client, self._queue = client, queue

@@ -126,12 +126,7 @@ class Photographs:
     # -- errors -----------------------------------------------------------------------------------------------
 
     def at(self, pose: Pose, time: float | None = None) -> int | None:
-        """Return the image whose camera has a given position and direction; None if there is none.
-
-        Args:
-            pose: camera of a view.
-            time: time of the view, which chooses among the images of a camera that stood still; None for no time.
-        """
+        """Return the image with a camera at `pose`, and of several the one at `time`; None without one."""
         cameras = self.cameras
         if cameras is None or self.ndc is not None:
             return None

@@ -15,11 +15,7 @@ MAX_REPORT = 2**24
 
 
 def heading(loaded: Loaded) -> str:
-    """Return the method, the folder or file, the step and the PSNR as Markdown.
-
-    Args:
-        loaded: the run or file.
-    """
+    """Return the method, the folder or file, the step and the PSNR of `loaded` as Markdown."""
     step = f" · step {loaded.step:,}" if loaded.is_run else ""
     lines = [f"**{plain(loaded.method)}** · {plain(loaded.origin.name)}{step}"]
     origin = loaded.origin
@@ -32,11 +28,7 @@ def heading(loaded: Loaded) -> str:
 
 
 def curve(folder: Path) -> tuple[list[float], list[float]]:
-    """Return training seconds and PSNR of held-out images, dB, in order of time; empty if there are none.
-
-    Args:
-        folder: the run's folder.
-    """
+    """Return training seconds and PSNR of held-out images, dB, of the run in `folder`, by time; possibly none."""
     content = _read(folder / "learning_curve.json")
     points = []
     for row in content if isinstance(content, list) else ():

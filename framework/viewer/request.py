@@ -117,12 +117,7 @@ class Request:
 
 
 def smaller(width: int, height: int, stride: int) -> tuple[int, int]:
-    """Return the size of a picture at a stride.
-
-    Args:
-        width, height: size of the whole picture, pixels.
-        stride: divisor of both, rounded up.
-    """
+    """Return the size of a picture of `width` x `height` pixels at a `stride`, which divides both, rounded up."""
     return -(-width // stride), -(-height // stride)
 
 
@@ -154,11 +149,7 @@ def pose_of(wxyz: Any, position: Any, fov: Any) -> Pose | None:
 
 
 def quaternion_of(pose: Tensor) -> tuple[float, float, float, float]:
-    """Return the quaternion w, x, y, z of a camera with axes x right, y down, z forward; the inverse of `pose_of`.
-
-    Args:
-        pose: (3, 4) camera-to-scene, OpenGL axes.
-    """
+    """Return the w, x, y, z of `pose` (3, 4) with axes x right, y down, z forward; the inverse of `pose_of`."""
     m = (pose[:, :3].double() * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)).tolist()
     trace = m[0][0] + m[1][1] + m[2][2]
     # Divide by the largest of the four squares, so that nothing is divided by zero.
@@ -191,45 +182,25 @@ def size_of(width: Any, height: Any, longest: int) -> tuple[int, int]:
 
 
 def number_in(value: Any, least: float, most: float, default: float) -> float:
-    """Return a number from a browser, clamped; the default if it is not a finite number.
-
-    Args:
-        value: value sent by the browser.
-        least, most: range.
-        default: the default.
-    """
+    """Return a browser's `value` as a number from `least` to `most`; `default` if it is not a finite number."""
     found = _numbers([value], 1)
     return default if found is None else min(max(found[0], least), most)
 
 
 def one_of(value: Any, choices: Sequence[str]) -> str:
-    """Return a word from a browser if it is among the choices, otherwise the first choice.
-
-    Args:
-        value: value sent by the browser.
-        choices: allowed words.
-    """
+    """Return a browser's `value` if it is among `choices`, otherwise the first choice."""
     return value if isinstance(value, str) and value in choices else choices[0]
 
 
 def color_of(value: Any) -> tuple[float, float, float]:
-    """Return a browser's colour in [0, 1], from three numbers from 0 to 255; white if they are invalid.
-
-    Args:
-        value: value sent by the browser.
-    """
+    """Return a browser's `value`, three numbers from 0 to 255, as a colour in [0, 1]; white if invalid."""
     found = _numbers(value, 3)
     red, green, blue = (1.0, 1.0, 1.0) if found is None else (min(max(part / 255, 0.0), 1.0) for part in found)
     return red, green, blue
 
 
 def corner_of(value: Any, default: Sequence[float]) -> tuple[float, float, float]:
-    """Return a point from a browser; the default if it is invalid.
-
-    Args:
-        value: value sent by the browser.
-        default: three coordinates.
-    """
+    """Return a browser's `value` as a point; the coordinates `default` if it is invalid."""
     found = _numbers(value, 3)
     x, y, z = default if found is None else (min(max(part, -MAX_COORDINATE), MAX_COORDINATE) for part in found)
     return x, y, z

@@ -38,13 +38,7 @@ PAUSE = 0.05
 
 
 class Turns:
-    """The viewer's turns between the steps of a run.
-
-    Args:
-        trainer: the run's trainer.
-        queue: draws the pictures.
-        share: fraction of the time for pictures.
-    """
+    """The viewer's turns between steps of `trainer`: a `share` of the time for pictures that `queue` draws."""
 
     def __init__(self, trainer: Trainer, queue: RenderQueue, share: float) -> None:
         self._trainer, self._queue, self._share = trainer, queue, Share(share)
@@ -53,12 +47,7 @@ class Turns:
         self.waited = 0.0
 
     def take(self, report: StepReport, stopped: Sequence[int]) -> None:
-        """Draw within the share of time; while training is paused, draw until it continues.
-
-        Args:
-            report: report of the last step.
-            stopped: signals received so far; any signal ends a pause.
-        """
+        """Draw within the share of time, after `report`; in a pause, until it ends or signals are in `stopped`."""
         start = time.perf_counter()
         if self._queue.is_empty and not self.paused:  # no browsers
             self._ended = start
@@ -98,11 +87,7 @@ class Status:
         self._button.label = "Continue training" if self._turns.paused else "Pause training"
 
     def show(self, report: StepReport) -> None:
-        """Show the numbers of a step, unless others were shown a moment ago.
-
-        Args:
-            report: report of the step.
-        """
+        """Show the numbers of a step's `report`, unless others were shown a moment ago."""
         now = time.monotonic()
         if now - self._told < SECONDS_PER_REPORT:
             return
@@ -118,11 +103,7 @@ class Status:
 
 
 def in_training(run: Run, trainer: Trainer) -> Loaded:
-    """Return a run in training, at its present step, as something to look at.
-
-    Args:
-        trainer: its trainer.
-    """
+    """Return the run of `trainer`, at its present step, as something to look at."""
     placement, checkpoints = trainer.train_set.placement, run.folder / FOLDER
     loaded = Loaded(trainer.model, placement, run.method, run.folder, checkpoints, trainer.state.step, run)
     return loaded.scaled(read_scale(run.folder))

@@ -35,12 +35,7 @@ AXES: dict[str, Vector] = {
 
 
 class Viewpoint:
-    """Controls of one browser for its camera.
-
-    Args:
-        client: the browser.
-        up: up direction of the scene.
-    """
+    """Controls of the browser `client` for its camera, in a scene with the direction `up`."""
 
     def __init__(self, client: viser.ClientHandle, up: Vector) -> None:
         self._client = client
@@ -58,12 +53,7 @@ class Viewpoint:
             self._client.camera.up_direction = self._ups[one_of(self._up.value, list(self._ups))]
 
     def move(self, pose: Tensor, fov: float) -> None:
-        """Move the camera.
-
-        Args:
-            pose: (3, 4) camera-to-scene, OpenGL axes.
-            fov: vertical field of view, radians.
-        """
+        """Move the camera to `pose` (3, 4), OpenGL axes, with a vertical field of view `fov` in radians."""
         camera = self._client.camera
         with self._client.atomic():
             self._fov.value = round(number_in(math.degrees(fov), *SLIDER, FIRST_FOV), 1)

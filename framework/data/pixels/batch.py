@@ -91,12 +91,7 @@ class ViewBatch:
 
 
 def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
-    """Return the background behind transparent pixels in training.
-
-    Args:
-        asked: the configured background; "auto" is random for images with alpha, else black.
-        has_alpha: whether the images have alpha.
-    """
+    """Return the background in training: what is `asked`, and for "auto" random if `has_alpha`, else black."""
     if asked != "auto":
         return asked
     return "random" if has_alpha else "black"
@@ -131,13 +126,7 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
 
 
 def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
-    """Draw `count` pixels from `num_images` randomly drawn images, by PyTorch's generator.
-
-    Args:
-        dataset: the images.
-        count: number of pixels.
-        num_images: number of images; each gets about the same number of pixels, and an image may be drawn twice.
-    """
+    """Draw `count` pixels of `dataset`, as many from each of `num_images` random images, by torch's generator."""
     drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
     ranks = ends if drawn is None else drawn.ranks(ends)
     sizes = ranks.diff()

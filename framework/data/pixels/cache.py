@@ -42,12 +42,7 @@ class PixelMemory:
 
     @classmethod
     def of(cls, limit: float | None = None, folder: Path | None = None) -> PixelMemory:
-        """Construct the limit and folder from settings.
-
-        Args:
-            limit: limit in MB; half of the machine's memory if None.
-            folder: cache folder; the user's cache folder if None.
-        """
+        """Construct from a `limit` in MB, or half of the memory, and a `folder`, or the user's cache folder."""
         return cls(machine_memory() / 2 if limit is None else limit * MB, folder or cache_folder())
 
 
@@ -118,13 +113,7 @@ def temporary_store(path: Path, size: int) -> FileStore:
 
 
 def no_room(folder: Path, size: int, error: OSError) -> DataError:
-    """Return the error for a failed write.
-
-    Args:
-        folder: the cache folder.
-        size: number of bytes that were to be written.
-        error: the system's error.
-    """
+    """Return the error for a failed write of `size` bytes to the cache `folder`, by the system's `error`."""
     try:
         free = f", where {shutil.disk_usage(folder).free / MB:,.0f} MB are free"
     except OSError:

@@ -24,22 +24,12 @@ class PixelSet:
 
     @classmethod
     def of_runs(cls, starts: Tensor, lengths: Tensor) -> PixelSet:
-        """Construct from runs in ascending order, neither overlapping nor empty.
-
-        Args:
-            starts: (N,) int64 first pixel of each run.
-            lengths: (N,) int64 number of pixels of each run.
-        """
+        """Construct from runs of `lengths` (N,) from `starts` (N,) int64, ascending, neither overlapping nor empty."""
         return cls(starts, torch.cat([torch.zeros_like(starts[:1]), lengths]).cumsum(0) if len(starts) else _none(1))
 
     @classmethod
     def of_mask(cls, mask: Tensor, first: int = 0) -> PixelSet:
-        """Construct from the true elements of a mask.
-
-        Args:
-            mask: bool, of any shape.
-            first: pixel of the mask's first element.
-        """
+        """Construct from the true elements of a bool `mask`, of any shape, that begins at pixel `first`."""
         edges = torch.nn.functional.pad(mask.reshape(-1).to(torch.int8), (1, 1)).diff()
         starts = (edges == 1).nonzero().squeeze(-1)
         return cls.of_runs(starts + first, (edges == -1).nonzero().squeeze(-1) - starts)
@@ -61,12 +51,7 @@ class PixelSet:
 
     @classmethod
     def shared(cls, sets: Sequence[PixelSet], at_least: int) -> PixelSet:
-        """Return the pixels that are in several sets.
-
-        Args:
-            sets: one or more sets.
-            at_least: minimum number of sets that contain a pixel: 1 for the union, len(sets) for the intersection.
-        """
+        """Return the pixels that are in at least `at_least` of the `sets`: 1 for the union."""
         starts = torch.cat([part.starts for part in sets])
         ends = torch.cat([part.starts + part.before.diff() for part in sets])
         boundaries, order = torch.cat([ends, starts]).sort(stable=True)  # at equal positions, ends before starts

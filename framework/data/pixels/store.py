@@ -81,13 +81,7 @@ class FileStore(PixelStore):
             return np.frombuffer(self._file.read(count), np.uint8)
 
     def finish(self, size: int, ending: bytes, path: Path) -> None:
-        """Complete the file and rename it once its content is safely on the disk.
-
-        Args:
-            size: bytes to keep.
-            ending: bytes to append.
-            path: final path.
-        """
+        """Keep `size` bytes, append `ending`, and rename the file to `path` once it is safely on the disk."""
         with self._lock:
             self._file.truncate(size)
             self._file.seek(size)

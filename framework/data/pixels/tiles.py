@@ -9,12 +9,7 @@ from nerfloom.cameras.cameras import Cameras
 
 
 class Tiles:
-    """The tiles that M images are divided into; those at the right and lower borders may be smaller.
-
-    Args:
-        cameras: cameras of the images, with their sizes.
-        side: side of a tile, pixels.
-    """
+    """The tiles of `side` pixels of M images of `cameras`; those at the right and lower borders may be smaller."""
 
     def __init__(self, cameras: Cameras, side: int) -> None:
         self.cameras, self.side = cameras, side

@@ -99,10 +99,7 @@ def captured_scene(
 
 
 def image_sizes(paths: Sequence[Path]) -> Tensor:
-    """Return width and height (M, 2) int64 of images from their headers; unreadable ones get the first readable size.
-
-    Args:
-        paths: M image files.
+    """Return width and height (M, 2) int64 of images `paths` by their headers; unreadable ones get the first.
 
     Raises:
         DataError: if no file is readable.
@@ -246,11 +243,7 @@ def _check_masks(masks: tuple[Path | None, ...] | None) -> None:
 
 
 def checked_box(box: Tensor, source: str) -> Tensor:
-    """Return `box` (2, 3) if it is valid.
-
-    Args:
-        box: minimum and maximum corner.
-        source: what the box is computed from, as a plural subject for the message.
+    """Return `box` (2, 3) if it is valid; the message names its `source` as a plural subject.
 
     Raises:
         DataError: if the box is empty or too large.
@@ -261,11 +254,7 @@ def checked_box(box: Tensor, source: str) -> Tensor:
 
 
 def placed_cameras(images: PosedImages, placement: Placement) -> Cameras:
-    """Return the cameras in the scene's frame, for the sizes of the image files.
-
-    Args:
-        images: M images, whose files exist.
-        placement: placement of the scene.
+    """Return the cameras of `images` in the frame of `placement`, for the sizes of the image files.
 
     Raises:
         DataError: if a camera is invalid or does not fit its image.

@@ -28,10 +28,7 @@ is invalid."""
 
 
 def check_binary(folder: Path) -> None:
-    """Traverse the existing binary files of a model.
-
-    Args:
-        folder: folder of the reconstruction.
+    """Traverse the existing binary files of a model in `folder`.
 
     Raises:
         DataError: if a file is truncated or damaged.
@@ -60,10 +57,7 @@ def image_names(folder: Path) -> list[str]:
 
 
 def text_names(file: Path) -> dict[int, str]:
-    """Return image number -> name in a text model, including spaces, where pycolmap cuts names off.
-
-    Args:
-        file: images.txt, with two lines for each image: number, pose, camera and name; and the keypoints.
+    """Return image number -> name in images.txt, `file`, including spaces, where pycolmap cuts names off.
 
     Raises:
         OSError: if the file cannot be read.

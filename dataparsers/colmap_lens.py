@@ -29,12 +29,7 @@ class Lenses:
 
 
 def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str) -> Lenses:
-    """Convert the cameras of M images to one lens model.
-
-    Args:
-        cameras: M cameras.
-        names: M names of the images.
-        where: folder of the reconstruction, for messages.
+    """Convert M `cameras` of images `names` to one lens model; `where` is their folder, for messages.
 
     Raises:
         DataError: if the camera model of an image is not supported, or cannot be combined with another's.

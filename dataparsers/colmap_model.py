@@ -127,10 +127,7 @@ def choose_model(path: Path, location: str | None, images: str = "images", quiet
 
 
 def read_model(folder: Path) -> SparseModel:
-    """Read a reconstruction, binary or text, with pycolmap.
-
-    Args:
-        folder: folder of the reconstruction.
+    """Read a reconstruction in `folder`, binary or text, with pycolmap.
 
     Raises:
         DataError: if a file is missing, damaged or contradicts another, no image has a pose, or pycolmap is not

@@ -90,11 +90,7 @@ def read_intrinsics(
 
 
 def ngp_cube(content: dict[str, Any], file: Path) -> tuple[Tensor, float] | None:
-    """Return centre (3,) float64 and edge of instant-ngp's cube, in the file's units; None without `aabb_scale`.
-
-    Args:
-        content: the file's JSON object.
-        file: the file, for messages.
+    """Return centre (3,) float64 and edge of instant-ngp's cube in `content` of `file`; None without `aabb_scale`.
 
     Raises:
         DataError: if 'aabb_scale', 'scale' or 'offset' is invalid.

@@ -75,10 +75,7 @@ def _tables(path: Path) -> list[Path]:
 
 
 def read_splits(file: Path) -> dict[str, str]:
-    """Return file name -> train or test, for the images with a pose.
-
-    Args:
-        file: the .tsv file.
+    """Return file name -> train or test, for the images of a .tsv `file` with a pose.
 
     Raises:
         DataError: if the file cannot be read, lacks a column, or has an unknown split.

@@ -22,12 +22,7 @@ MAX_PATH_LENGTH = 3000
 
 
 def read_frames(content: dict[str, Any], file: Path, image: str) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the frames that a JSON file lists, and their names in messages.
-
-    Args:
-        content: the file's object.
-        file: the file.
-        image: name of the entry that names a frame's image.
+    """Return the frames that `content` of `file` lists, named by the entry `image`, and their names in messages.
 
     Raises:
         DataError: if no frames are listed, or one is not an object.
@@ -43,11 +38,7 @@ def read_frames(content: dict[str, Any], file: Path, image: str) -> tuple[list[d
 
 
 def read_pose(frame: dict[str, Any], where: str) -> Tensor:
-    """Return the camera-to-world matrix (4, 4) float64 of a frame.
-
-    Args:
-        frame: the frame's JSON object.
-        where: name of the frame in messages.
+    """Return the camera-to-world matrix (4, 4) float64 of a JSON object `frame`, called `where` in messages.
 
     Raises:
         DataError: if the matrix is missing, of another shape, not finite or not rigid.
@@ -77,11 +68,7 @@ def rigid(matrix: Any, name: str, where: str) -> Tensor:
 
 
 def read_times(frames: list[Any], where: list[str]) -> Tensor | None:
-    """Return the times (M,) of frames in [0, 1], or None if no frame has a time.
-
-    Args:
-        frames: the frames' JSON objects.
-        where: their names in messages.
+    """Return the times (M,) in [0, 1] of JSON objects `frames`, `where` in messages; None if no frame has one.
 
     Raises:
         DataError: if only some frames have a time, or one is not a number from 0 to 1.

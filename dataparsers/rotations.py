@@ -36,11 +36,7 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
 
 
 def unit_quaternions(quaternions: Tensor, labels: Sequence[str]) -> Tensor:
-    """Return quaternions (M, 4) of length 1.
-
-    Args:
-        quaternions: (M, 4) float64.
-        labels: M names for messages.
+    """Return `quaternions` (M, 4) float64 with length 1; `labels` are their names for messages.
 
     Raises:
         DataError: if a length is not 1 up to rounding.

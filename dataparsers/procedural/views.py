@@ -240,10 +240,7 @@ def write_views(
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that is renamed to `folder` on success and removed on failure.
-
-    Args:
-        folder: folder to create. If another process creates it meanwhile, its content is kept.
+    """Yield a temporary folder, renamed to `folder` on success, if no process made it meanwhile, and else removed.
 
     Raises:
         OSError: if the folder cannot be written.

@@ -131,11 +131,7 @@ class CameraPath:
 
 
 def write_camera_path(file: Path, path: CameraPath) -> None:
-    """Write a camera path, with all that nerfstudio's viewer and ns-render read.
-
-    Args:
-        file: JSON file to write.
-        path: the path.
+    """Write a camera `path` as a JSON `file` with all that nerfstudio's viewer and ns-render read.
 
     Raises:
         OSError: if the file cannot be written; the old file is then unchanged.
@@ -189,10 +185,7 @@ def _flat(pose: Tensor) -> list[float]:
 
 
 def read_camera_path(file: Path) -> CameraPath:
-    """Read a camera path.
-
-    Args:
-        file: JSON file in the format of nerfstudio's viewer.
+    """Read a camera path from a JSON `file` in the format of nerfstudio's viewer.
 
     Raises:
         DataError: if the file cannot be read, has another format, or holds invalid cameras.
@@ -230,10 +223,7 @@ def read_camera_path(file: Path) -> CameraPath:
 
 
 def read_transforms(file: Path) -> Placement:
-    """Read the placement of a run, ours or nerfstudio's, from its dataparser_transforms.json.
-
-    Args:
-        file: the JSON file.
+    """Read the placement of a run, ours or nerfstudio's, from its dataparser_transforms.json, `file`.
 
     Raises:
         DataError: if the file cannot be read or holds no similarity.
@@ -242,11 +232,7 @@ def read_transforms(file: Path) -> Placement:
 
 
 def read_placement(content: Any, where: str) -> Placement:
-    """Return the placement that a JSON object describes by `transform` (3 x 4) and `scale`.
-
-    Args:
-        content: the object.
-        where: name of the object in messages.
+    """Return the placement of an object `content`, `where` in messages, by `transform` (3 x 4) and `scale`.
 
     Raises:
         DataError: if the content is not a similarity.

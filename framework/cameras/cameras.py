@@ -360,11 +360,7 @@ def _compiled_rays(
 
 
 def check_pose(pose: Tensor, where: str) -> None:
-    """Refuse a camera pose that is not a finite rigid motion.
-
-    Args:
-        pose: (4, 4) or (3, 4) camera-to-world matrix.
-        where: name of the pose in the message.
+    """Refuse a camera `pose`, (3, 4) or (4, 4), that is not a finite rigid motion, named `where` in the message.
 
     Raises:
         DataError: with `where` and what is wrong.

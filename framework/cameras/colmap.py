@@ -45,12 +45,7 @@ class Intrinsics(NamedTuple):
 
 
 def from_colmap(model_name: str, params: Sequence[float], width: int, height: int) -> Intrinsics:
-    """Convert one of COLMAP's cameras; an opencv camera without distortion becomes a pinhole camera.
-
-    Args:
-        model_name: COLMAP's name of the model, such as "SIMPLE_RADIAL".
-        params: its parameters in COLMAP's order.
-        width, height: size of the images, pixels.
+    """Convert COLMAP's camera `model_name` of `params`, `width`, `height`; opencv without distortion is a pinhole.
 
     Raises:
         DataError: if the model is not one of `PARAMETERS`, or its parameters are invalid.

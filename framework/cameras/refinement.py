@@ -51,10 +51,7 @@ class PoseRefinement(nn.Module):
         return rigid_motions(self.tangents[chosen], self.group == "SE3")
 
     def forward(self, rays: Rays) -> Rays:
-        """Move rays of training cameras from their given to their refined poses, with a gradient.
-
-        Args:
-            rays: R rays from the given poses.
+        """Move `rays` of training cameras from their given to their refined poses, with a gradient.
 
         Raises:
             ValueError: if the rays have no camera indices.

@@ -60,11 +60,7 @@ class Scale:
 
 
 def checked(scale: Scale, where: str) -> Scale:
-    """Return a scale whose numbers and name can be used.
-
-    Args:
-        scale: the scale.
-        where: what the scale comes from, for the message.
+    """Return a `scale` with usable numbers and name; the message says `where` it comes from.
 
     Raises:
         FlagError: if the factor is not positive and finite, or the name is not a short word.
@@ -83,10 +79,7 @@ def scale_file(path: Path) -> Path:
 
 
 def read_scale(path: Path) -> Scale:
-    """Read the scale of a run, a file of Gaussians or an octree; that of the input if none is kept.
-
-    Args:
-        path: the run's folder, or the file.
+    """Read the scale kept for `path`, a run's folder or a file; that of the input if there is none.
 
     Raises:
         DataError: if the scale cannot be read or used.
@@ -106,11 +99,7 @@ def read_scale(path: Path) -> Scale:
 
 
 def write_scale(path: Path, scale: Scale) -> None:
-    """Write the scale of a run, a file of Gaussians or an octree; remove an earlier one if it is the input's own.
-
-    Args:
-        path: the run's folder, or the file.
-        scale: the scale.
+    """Write the `scale` of `path`, a run's folder or a file; remove an earlier one if it is the input's own.
 
     Raises:
         OSError: if the scale cannot be written or removed.

@@ -27,11 +27,7 @@ PICTURES = 3
 
 
 def split_words(text: str, flag: str) -> tuple[str, ...]:
-    """Split the value of a flag into words as a shell does.
-
-    Args:
-        text: the value.
-        flag: name of the flag, for messages.
+    """Split the value `text` of a `flag` into words as a shell does.
 
     Raises:
         ConfigError: if a quote is not closed.

@@ -194,11 +194,7 @@ class Dataset:
 
 
 def existing_files(paths: Sequence[Path], split: str) -> Tensor:
-    """Return the indices of existing files, and report the number of missing files and the first one.
-
-    Args:
-        paths: files.
-        split: name of the split in messages.
+    """Return the indices of `paths` that exist, and report the number and first of the others of a `split`.
 
     Raises:
         DataError: if no file exists.

@@ -51,10 +51,7 @@ class ExrHeader:
 
 
 def read_header(content: bytes) -> ExrHeader:
-    """Read the header of a file.
-
-    Args:
-        content: the file.
+    """Read the header of a file with `content`.
 
     Raises:
         DataError: if the content is not OpenEXR, or of an unsupported kind.
@@ -76,10 +73,7 @@ def read_header(content: bytes) -> ExrHeader:
 
 
 def depth_channel(header: ExrHeader) -> str:
-    """Return the name of the depth channel: the only channel, or one with a likely name.
-
-    Args:
-        header: the file's header.
+    """Return the name of the depth channel in `header`: the only channel, or one with a likely name.
 
     Raises:
         DataError: if there are several channels and none has a likely name.
@@ -92,12 +86,7 @@ def depth_channel(header: ExrHeader) -> str:
 
 
 def read_channel(content: bytes, header: ExrHeader, name: str) -> np.ndarray:
-    """Read a channel, (H, W) float32.
-
-    Args:
-        content: the file.
-        header: its header.
-        name: the channel.
+    """Read the channel `name`, (H, W) float32, of a file with `content` and `header`.
 
     Raises:
         DataError: if a block is missing or damaged.

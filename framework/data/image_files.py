@@ -32,10 +32,7 @@ def read_heif(path: Path) -> None:
 
 
 def image_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Return width and height, in pixels, of the first readable image, from its header.
-
-    Args:
-        paths: image files.
+    """Return width and height, in pixels, of the first readable image of `paths`, from its header.
 
     Raises:
         DataError: if no file is readable.
@@ -75,11 +72,7 @@ class Content(io.BytesIO):
 
 
 def read_image(path: Path, factor: int = 1) -> np.ndarray:
-    """Read an 8-bit image as (H, W, 4) uint8 with straight alpha; an animation's first frame.
-
-    Args:
-        path: the file.
-        factor: integer reduction factor of the image.
+    """Read an 8-bit image, `path`, reduced by `factor`, as (H, W, 4) uint8, straight alpha; the first frame.
 
     Raises:
         DataError: if the image cannot be decoded, or has more than 8 bits per channel.

@@ -53,10 +53,7 @@ def write_offset(file: Path, origin: Tensor | None) -> str | None:
 
 
 def read_offset(file: Path) -> Tensor:
-    """Return the offset (3,) float64 of a file; zeros if it has no offset file.
-
-    Args:
-        file: path of the file.
+    """Return the offset (3,) float64 of a `file`; zeros if it has no offset file.
 
     Raises:
         DataError: if the offset cannot be read, or is not three finite numbers.

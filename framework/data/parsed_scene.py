@@ -119,11 +119,7 @@ class DataParser(ABC):
 
     @abstractmethod
     def parse(self, path: Path | None, split: Split) -> ParsedScene:
-        """Read one split.
-
-        Args:
-            path: the data folder, or None if the user gave none.
-            split: the split to read.
+        """Read a `split` from the data folder `path`, or None if the user gave none.
 
         Raises:
             DataError: with the file and its problem.

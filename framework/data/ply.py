@@ -70,10 +70,7 @@ class PlyHeader:
 
 
 def read_points(file: Path) -> Tensor:
-    """Read the positions of the vertices (K, 3), float64; those that are not finite are left out, and counted.
-
-    Args:
-        file: path of the PLY file.
+    """Read the vertices (K, 3) float64 of a PLY `file`; those that are not finite are left out, and counted.
 
     Raises:
         DataError: if the file cannot be read, is not a PLY file, lacks positions or is truncated.
@@ -87,10 +84,7 @@ def read_points(file: Path) -> Tensor:
 
 
 def read_header(file: Path) -> PlyHeader:
-    """Read the header of a PLY file.
-
-    Args:
-        file: path of the PLY file.
+    """Read the header of a PLY `file`.
 
     Raises:
         DataError: if the file cannot be read or is not a PLY file.
@@ -100,11 +94,7 @@ def read_header(file: Path) -> PlyHeader:
 
 
 def vertices(file: Path, header: PlyHeader) -> PlyElement:
-    """Return the vertices of a PLY file, which have positions.
-
-    Args:
-        file: path of the PLY file, for messages.
-        header: its header.
+    """Return the vertices of a PLY `file` with this `header`, which have positions.
 
     Raises:
         DataError: if there are none, or they lack positions.

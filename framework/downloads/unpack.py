@@ -31,10 +31,7 @@ Place = Callable[[tuple[str, ...]], tuple[str, ...] | None]
 
 
 def names_of(archive: Path) -> list[tuple[str, ...]]:
-    """Return the paths of all files in a zip file, split into parts.
-
-    Args:
-        archive: the zip file.
+    """Return the paths of all files in the zip file `archive`, split into parts.
 
     Raises:
         DataError: if it is damaged, has too many entries, or an entry's path is unsafe.

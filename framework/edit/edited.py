@@ -128,10 +128,7 @@ class Edited:
         return write_placed(Path(file), self.gaussians, self.look, self.scale, placement, max_megabytes, spz_version)
 
     def photographed(self, step: str) -> Loaded:
-        """Return the run or file whose photographs show the Gaussians.
-
-        Args:
-            step: name of the step that needs them, for the message.
+        """Return the run or file with photographs of the Gaussians, which the step named `step` needs.
 
         Raises:
             ConfigError: if photographs are not known.

@@ -69,10 +69,7 @@ class Step:
     """Arguments of the function after the first."""
 
     def __call__(self, edited: Edited) -> Edited:
-        """Take the step.
-
-        Args:
-            edited: Gaussians before it.
+        """Take the step from the Gaussians `edited`.
 
         Raises:
             ConfigError: if the settings do not fit the Gaussians.
@@ -134,11 +131,7 @@ def read_recipe(file: Path) -> list[Step]:
 
 
 def write_recipe(file: Path, steps: Sequence[Step]) -> None:
-    """Write a recipe that `read_recipe` reads as the same steps.
-
-    Args:
-        file: path of the YAML file.
-        steps: the steps.
+    """Write `steps` to a YAML `file` that `read_recipe` reads as the same steps.
 
     Raises:
         OSError: if the file cannot be written.

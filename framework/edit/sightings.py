@@ -41,11 +41,7 @@ class Sightings:
 
 
 def training_views(loaded: Loaded, look: Look) -> list[SplatCamera]:
-    """Return the cameras of training images, as they are drawn.
-
-    Args:
-        loaded: a run, or a file with data.
-        look: the settings of drawing.
+    """Return the cameras of training images of `loaded`, a run or a file with data, as drawn by `look`.
 
     Raises:
         ConfigError: if Gaussians cannot be drawn for such cameras.

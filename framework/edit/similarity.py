@@ -30,11 +30,7 @@ def vector(values: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
 
 
 def direction(values: Sequence[float], name: str) -> Tensor:
-    """Return a direction of unit length, (3,) float64.
-
-    Args:
-        values: the direction, of any length but 0.
-        name: name of the setting, for the message.
+    """Return the direction `values`, of any length but 0, as a unit vector (3,) float64; `name` is for the message.
 
     Raises:
         ConfigError: if the length is 0.

@@ -12,12 +12,7 @@ from nerfloom.edit.recipe import Step
 
 
 def take_steps(edited: Edited, steps: Sequence[Step], held_out: HeldOut | None = None) -> Edited:
-    """Take steps, and say what each does.
-
-    Args:
-        edited: Gaussians before the first step.
-        steps: the steps.
-        held_out: photographs that tell what a step costs; None for none.
+    """Take `steps` from `edited`, and say what each does, and costs by `held_out`, photographs or None.
 
     Raises:
         ConfigError: if a step cannot be taken, or leaves no Gaussians.

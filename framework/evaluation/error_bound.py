@@ -34,14 +34,9 @@ def parse_error(text: str) -> float:
 
 @contextmanager
 def limited_error(model: Renderable, bound: float) -> Iterator[None]:
-    """End rays at a given transmittance, within a `with` block; the rest of a ray changes a colour by at most as much.
+    """End rays of `model` at a transmittance `bound` in [0, 1), within a `with` block.
 
-    Args:
-        model: the model.
-        bound: transmittance in [0, 1).
-
-    Raises:
-        ConfigError: if the model's sampler cannot end rays early.
+    The rest of a ray changes a colour by at most as much.
     """
     samplers = parts(model, StopsEarly)
     if not samplers:

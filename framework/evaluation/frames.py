@@ -66,10 +66,7 @@ class Frames:
             yield kept
 
     def render(self, render: Callable[[int], Arrays]) -> None:
-        """Render the missing frames, and say after the second one how long the others will take.
-
-        Args:
-            render: function from a frame's index to its arrays.
+        """Render the missing frames by `render(index)`, and say after the second how long the others will take.
 
         Raises:
             ConfigError: if a frame cannot be written.
@@ -103,12 +100,7 @@ class Frames:
 
 
 def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
-    """Return the frames for a file or folder, including frames of an earlier, stopped run of the same command.
-
-    Args:
-        output: rendered file or folder.
-        count: number of frames.
-        facts: plain data; everything that the frames depend on.
+    """Return `count` frames for `output`, with those of an earlier, stopped run that had the same `facts`.
 
     Raises:
         ConfigError: if the folder of the frames cannot be written.

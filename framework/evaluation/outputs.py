@@ -27,11 +27,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def chosen_outputs(model: Renderable, names: Sequence[str]) -> list[Output]:
-    """Return the outputs of these names.
-
-    Args:
-        model: the model, which declares its own outputs.
-        names: names of the outputs.
+    """Return the outputs of these `names`, some of which `model` may declare.
 
     Raises:
         ConfigError: if the model has no output of that name.

@@ -44,10 +44,7 @@ def read_mesh(file: Path) -> Surface:
 
 
 def read_points(file: Path) -> Surface:
-    """Read points on a surface, with normals if the file has nx, ny and nz. Unusable points are left out and counted.
-
-    Args:
-        file: path of a PLY file; its faces, if any, are ignored.
+    """Read points, with normals if given, from a PLY `file`. Unusable points are left out and counted.
 
     Raises:
         DataError: if the file cannot be read or has no points.

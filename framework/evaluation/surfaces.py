@@ -99,11 +99,7 @@ class Samples:
 
 
 def usable(surface: Surface, name: str) -> tuple[Surface, list[str]]:
-    """Return a surface without unusable parts, and notes on them: coordinates that are not finite, faces without area.
-
-    Args:
-        surface: vertices, faces and normals as read from a file.
-        name: the surface's name in messages.
+    """Return `surface`, `name` in messages, without infinite coordinates and faces without area, and notes on them.
 
     Raises:
         DataError: if nothing is left.

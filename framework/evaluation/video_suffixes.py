@@ -19,10 +19,7 @@ def default_video(stem: str) -> Path:
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse, before rendering, an output file that cannot be written.
-
-    Args:
-        path: file; a path without suffix is a folder.
+    """Refuse, before rendering, a file `path` that cannot be written; without suffix it is a folder.
 
     Raises:
         ConfigError: for an unknown suffix, or for MP4 if ffmpeg is not installed.

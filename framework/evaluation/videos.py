@@ -110,11 +110,7 @@ def _units(frames: int, fps: float, unit: int) -> int:
 
 
 def write_strip(path: Path, pictures: Iterable[np.ndarray]) -> None:
-    """Write pictures side by side to one PNG file.
-
-    Args:
-        path: file to write.
-        pictures: (H, W, 3) uint8 pictures of one height.
+    """Write `pictures`, (H, W, 3) uint8 of one height, side by side to a PNG file `path`.
 
     Raises:
         ConfigError: if the file cannot be written.
@@ -123,11 +119,7 @@ def write_strip(path: Path, pictures: Iterable[np.ndarray]) -> None:
 
 
 def write_images(paths: Iterable[Path], pictures: Iterable[np.ndarray]) -> None:
-    """Write each picture to its own file; missing folders are created.
-
-    Args:
-        paths: files to write, with the suffix .png or .jpg.
-        pictures: (H, W, 3) uint8 pictures.
+    """Write each of `pictures`, (H, W, 3) uint8, to its own .png or .jpg of `paths`; folders are created.
 
     Raises:
         ConfigError: if a file cannot be written.

@@ -69,10 +69,7 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
 
 
 def check_scale(loaded: Loaded) -> None:
-    """Refuse a run whose scene has no scale.
-
-    Args:
-        loaded: what is exported.
+    """Refuse a run `loaded` with a scene that has no scale.
 
     Raises:
         ConfigError: if it is in normalised device coordinates.

@@ -21,12 +21,7 @@ from nerfloom.training.loaded import Loaded
 
 
 def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings) -> None:
-    """Write a mesh of a level of the density, or of where a signed distance is zero, in the frame of the input.
-
-    Args:
-        loaded: what is exported.
-        path: file to write, .ply, .obj or .glb.
-        settings: settings of the mesh.
+    """Write a mesh of a level of density, or of distance zero, of `loaded` to `path` by `settings`.
 
     Raises:
         ConfigError: if a setting is out of range, the method has no density, or there is no surface.
@@ -54,12 +49,7 @@ def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings
 
 
 def export_fused(loaded: Loaded, path: Path, settings: TsdfSettings) -> None:
-    """Write a mesh of fused depth images, in the frame of the input.
-
-    Args:
-        loaded: what is exported.
-        path: file to write, .ply, .obj or .glb.
-        settings: settings of the mesh.
+    """Write a mesh of fused depth images of `loaded`, in the frame of the input, to `path` by `settings`.
 
     Raises:
         ConfigError: if a setting is out of range, or there is no surface.

@@ -15,12 +15,7 @@ from nerfloom.training.loaded import Loaded
 
 
 def export_occupancy(loaded: Loaded, path: Path, settings: OccupancySettings) -> None:
-    """Write the occupancy grid of a run, and beside it the occupied cells as a PLY file.
-
-    Args:
-        loaded: the run.
-        path: file of the grid to write, .npz.
-        settings: settings of the cells.
+    """Write the occupancy grid of `loaded` to `path`, .npz, and its cells as PLY beside it, by `settings`.
 
     Raises:
         ConfigError: if the run has no grid, no cell is occupied, or packages are missing.

@@ -158,11 +158,7 @@ def _write_picture(path: Path, gaussians: Gaussians, camera: SplatCamera, backgr
 
 
 def start_of(names: Sequence[str], wanted: str | None) -> int:
-    """Return the number of the camera from which a page starts.
-
-    Args:
-        names: names of the cameras' images, in the page's order.
-        wanted: name of one, with or without folder and extension; None for the first.
+    """Return the number of the camera `wanted` in `names`, with or without folder and ending; 0 for None.
 
     Raises:
         ConfigError: if no camera or several have the name.
@@ -274,11 +270,7 @@ def closeness(
 
 
 def moment_of(moving: bool, asked: float | None) -> float | None:
-    """Return the time that an export shows; None of a static scene.
-
-    Args:
-        moving: whether the photographs have times.
-        asked: the time that was asked for.
+    """Return the time `asked` for, of photographs that have times if `moving`; None of a static scene.
 
     Raises:
         ConfigError: if a static scene was asked for a time.

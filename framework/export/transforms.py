@@ -24,12 +24,7 @@ POINTS = "sparse_pc.ply"
 
 
 def write_transforms(file: Path, posed: PosedFiles, relative: bool) -> None:
-    """Write transforms.json, and the sparse points beside it, in a folder that is created.
-
-    Args:
-        file: path of the JSON file.
-        posed: the images.
-        relative: as in `transforms`.
+    """Write the images `posed` to transforms.json, `file`, and points beside it; `relative` as in `transforms`.
 
     Raises:
         ConfigError: as `transforms`.

@@ -98,10 +98,7 @@ def upright(cameras: Cameras) -> Tensor:
 
 
 def pinhole(cameras: Cameras) -> Cameras:
-    """Return pinhole cameras in the same places, which see about as much.
-
-    Args:
-        cameras: M cameras of any model with a centre of projection.
+    """Return pinhole cameras in the places of M `cameras` with a centre of projection, which see about as much.
 
     Raises:
         ConfigError: if they have none.
@@ -177,10 +174,7 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
 
 
 def check_size(max_megabytes: float) -> None:
-    """Check the limit of a page's size.
-
-    Args:
-        max_megabytes: the limit, in millions of bytes.
+    """Check the limit of a page's size, `max_megabytes`, in millions of bytes.
 
     Raises:
         ConfigError: if it is not positive, or above MAX_MEGABYTES.
@@ -230,10 +224,7 @@ def preview_tags(facts: PageFacts) -> str:
 
 
 def payload_of(text: str) -> bytes:
-    """Return the SPZ file in a page.
-
-    Args:
-        text: content of the page.
+    """Return the SPZ file in a page with the content `text`.
 
     Raises:
         DataError: if there is none.
@@ -246,10 +237,7 @@ def payload_of(text: str) -> bytes:
 
 
 def gaussians_of(text: str) -> Gaussians:
-    """Return the Gaussians in a page, as they are drawn there.
-
-    Args:
-        text: content of the page.
+    """Return the Gaussians in a page with the content `text`, as they are drawn there.
 
     Raises:
         DataError: if there are none, or they are damaged.

@@ -112,10 +112,7 @@ KINDS: dict[str, type[Box] | type[Sphere]] = {"box": Box, "sphere": Sphere}
 
 
 def read_region(file: Path) -> Region:
-    """Read a region.
-
-    Args:
-        file: path of the file, YAML or JSON.
+    """Read a region from a `file`, YAML or JSON.
 
     Raises:
         ConfigError: if the file cannot be read, or holds no region.
@@ -130,11 +127,7 @@ def read_region(file: Path) -> Region:
 
 
 def write_region(file: Path, region: Region) -> None:
-    """Write a region that `read_region` reads as the same one.
-
-    Args:
-        file: path of the YAML file.
-        region: a box or a sphere.
+    """Write a `region` to a YAML `file` that `read_region` reads as the same one.
 
     Raises:
         OSError: if the file cannot be written.

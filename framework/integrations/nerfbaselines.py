@@ -252,11 +252,7 @@ class Saved:
 
     @classmethod
     def read(cls, folder: Path, method: str) -> Saved:
-        """Read a checkpoint.
-
-        Args:
-            folder: folder of the checkpoint.
-            method: name of the method.
+        """Read the checkpoint of a `method` in `folder`.
 
         Raises:
             CheckpointError: if a file is missing or damaged, or the checkpoint is another method's.

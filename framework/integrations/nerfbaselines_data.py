@@ -160,11 +160,7 @@ class Frame:
 
     @classmethod
     def of(cls, images: ArrayImages, flags: FrameFlags) -> Frame:
-        """Return a box for an object cut out by alpha, and for other data the unbounded frame of `ns-train`.
-
-        Args:
-            images: the images.
-            flags: the user's settings.
+        """Return a box for `images` of an object cut out by alpha, by `flags`, else `ns-train`'s unbounded frame.
 
         Raises:
             DataError: if the size of the box cannot be determined.
@@ -212,12 +208,7 @@ def _unbounded_frame(images: ArrayImages) -> Frame:
 
 
 def dataset_of(images: ArrayImages, frame: Frame, masks: Masks) -> Dataset:
-    """Construct a data set in the scene's frame.
-
-    Args:
-        images: the images.
-        frame: their frame.
-        masks: meaning of masked-out pixels.
+    """Construct a data set of `images` in the scene's `frame`; `masks` says what masked-out pixels mean.
 
     Raises:
         DataError: if no pixel has a ray.

@@ -82,11 +82,7 @@ def _environment(job: Job) -> dict[str, str]:
 
 
 def places_for(jobs: Sequence[Job], at_once: int) -> list[dict[str, str]]:
-    """Return the environment variables that give each of several simultaneous jobs its part of this machine.
-
-    Args:
-        jobs: the jobs.
-        at_once: number of simultaneous jobs.
+    """Return the environment variables that give each of `at_once` simultaneous `jobs` its part of this machine.
 
     Raises:
         ConfigError: if the machine has too few GPUs, or too few cores.

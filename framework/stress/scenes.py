@@ -123,11 +123,7 @@ def photograph(cameras: Cameras) -> Tensor:
 
 
 def data_views(parser: DataParser, data: Path | None) -> Views:
-    """Return a few images of a data set, evenly spaced in each split and reduced.
-
-    Args:
-        parser: the data format, with its flags.
-        data: folder of the data set; None for the embedded scene.
+    """Return a few images of `data`, or the embedded scene, by `parser`, evenly spaced in each split and reduced.
 
     Raises:
         DataError: if a split cannot be read.

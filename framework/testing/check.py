@@ -86,11 +86,7 @@ def _finding(check: Check, subject: MethodUnderTest) -> Finding:
 
 
 def assert_method(method: Method, name: str = "the method", config: TrainConfig | None = None) -> None:
-    """Check a method in a test.
-
-    Args:
-        name: the method's name in messages.
-        config: settings for the check; the method's defaults if None.
+    """Check a method, called `name` in messages, with `config` or its defaults, in a test.
 
     Raises:
         AssertionError: if a check fails; the message has a line for each failed check.

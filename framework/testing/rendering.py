@@ -55,12 +55,7 @@ def check_render(subject: MethodUnderTest) -> str:
 
 
 def require_rendered(rendered: Rendered, count: int, when: str) -> None:
-    """Check the shapes and values of rendered rays.
-
-    Args:
-        rendered: the rendered rays.
-        count: number of rays.
-        when: start of the message, such as "in training".
+    """Check the shapes and values of `count` rays `rendered`; the message begins with `when`.
 
     Raises:
         Fault: if a field has another shape or type, or a value is not finite or out of range.

@@ -66,10 +66,7 @@ class PathSettings(FileSettings, ViewSettings):
     """Whether a PNG file shows the frames side by side; if not, it is an animation."""
 
     def check(self, output: Path) -> None:
-        """Refuse settings that contradict each other or are out of range.
-
-        Args:
-            output: file or folder to write.
+        """Refuse settings that contradict each other, or `output`, or are out of range.
 
         Raises:
             FlagError: with what is wrong.

@@ -67,11 +67,7 @@ class Views:
 
 
 def background_of(settings: PathSettings, loaded: Loaded) -> Tensor:
-    """Return the colour (3,) behind the scene, on the model's device.
-
-    Args:
-        settings: settings of the path.
-        loaded: what is rendered.
+    """Return the colour (3,) behind the scene of `loaded` by `settings`, on the model's device.
 
     Raises:
         ConfigError: if the settings name no colour.
@@ -81,11 +77,7 @@ def background_of(settings: PathSettings, loaded: Loaded) -> Tensor:
 
 
 def camera_path_views(settings: CameraPathSettings, loaded: Loaded) -> Views:
-    """Return the views of a camera path file; this needs no data.
-
-    Args:
-        settings: settings of the path.
-        loaded: what is rendered.
+    """Return the views of a camera path file, by `settings`, for `loaded`; this needs no data.
 
     Raises:
         DataError: if the file cannot be read.
@@ -200,11 +192,7 @@ def in_scene(length: float | None, loaded: Loaded) -> float | None:
 
 
 def dataset_views(settings: DatasetSettings, loaded: Loaded) -> Views:
-    """Return the views of a split, with their true images.
-
-    Args:
-        settings: settings of the path.
-        loaded: what is rendered.
+    """Return the views of the split of `loaded` that `settings` name, with their true images.
 
     Raises:
         DataError: if the data cannot be read.

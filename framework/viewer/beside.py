@@ -21,11 +21,7 @@ COLOR = (255, 190, 0)
 
 
 def check_beside(loaded: Loaded, second: Loaded) -> None:
-    """Check that two runs can be shown side by side.
-
-    Args:
-        loaded: the first run or file.
-        second: the second run or file.
+    """Check that two runs or files, `loaded` and `second`, can be shown side by side.
 
     Raises:
         ConfigError: if one of them is in normalised device coordinates, where no similarity relates two frames.

@@ -32,11 +32,7 @@ def check_installed() -> None:
 
 
 def free_port(host: str, port: int) -> int:
-    """Return the first free port, starting at a given one.
-
-    Args:
-        host: name or address of a network interface of this machine.
-        port: first port to try.
+    """Return the first free port of `host`, an interface of this machine, from `port` on.
 
     Raises:
         ConfigError: if the host is not a local address, or no port is free.
@@ -61,12 +57,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def open_server(host: str, port: int, label: str) -> viser.ViserServer:
-    """Start the server and report its address.
-
-    Args:
-        host: interface to listen on.
-        port: port to listen on; the next free one if it is taken.
-        label: title of the page's panel.
+    """Start the server on `host` at `port`, or the next free one, with a panel `label`, and report its address.
 
     Raises:
         ConfigError: if viser is missing, or the address cannot be used.

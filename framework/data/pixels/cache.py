@@ -93,11 +93,7 @@ def unpack(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def temporary_store(path: Path, size: int) -> FileStore:
-    """Create a file beside `path`, after removing leftovers of killed processes.
-
-    Args:
-        path: final path of the file.
-        size: size in bytes.
+    """Create a file of `size` bytes beside its final `path`, after removing leftovers of killed processes.
 
     Raises:
         DataError: if the disk lacks space.

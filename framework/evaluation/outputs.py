@@ -27,7 +27,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def chosen_outputs(model: Renderable, names: Sequence[str]) -> list[Output]:
-    """Return the outputs of these `names`, some of which `model` may declare.
+    """Return the outputs of these `names`; `model` declares its own.
 
     Raises:
         ConfigError: if the model has no output of that name.

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.json_files import write_json
 from nerfloom.comparison.measures import read_json
-from nerfloom.training.run import write_json
 
 
 def read_rows(file: Path) -> dict[str, Any]:

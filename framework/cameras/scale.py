@@ -7,16 +7,14 @@ unit and the scale in NAME.scale.json. Without such a file, lengths are in the i
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 
-from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, FlagError, shown
-from nerfloom.base.json_files import read_object
+from nerfloom.base.json_files import read_object, write_json
 from nerfloom.cameras.poses import Placement
 
 NAME = "scale.json"
@@ -108,5 +106,4 @@ def write_scale(path: Path, scale: Scale) -> None:
     if not scale.is_known:
         file.unlink(missing_ok=True)
         return
-    text = json.dumps(asdict(scale), indent=2, allow_nan=False) + "\n"
-    write_atomically(file, lambda stream: stream.write(text.encode()))
+    write_json(file, asdict(scale))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.base.console import say
+from nerfloom.base.json_files import write_json
 from nerfloom.cli.common import chosen_kind
 from nerfloom.cli.flags import read_flags
 from nerfloom.training.run_path import check_data
@@ -39,8 +40,6 @@ def run_benchmark(
 
 def write_results(path: Path, content: dict[str, Any]) -> None:
     """Write plain data `content` as JSON to `path`, in a folder that is created if missing, and print the path."""
-    from nerfloom.training.run import write_json
-
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, content)
     say(f"written to {path}")

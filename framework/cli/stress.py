@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
+from nerfloom.base.json_files import write_json
 from nerfloom.cli.common import make_room, run_command
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
@@ -179,8 +180,6 @@ def _data_name(flags: StressFlags) -> str:
 
 def _write(path: Path, flags: StressFlags, conditions: Sequence[Condition], results: Sequence[Result]) -> None:
     """Write the flags, the conditions and the outcomes so far."""
-    from nerfloom.training.run import write_json
-
     content = {
         "data": _data_name(flags),
         "data_flags": flags.data_flags,

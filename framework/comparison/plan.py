@@ -13,8 +13,8 @@ from typing import Any
 
 from nerfloom.base.child import python_command
 from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.base.json_files import write_json
 from nerfloom.registry import entry_of
-from nerfloom.training.run import write_json
 
 FIRST_SEED = 42
 """Seed of the first run of each contender; further runs have the following seeds."""

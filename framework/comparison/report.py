@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 from rich.table import Table
 
 from nerfloom.base.atomic import write_atomically
+from nerfloom.base.json_files import write_json
 from nerfloom.comparison import plots
 from nerfloom.comparison.crops import views
 from nerfloom.comparison.measures import TIME_TOLERANCE, Measured, Row, pareto
@@ -99,7 +99,7 @@ def write_report(plan: Plan, rows: Sequence[Row], sharing: str | None = None) ->
         "failures": {row.label: list(row.failures) for row in rows if row.failures},
         "runs": [run.as_plain() for run in runs],
     }
-    _write(plan.folder / "results.json", json.dumps(plain, indent=2, allow_nan=False) + "\n")
+    write_json(plan.folder / "results.json", plain)
     return plan.folder / "report.html"
 
 

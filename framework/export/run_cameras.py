@@ -7,13 +7,13 @@ from pathlib import Path
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.json_files import write_json
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.export.cameras import SPLITS, camera_list, posed_files
 from nerfloom.export.colmap_text import images_folder, write_model
 from nerfloom.export.settings import CameraSettings
 from nerfloom.export.transforms import write_transforms
 from nerfloom.training.loaded import Loaded
-from nerfloom.training.run import write_json
 
 
 def export_cameras(loaded: Loaded, path: Path, settings: CameraSettings) -> None:

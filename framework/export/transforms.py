@@ -9,9 +9,9 @@ from typing import Any
 
 import torch
 
+from nerfloom.base.json_files import write_json
 from nerfloom.data.ply import write_points
 from nerfloom.export.cameras import SPLITS, PosedFiles, coefficients, rational
-from nerfloom.training.run import write_json
 
 OPENCV = {"k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2", "k3": "k3", "k4": "k7"}
 """Coefficient of the file -> coefficient of `LENSES["opencv"]`; the file's k4 is the r^8 term."""

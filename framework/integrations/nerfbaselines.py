@@ -23,6 +23,7 @@ from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import CheckpointError, ConfigError
+from nerfloom.base.json_files import write_json
 from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.cameras.view import View
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
@@ -40,7 +41,6 @@ from nerfloom.integrations.nerfbaselines_settings import flattened, parse_overri
 from nerfloom.registry import load_method
 from nerfloom.renderable import refined_cameras
 from nerfloom.training.checkpoint import FOLDER, load_newest
-from nerfloom.training.run import write_json
 from nerfloom.training.trained import restored_model
 from nerfloom.training.trainer import Trainer
 

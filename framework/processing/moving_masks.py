@@ -9,11 +9,10 @@ from PIL import Image
 
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
-from nerfloom.base.json_files import read_object
+from nerfloom.base.json_files import read_object, write_json
 from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.pixels.device_placement import on_device
-from nerfloom.processing import transforms
 from nerfloom.processing.images import save
 from nerfloom.processing.output import FINISHED
 from nerfloom.processing.pyramid import write_pyramid
@@ -76,5 +75,5 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
         names.append(f"{name}.png")
         share += float(1 - counting.mean()) / len(parsed.image_paths)
     write_pyramid(output / "masks", names, num_downscales, masks=True)
-    transforms.write(output / FINISHED, content)
+    write_json(output / FINISHED, content)
     say(f"masks leave out {share:.1%} of all pixels; look at {output / 'masks'} before you train with them")

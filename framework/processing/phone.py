@@ -10,12 +10,13 @@ import numpy as np
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.json_files import write_json
 from nerfloom.processing.capture import resized
 from nerfloom.processing.finite_numbers import finite, side
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
-from nerfloom.processing.transforms import Frame, Lens, content, write
+from nerfloom.processing.transforms import Frame, Lens, content
 
 
 def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
@@ -75,7 +76,7 @@ def write_folder(
         frames.append(Frame(image.name, pose, cropped(lens, crop), source=image.source))
     write_pyramid(output / "images", [image.name for image in prepared], num_downscales)
     more = {"orientation_override": "none"} if z_is_up else {}
-    write(output / FINISHED, content(frames, applied, None, more))
+    write_json(output / FINISHED, content(frames, applied, None, more))
     say(f"{len(frames)} images with the phone's poses")
     say(ready(output))
 

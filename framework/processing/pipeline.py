@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.json_files import write_json
 from nerfloom.processing import colmap, contrast, database, features, mapping, matching, transforms
 from nerfloom.processing.images import PreparedImage, prepare_all, write_masks
 from nerfloom.processing.output import FINISHED, ready
@@ -79,7 +80,7 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
     )
     _keep(work, output / "colmap", final)
     (output / "colmap" / "summary.json").write_text(json.dumps(summary.as_json(), indent=2))
-    transforms.write(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
+    write_json(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
     if flags.mask_moving:
         _mask_moving(state)
     for line in lines(summary):

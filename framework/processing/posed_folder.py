@@ -13,12 +13,13 @@ from PIL import Image
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.json_files import write_json
 from nerfloom.processing.capture import Capture, PosedCamera
 from nerfloom.processing.images import PreparedImage, in_parallel, output_names, prepare_all, save
 from nerfloom.processing.named_images import PlacedImages, reasons
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
-from nerfloom.processing.transforms import Frame, Lens, content, transformed, write, write_points
+from nerfloom.processing.transforms import Frame, Lens, content, transformed, write_points
 from nerfloom.processing.views import View, Views, cut, view_lens
 
 POINTS = "sparse_pc.ply"
@@ -81,7 +82,7 @@ def write_capture(
     write_pyramid(output / "masks", masks, num_downscales if masks else 0, masks=True)
     more = {"orientation_override": "none"} if capture.z_is_up else {}
     name = None if capture.points is None else POINTS
-    write(output / FINISHED, content(frames, capture.frame, name, more))
+    write_json(output / FINISHED, content(frames, capture.frame, name, more))
     say(ready(output))
 
 

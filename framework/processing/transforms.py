@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,19 +131,6 @@ def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: 
             entry["colmap_im_id"] = frame.image_id
         top["frames"].append(entry)
     return top
-
-
-def write(path: Path, value: dict[str, Any]) -> None:
-    """Write JSON atomically: a killed process leaves a complete file or none.
-
-    Args:
-        path: the file.
-        value: its content.
-    """
-    from nerfloom.base.atomic import write_atomically
-
-    text = json.dumps(value, indent=2, allow_nan=False)
-    write_atomically(path, lambda file: file.write(text.encode()))
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:

@@ -22,13 +22,13 @@ from torch import Tensor
 from nerfloom.base.child import python_command
 from nerfloom.base.device import num_gpus
 from nerfloom.base.errors import ConfigError, DataError
-from nerfloom.base.json_files import read_json, read_object
+from nerfloom.base.json_files import read_json, read_object, write_json
 from nerfloom.blocks.block import Block, TrainedBlock
 from nerfloom.cameras.ndc import NdcCameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.jobs.job import Job, Resources, Step
-from nerfloom.training.run import TRANSFORMS, Run, write_json
+from nerfloom.training.run import TRANSFORMS, Run
 from nerfloom.training.run_path import CONFIG
 
 PLAN = "plan.json"

@@ -16,11 +16,11 @@ from statistics import fmean
 from typing import Any, TypeAlias
 
 from nerfloom.base.device import runs_ahead
+from nerfloom.base.json_files import finite_or_null
 from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.evaluator import Measured, measure_view, spread, views_to_judge
 from nerfloom.renderable import Renderable, with_refined_poses
 from nerfloom.training.progress import StepReport
-from nerfloom.training.run import finite_or_null
 
 MAX_IMAGES = 3
 """Maximum number of images that are evaluated between evaluations of all images."""

@@ -9,11 +9,12 @@ import torch
 
 from nerfloom.base.device import peak_memory
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.json_files import finite_or_null, write_json
 from nerfloom.evaluation.evaluator import Evaluation
 from nerfloom.ray_model import RayModel
 from nerfloom.training.machine import kernels, machine
 from nerfloom.training.outcome import Outcome
-from nerfloom.training.run import Run, finite_or_null, write_json, write_report
+from nerfloom.training.run import Run, write_report
 from nerfloom.training.trainer import Trainer
 
 SUMMARY = "summary.json"

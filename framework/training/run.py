@@ -16,8 +16,6 @@ outputs/{experiment}/{method}/{YYYY-mm-dd_HHMMSS}/
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 import os
 import shlex
 from dataclasses import dataclass
@@ -31,6 +29,7 @@ from nerfloom.base.atomic import write_atomically
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.json_files import write_json
 from nerfloom.base.plain import from_plain, read_yaml, to_plain
 from nerfloom.base.splits import Split
 from nerfloom.base.step_limit import limited_as_given
@@ -182,25 +181,6 @@ def read_run(path: Path) -> Run:
     name = str(name)
     parser = from_plain(load_dataparser(name)(), data_flags, f"{path}: dataparser")
     return Run(method, config, name, parser, path.parent)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write finite plain `content` as indented JSON to `path`, atomically.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    write_atomically(path, lambda file: file.write(text.encode()))
-
-
-def finite_or_null(content: Any) -> Any:
-    """Return plain `content` with None for each non-finite number, since JSON has none."""
-    if isinstance(content, dict):
-        return {name: finite_or_null(value) for name, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [finite_or_null(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def write_report(path: Path, content: Any) -> None:

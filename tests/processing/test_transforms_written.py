@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 
 from nerfloom.base.errors import DataError
+from nerfloom.base.json_files import write_json
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.processing import transforms
 from nerfloom.processing.output import check_apart, claim
@@ -29,7 +30,7 @@ def test_points_are_seen_where_colmap_sees_them(tmp_path: Path) -> None:
         Image.new("RGB", (64, 48)).save(tmp_path / "images" / name)
         pose = transforms.transformed(transforms.opengl_pose(world_to_camera(index)), transforms.Z_UP)
         frames.append(transforms.Frame(name, pose, lens))
-    transforms.write(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
+    write_json(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
     scene = Nerfstudio(eval_interval=0).parse(tmp_path, "train")
     assert scene.transform is not None
     draws = np.random.default_rng(9)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from nerfloom import ParsedScene
+from nerfloom.base.json_files import write_json
 from nerfloom.dataparsers.colmap import Colmap
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.processing import transforms
@@ -77,7 +78,7 @@ def test_colmaps_cameras_as_they_are_written_and_read(model: str, tmp_path: Path
         )
         for index, name in enumerate(NAMES)
     ]
-    transforms.write(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
+    write_json(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
     write_photographs(tmp_path / "images", NAMES)
     assert_rays_are_the_lens(Nerfstudio(eval_mode="all").parse(tmp_path, "train"), lens)
 

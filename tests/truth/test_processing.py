@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from nerfloom.base.json_files import write_json
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
@@ -190,7 +191,7 @@ def test_a_lens_of_each_photograph(tmp_path: Path) -> None:
         world_to_camera = np.concatenate([model.rotations[index], model.translations[index][:, None]], 1)
         pose = transforms.transformed(transforms.opengl_pose(world_to_camera), transforms.Z_UP)
         frames.append(transforms.Frame(name, pose, written))
-    transforms.write(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
+    write_json(tmp_path / "transforms.json", transforms.content(frames, transforms.Z_UP, None, {}))
     assert_pixels_show_the_ball(EVERY.parse(tmp_path, "train"), None)
 
 

@@ -15,19 +15,21 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks.children import own_command
 from nerfloom.base.console import say
 from nerfloom.base.errors import FlagError, NerfloomError
-from nerfloom.benchmarks.workload import default_run, endless_trainer
+from nerfloom.benchmarks.workload import endless_trainer
 from nerfloom.data.dataset import Dataset
 from nerfloom.kernels import native
+from nerfloom.registry import load_dataparser, load_method
 from nerfloom.training.data_folder import find_data
 from nerfloom.training.datasets import load_split
 from nerfloom.training.machine import machine
+from nerfloom.training.run import Run
 from nerfloom.training.trainer import Trainer
 
 LOOP = "import time\nend = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
@@ -199,7 +201,9 @@ def child(work: str, data: Path, seconds: float) -> dict[str, float]:
         Steps or images per second, and the seconds of the first, the longest and the median one.
     """
     with tempfile.TemporaryDirectory() as folder:
-        run = default_run("instant-ngp", data)
+        root, name = find_data(data)
+        config = replace(load_method("instant-ngp").config, data=root)
+        run = Run("instant-ngp", config, name, load_dataparser(name)(), Path())
         trainer = endless_trainer(run, SETTINGS_FOR, Path(folder))
         views = load_split(run, "test") if work == "rendering" else None
         once = rendering(trainer, views) if views is not None else lambda _: trainer.train_step()

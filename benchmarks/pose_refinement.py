@@ -18,12 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.pose_errors import pose_errors
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.evaluation.evaluator import evaluate
-from nerfloom.geometry.alignment import align_cameras, pose_errors
+from nerfloom.geometry.alignment import align_cameras
 from nerfloom.kernels.math import cross_matrix
 from nerfloom.methods._captures import ProposedConfig
 from nerfloom.registry import load_dataparser, load_method

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.pose_errors import pose_errors
 from nerfloom.base.errors import DataError
-from nerfloom.geometry.alignment import pose_errors
 from nerfloom.processing.colmap import read_model
 from nerfloom.processing.transforms import opengl_pose
 

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
+from benchmarks.pose_errors import pose_errors
 from nerfloom.base.errors import DataError
-from nerfloom.geometry.alignment import align, align_cameras, pose_errors
+from nerfloom.geometry.alignment import align, align_cameras
 
 
 def some_poses(count: int) -> torch.Tensor:

@@ -6,26 +6,10 @@ import dataclasses
 from pathlib import Path
 
 from nerfloom.base.device import choose_device
-from nerfloom.registry import load_dataparser, load_method
-from nerfloom.training.data_folder import find_data
+from nerfloom.registry import load_method
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run, create_folder
 from nerfloom.training.trainer import Trainer
-
-
-def default_run(method: str, data: Path) -> Run:
-    """Return a run of a method with its default settings.
-
-    Args:
-        method: name of the method.
-        data: folder of the data set; its format is detected.
-
-    Raises:
-        DataError: if no format recognises the data.
-    """
-    data_folder, name = find_data(data)
-    config = dataclasses.replace(load_method(method).config, data=data_folder)
-    return Run(method, config, name, load_dataparser(name)(), Path())
 
 
 def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:

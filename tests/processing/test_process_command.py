@@ -8,8 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
+from benchmarks.pose_errors import pose_errors
 from nerfloom.cli.process_data import main
-from nerfloom.geometry.alignment import pose_errors
 from nerfloom.processing.record3d import convert
 from tests.conftest import Refused
 from tests.processing.scene import write_corner

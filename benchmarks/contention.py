@@ -22,7 +22,7 @@ from typing import Any
 from benchmarks.children import own_command
 from nerfloom.base.console import say
 from nerfloom.base.errors import FlagError, NerfloomError
-from nerfloom.benchmarks.workload import endless_trainer
+from nerfloom.benchmarks.profile_step import endless_trainer
 from nerfloom.data.dataset import Dataset
 from nerfloom.kernels import native
 from nerfloom.registry import load_dataparser, load_method

@@ -75,17 +75,7 @@ def conditions(data: str | None, flags: tuple[str, ...], seconds: float, views: 
         seconds: seconds of training.
         views: maximum number of held-out views to evaluate; None for all.
     """
-    return Conditions(
-        data=data,
-        data_flags=flags,
-        max_seconds=seconds,
-        max_num_iterations=None,
-        target_psnr=None,
-        num_threads=None,
-        device_type="auto",
-        curve_images=0,
-        max_eval_images=views,
-    )
+    return Conditions(data, flags, seconds, curve_images=0, max_eval_images=views)
 
 
 def run(plan: Plan) -> Budget:

@@ -226,17 +226,8 @@ def _timed(
 
 def gpu_plan(data: Path | None, seconds: float, folder: Path) -> Plan:
     """Return the plan of `seconds` of training per method, on `data` or the embedded scene, into `folder`."""
-    conditions = Conditions(
-        data=None if data is None else str(data.resolve()),
-        data_flags=(),
-        max_seconds=seconds,
-        max_num_iterations=None,
-        target_psnr=None,
-        num_threads=None,
-        device_type="cuda",
-        curve_images=4,
-        max_eval_images=20,
-    )
+    path = None if data is None else str(data.resolve())
+    conditions = Conditions(path, max_seconds=seconds, device_type="cuda", max_eval_images=20)
     return Plan(tuple(map(Contender.of, METHODS)), conditions, 1, folder.resolve())
 
 

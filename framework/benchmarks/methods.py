@@ -31,17 +31,7 @@ def standard_plan(data: Path | None, max_seconds: float, repeats: int, folder: P
         repeats: number of runs of each method, with different seeds.
         folder: folder of runs and report.
     """
-    conditions = Conditions(
-        data=None if data is None else str(data.resolve()),
-        data_flags=(),
-        max_seconds=max_seconds,
-        max_num_iterations=None,
-        target_psnr=None,
-        num_threads=None,
-        device_type="auto",
-        curve_images=4,
-        max_eval_images=None,
-    )
+    conditions = Conditions(None if data is None else str(data.resolve()), max_seconds=max_seconds)
     return Plan(tuple(map(Contender.of, STANDARD)), conditions, repeats, folder.resolve())
 
 

@@ -6,17 +6,20 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from nerfloom.base.console import say
-from nerfloom.base.device import wait_for
-from nerfloom.benchmarks.workload import endless_trainer
+from nerfloom.base.device import choose_device, wait_for
 from nerfloom.kernels import native
+from nerfloom.registry import load_method
+from nerfloom.training.datasets import load_split
 from nerfloom.training.machine import kernels, machine
-from nerfloom.training.run import Run
+from nerfloom.training.run import Run, create_folder
+from nerfloom.training.trainer import Trainer
 
 MAX_PRINTED, MAX_NAME_LENGTH = 25, 90
 """Number of GPU kernels that are printed, and length of their names."""
@@ -87,3 +90,24 @@ def gpu_kernels(train_step: Callable[[], object], steps: int) -> dict[str, float
         if event.device_type.name == "CUDA":
             spent[event.name[:MAX_NAME_LENGTH]] += event.self_device_time_total / 1e3 / steps
     return dict(spent)
+
+
+def endless_trainer(run: Run, seconds: float, folder: Path) -> Trainer:
+    """Return a trainer with the settings for a time budget, but without the budget itself.
+
+    With a budget, the learning rate would fall over time, and a run that reaches its end would not be typical.
+
+    Args:
+        run: the run to train; its own budget and folder are not used.
+        seconds: time budget, seconds, for the method's choice of settings.
+        folder: parent of the run's folder.
+    """
+    config = replace(run.config, vis="none", max_seconds=seconds)
+    run = replace(run, config=config, folder=folder / "run")
+    train_set = load_split(run, "train").to(choose_device(run.config.machine))
+    config, _ = load_method(run.method).decided(config, train_set.scene)
+    run = replace(run, config=replace(config, max_seconds=None))
+    create_folder(run)
+    trainer = Trainer.of(run, train_set)
+    trainer.prepare()
+    return trainer

@@ -125,6 +125,8 @@ def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
         read_json(planned.folder / "scene_profile.json") or {},
         read_json(planned.folder / "skip_report.json") or [],
     )
+    # As a user would train the same, without the comparison's folders.
+    flags = [*planned.contender.flags, *conditions.data_flags, "--machine.seed", str(planned.seed)]
     return Measured(
         label=planned.contender.label,
         method=planned.contender.method,
@@ -148,21 +150,12 @@ def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
         decisions=tuple(f"{d['option']}: {d['choice']}, as {d['reason']}" for d in profile.get("decisions", [])),
         skipped=tuple(f"{skip['skipped']:.1%} of {skip['name']}" for skip in skips),
         machine=summary["machine"],
-        command=shlex.join(["ns-train", planned.contender.method, *_user_flags(planned, conditions)]),
+        command=shlex.join(["ns-train", planned.contender.method, *flags, *conditions.flags()]),
         folder=str(planned.folder),
         lpips_note=evaluation["lpips"],
         masks_note=evaluation.get("masks"),
         geometry=evaluation.get("geometry"),
     )
-
-
-def _user_flags(planned: PlannedRun, conditions: Conditions) -> list[str]:
-    """Return the flags for the same training by a user, without those that name the comparison's folders."""
-    flags = [*planned.contender.flags, *conditions.data_flags, "--machine.seed", str(planned.seed)]
-    for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
-        value = getattr(conditions, name)
-        flags += [] if value is None else ["--" + name.replace("_", "-"), str(value)]
-    return flags
 
 
 def read_json(path: Path) -> Any:

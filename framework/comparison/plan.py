@@ -95,21 +95,21 @@ class Conditions:
 
     data: str | None
     """Absolute path of the data folder; None for the embedded scene."""
-    data_flags: tuple[str, ...]
+    data_flags: tuple[str, ...] = ()
     """Flags of the data format."""
-    max_seconds: float | None
+    max_seconds: float | None = None
     """Seconds of training."""
-    max_num_iterations: int | None
+    max_num_iterations: int | None = None
     """Steps of training."""
-    target_psnr: float | None
+    target_psnr: float | None = None
     """PSNR on the validation views that stops training, dB."""
-    num_threads: int | None
+    num_threads: int | None = None
     """CPU threads; None for all."""
-    device_type: str
+    device_type: str = "auto"
     """Device of training and evaluation."""
-    curve_images: int
+    curve_images: int = 4
     """Maximum number of views of the learning curve; 0 for no curve."""
-    max_eval_images: int | None
+    max_eval_images: int | None = None
     """Maximum number of views of the final evaluation; None for all."""
     lpips_weights: str | None = None
     """Absolute path of LPIPS's weights file; None to use the lpips package."""
@@ -127,6 +127,12 @@ class Conditions:
                 raise FlagError(f"--{name.replace('_', '-')} is {value}; it must be more than 0 and finite")
         if self.curve_images < 0 or (self.max_eval_images is not None and self.max_eval_images < 1):
             raise FlagError("--curve-images must be at least 0, --max-eval-images at least 1")
+
+    def flags(self) -> list[str]:
+        """Return the flags of ns-train for the data and the budget."""
+        values = {name: getattr(self, name) for name in ("data", "max_seconds", "max_num_iterations", "target_psnr")}
+        given = {name: value for name, value in values.items() if value is not None}
+        return [word for name, value in given.items() for word in ("--" + name.replace("_", "-"), str(value))]
 
     def budget(self) -> str:
         """Return a description of the training budget."""
@@ -181,9 +187,7 @@ class PlannedRun:
         """Return the command that trains under `conditions`."""
         start = python_command("nerfloom.cli.train")
         c, flags = conditions, ["--vis", "none", "--eval", "all", "--max-eval-images", str(conditions.curve_images)]
-        for name in ("data", "max_seconds", "max_num_iterations", "target_psnr"):
-            if getattr(c, name) is not None:
-                flags += ["--" + name.replace("_", "-"), str(getattr(c, name))]
+        flags += c.flags()
         if c.curve_images and c.max_seconds is not None:
             flags += ["--seconds-per-eval-all-images", str(c.max_seconds / CURVE_POINTS)]
         elif c.curve_images and c.max_num_iterations is not None:

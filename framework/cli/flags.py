@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr
 from typing import Any
 
-from nerfloom.base.errors import FlagError
+from nerfloom.base.errors import FlagError, shown
 
 HELP = ("-h", "--help", "--help-all")
 """Flags that ask for help. --help of `ns-train METHOD` shows only the everyday flags, --help-all shows all."""
@@ -66,6 +67,21 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
         raise FlagError(str(error)) from error
     sys.stderr.write(said.getvalue())
     return settings
+
+
+def numbers_in(text: str, count: int, name: str, what: str) -> list[float]:
+    """Return the numbers in a word, which commas separate.
+
+    Raises:
+        FlagError: if `text` does not have `count` finite numbers: the value `name` must be `what`.
+    """
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != count or not all(map(math.isfinite, found)):
+        raise FlagError(f"{name} is {shown(text)}; it must be {what}")
+    return found
 
 
 def in_one_line(box: str, prog: str) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import run_command, with_format, with_run
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import numbers_in, read_flags
 from nerfloom.cli.run_flags import OPENS, RunFlags
 
 if TYPE_CHECKING:
@@ -79,27 +78,16 @@ def _points(flags: MeasureFlags, loaded: Loaded, words: tuple[str, str]) -> list
     """Return two points (3,) that words describe."""
     import torch
 
-    numbers = [_numbers(word, 3 if flags.image is None else 2) for word in words]
+    count, what = 2, "two numbers column,row of --image"
+    if flags.image is None:
+        count, what = 3, "three numbers x,y,z (or column,row, with --image)"
+    numbers = [numbers_in(word, count, "a point", what) for word in words]
     if flags.image is None:
         return [torch.tensor(each, dtype=torch.float64) for each in numbers]
     view = loaded.photograph(flags.image)
     found = [loaded.pick(view, column, row) for column, row in numbers]
     for word, point in zip(words, found, strict=True):
         say(f"{word} of {flags.image}: {','.join(f'{value:.6g}' for value in point.tolist())}")
-    return found
-
-
-def _numbers(word: str, count: int) -> list[float]:
-    """Return the numbers in a word, which commas separate."""
-    try:
-        found = [float(part) for part in word.split(",")]
-    except ValueError:
-        found = []
-    if len(found) != count or not all(map(math.isfinite, found)):
-        what = (
-            "three numbers x,y,z (or column,row, with --image)" if count == 3 else "two numbers column,row of --image"
-        )
-        raise FlagError(f"a point is {shown(word)}; it must be {what}")
     return found
 
 

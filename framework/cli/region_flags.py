@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nerfloom.base.errors import ConfigError, FlagError, shown
+from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.cli.flags import numbers_in
 
 if TYPE_CHECKING:
     from nerfloom.geometry.regions import Box, Region, Sphere
@@ -34,7 +34,7 @@ class RegionFlags:
 
         if self.crop_box is None:
             return None
-        x0, y0, z0, x1, y1, z1 = _numbers("--crop-box", self.crop_box, "X,Y,Z,X,Y,Z", 6)
+        x0, y0, z0, x1, y1, z1 = numbers_in(self.crop_box, 6, "--crop-box", "6 numbers X,Y,Z,X,Y,Z")
         try:
             return Box((x0, y0, z0), (x1, y1, z1))
         except ConfigError as error:
@@ -50,7 +50,7 @@ class RegionFlags:
 
         if self.crop_sphere is None:
             return None
-        x, y, z, radius = _numbers("--crop-sphere", self.crop_sphere, "X,Y,Z,RADIUS", 4)
+        x, y, z, radius = numbers_in(self.crop_sphere, 4, "--crop-sphere", "4 numbers X,Y,Z,RADIUS")
         try:
             return Sphere((x, y, z), radius)
         except ConfigError as error:
@@ -67,14 +67,3 @@ class RegionFlags:
 
         file = None if self.region is None else read_region(self.region)
         return [region for region in (self.box(), self.sphere(), file) if region is not None]
-
-
-def _numbers(flag: str, text: str, form: str, count: int) -> list[float]:
-    """Return the numbers in the value of a flag, which commas separate."""
-    try:
-        found = [float(part) for part in text.split(",")]
-    except ValueError:
-        found = []
-    if len(found) != count or not all(map(math.isfinite, found)):
-        raise FlagError(f"{flag} is {shown(text)}; it must be {count} numbers {form}")
-    return found

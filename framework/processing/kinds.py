@@ -47,21 +47,17 @@ def process(name: str, flags: OutputFlags) -> None:
         Stopped: if a signal ends it; the message says how to continue.
     """
     flags.check()
+    from nerfloom.processing.output import check_apart
+
     try:
-        _check_input(flags)
+        if not flags.data.exists():
+            raise DataError(f"--data {flags.data}: there is no such file or folder")
+        check_apart(flags.output_dir, flags.data)
         KINDS[name].write(flags)
     except KeyboardInterrupt as stop:
         kept = "--resume continues with the features and matches so far, " if flags.can_resume else ""
         note = f"interrupted; {flags.output_dir} is unfinished; {kept}--overwrite starts again"
         raise Stopped(signal_of(stop), note) from None
-
-
-def _check_input(flags: OutputFlags) -> None:
-    from nerfloom.processing.output import check_apart
-
-    if not flags.data.exists():
-        raise DataError(f"--data {flags.data}: there is no such file or folder")
-    check_apart(flags.output_dir, flags.data)
 
 
 def _is_finished(flags: ColmapFlags) -> bool:
@@ -140,12 +136,12 @@ def _as_views(state: Reconstruction, folder: Path, sources: list[Path]) -> tuple
 def _convert_polycam(flags: PolycamFlags) -> None:
     from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.output import claim
-    from nerfloom.processing.polycam import check, convert, place
+    from nerfloom.processing.polycam import convert, folders_of, place
 
     if flags.data.is_file():
         check_archive(flags.data, place, "keyframes/images and keyframes/cameras; export Polycam's raw data")
     else:
-        check(flags.data)
+        folders_of(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
     crop = flags.crop_border_pixels
     with unpacked(flags.data, flags.output_dir, place) as export:

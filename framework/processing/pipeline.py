@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 from nerfloom.base.console import say
@@ -79,7 +80,8 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
         seconds=state.seconds,
     )
     _keep(work, output / "colmap", final)
-    (output / "colmap" / "summary.json").write_text(json.dumps(summary.as_json(), indent=2))
+    seconds = {stage: round(value, 2) for stage, value in summary.seconds.items()}
+    (output / "colmap" / "summary.json").write_text(json.dumps({**asdict(summary), "seconds": seconds}, indent=2))
     write_json(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
     if flags.mask_moving:
         _mask_moving(state)

@@ -38,7 +38,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
     Raises:
         DataError: if `export` is not an export or has no usable image.
     """
-    images, cameras = _folders(export)
+    images, cameras = folders_of(export)
     posed, blurred, without_camera = {}, 0, 0
     for name in find_images(images):
         path = (cameras / name).with_suffix(".json")
@@ -67,15 +67,6 @@ def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
     """
     inside = parts[parts.index("keyframes") :] if "keyframes" in parts else ()
     return inside if len(inside) == 3 and inside[1] in FOLDERS and parts[0] != "__MACOSX" else None
-
-
-def check(export: Path) -> None:
-    """Check that the folder `export` is a raw export.
-
-    Raises:
-        DataError: if it is not.
-    """
-    _folders(export)
 
 
 def blur_score_of(camera: dict[str, Any], path: Path, unknown: float) -> float:
@@ -118,8 +109,12 @@ def lens_of(camera: dict[str, Any], path: Path) -> Lens:
         raise DataError(f"{path} has no complete lens (width, height, fx, fy, cx, cy)") from error
 
 
-def _folders(export: Path) -> tuple[Path, Path]:
-    """Return the folders of images and cameras; those corrected by Polycam if they exist."""
+def folders_of(export: Path) -> tuple[Path, Path]:
+    """Return the folders of images and cameras of a raw `export`; those corrected by Polycam if they exist.
+
+    Raises:
+        DataError: if it is no raw export.
+    """
     for root in (export / "keyframes", export):
         for prefix in ("corrected_", ""):
             images, cameras = root / f"{prefix}images", root / f"{prefix}cameras"

@@ -15,6 +15,8 @@ import numpy as np
 
 Pair = tuple[int, int]
 """Indices of two images."""
+WORDS, SAMPLE, ROUNDS = 32, 400, 10
+"""Size of the vocabulary, maximum number of descriptors used per image, and iterations that find the vocabulary."""
 
 
 def all_pairs(count: int) -> list[Pair]:
@@ -56,38 +58,28 @@ def similar_pairs(descriptors: np.ndarray, neighbors: int, apart: int = 0) -> li
     return sorted(pairs)
 
 
-def global_descriptors(descriptors: list[np.ndarray], words: int = 32, sample: int = 400, seed: int = 0) -> np.ndarray:
+def global_descriptors(descriptors: list[np.ndarray]) -> np.ndarray:
     """Return a unit vector for each image; dot products measure the similarity of images.
 
     Args:
         descriptors: local descriptors (K, D) of each image, for any K.
-        words: size of the vocabulary.
-        sample: maximum number of descriptors used per image.
-        seed: seed of random choices.
 
     Returns:
-        (N, words D) float32; 0 for an image without descriptors.
+        (N, `WORDS` D) float32; 0 for an image without descriptors.
     """
-    random = np.random.default_rng(seed)
-    samples = [_sampled(local, sample, random) for local in descriptors]
+    random = np.random.default_rng(0)
+    samples = [_sampled(local, SAMPLE, random) for local in descriptors]
     everything = np.concatenate(samples) if samples else np.zeros((0, 1), np.float32)
     if len(everything) == 0:
         return np.zeros((len(descriptors), 1), np.float32)
-    centres = vocabulary(_sampled(everything, 20_000, random), words, random)
+    centres = vocabulary(_sampled(everything, 20_000, random), random)
     return np.stack([aggregate(local, centres) for local in samples])
 
 
-def vocabulary(descriptors: np.ndarray, words: int, random: np.random.Generator, rounds: int = 10) -> np.ndarray:
-    """Return at most `words` cluster centres (W, D), by Lloyd's algorithm.
-
-    Args:
-        descriptors: (K, D) local descriptors.
-        words: number of clusters.
-        random: source of the initial centres.
-        rounds: number of iterations.
-    """
-    centres = descriptors[random.permutation(len(descriptors))[:words]].astype(np.float32)
-    for _ in range(rounds):
+def vocabulary(descriptors: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return at most `WORDS` centres (W, D) of (K, D) `descriptors`, by Lloyd's algorithm from `random` ones."""
+    centres = descriptors[random.permutation(len(descriptors))[:WORDS]].astype(np.float32)
+    for _ in range(ROUNDS):
         nearest = _nearest(descriptors, centres)
         sums = np.zeros_like(centres)
         np.add.at(sums, nearest, descriptors)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
 
@@ -35,10 +34,6 @@ class Summary:
     """Fraction of image pairs between which the camera only rotated (`parallax.share_that_turned`)."""
     seconds: dict[str, float]
     """Seconds by stage."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the figures as a dictionary for a JSON file."""
-        return asdict(self) | {"seconds": {stage: round(value, 2) for stage, value in self.seconds.items()}}
 
 
 def lines(summary: Summary) -> list[str]:

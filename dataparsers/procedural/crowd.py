@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.dataparsers.procedural.courtyard import COURTYARD, GROUND, WALL
-from nerfloom.dataparsers.procedural.scene import Colour, Part, Parts, blend, mix, smoothstep, wave
+from nerfloom.dataparsers.procedural.scene import Colour, Part, Parts, blend, checks, mix, smoothstep, wave
 from nerfloom.dataparsers.procedural.shapes import Box, Cylinder, Sphere, Union
 from nerfloom.dataparsers.procedural.views import visible_parts
 
@@ -59,13 +59,6 @@ def _clothes(height: float, shirt: Colour, stripe: Colour, trousers: Colour, p: 
     return mix(worn, head, smoothstep(0.79, 0.81, z))
 
 
-def _chequered(light: Colour, dark: Colour, p: Tensor) -> Tensor:
-    value = torch.ones_like(p[0])
-    for row in p:
-        value = value * wave(row * 25.0 + 0.4, 5.0)
-    return blend(dark, light, 0.5 + 0.5 * value)
-
-
 def _bright(random: np.random.Generator) -> Colour:
     return colorsys.hsv_to_rgb(random.uniform(), random.uniform(0.4, 1.0), random.uniform(0.25, 0.95))
 
@@ -79,7 +72,7 @@ def cast(seed: int) -> list[Part]:
         texture = partial(_clothes, height, _bright(random), _bright(random), _bright(random))
         found.append(Part(_person(height, random.uniform(0.02, 0.09)), (0.0, 0.0, 0.0), 0.0, texture, 0.0))
     for index in range(NUM_THINGS):
-        size, texture = random.uniform(0.12, 0.24), partial(_chequered, _bright(random), _bright(random))
+        size, texture = random.uniform(0.12, 0.24), partial(checks, _bright(random), _bright(random), 25.0)
         shape = Box((size, 0.8 * size, 1.2 * size)) if index % 2 else Sphere(size)
         raised = Union(((shape, (0.0, 0.0, 1.2 * size if index % 2 else size)),))
         found.append(Part(raised, (0.0, 0.0, 0.0), 0.0, texture, 0.0))

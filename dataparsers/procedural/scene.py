@@ -45,6 +45,14 @@ def wave(x: Tensor, sharpness: float) -> Tensor:
     return (x.sin() * sharpness).clamp(-1.0, 1.0)
 
 
+def checks(light: Colour, dark: Colour, frequency: float, p: Tensor) -> Tensor:
+    """Return a checkerboard in space, (3, R) at points `p`: `light` and `dark` cells of edge pi / `frequency`."""
+    value = torch.ones_like(p[0])
+    for row in p:
+        value = value * wave(row * frequency + 0.4, 5.0)
+    return blend(dark, light, 0.5 + 0.5 * value)
+
+
 def _plinth_texture(p: Tensor) -> Tensor:
     """Return a fine checkerboard inside a ring of tick marks, and a fluted rim."""
     radius = (p[0] ** 2 + p[1] ** 2).sqrt()

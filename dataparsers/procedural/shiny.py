@@ -29,7 +29,7 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import run_command
 from nerfloom.cli.flags import read_flags
 from nerfloom.dataparsers.procedural.environment import Environment, make_environment
-from nerfloom.dataparsers.procedural.scene import Colour, Part, blend, trace_rows, wave
+from nerfloom.dataparsers.procedural.scene import Colour, Part, checks, trace_rows
 from nerfloom.dataparsers.procedural.shapes import Box, Shape, Sphere, Torus, dot
 from nerfloom.dataparsers.procedural.solids import poses_around
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, complete_folder, lay_out
@@ -93,17 +93,9 @@ def _black(p: Tensor) -> Tensor:
     return torch.zeros_like(p)
 
 
-def _checks(light: Colour, dark: Colour, size: float, p: Tensor) -> Tensor:
-    """Return a checkerboard (3, R) in space with cells of edge `size` at points `p` (3, R)."""
-    value = torch.ones_like(p[0])
-    for row in p:
-        value = value * wave(row * (math.pi / size) + 0.4, 5.0)
-    return blend(dark, light, 0.5 + 0.5 * value)
-
-
 MIRROR = Material((0.92, 0.93, 0.95), 0.0, _black)
 GOLD = Material((0.95, 0.70, 0.32), 0.03, _black)
-VARNISH = Material((0.06, 0.06, 0.06), 5e-4, partial(_checks, (0.85, 0.45, 0.30), (0.10, 0.22, 0.45), 0.22))
+VARNISH = Material((0.06, 0.06, 0.06), 5e-4, partial(checks, (0.85, 0.45, 0.30), (0.10, 0.22, 0.45), math.pi / 0.22))
 SCENES: Mapping[str, tuple[Solid, ...]] = {
     "mirror": (Solid(Sphere(0.95), (0.0, 0.0, 0.0), 0.0, MIRROR),),
     "metal": (Solid(Torus(0.75, 0.34), (0.0, 0.0, 0.0), 0.5, GOLD),),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -33,13 +32,9 @@ def error_map(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def write_image(path: Path, image: Tensor) -> None:
     """Write an `image` (H, W, 3) in [0, 1] to `path`, its extension the format, with 8 bits per channel."""
-    _write(path, to_uint8(image))
-
-
-def _write(path: Path, pixels: np.ndarray, **options: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        iio.imwrite(path, pixels, **options)
+        iio.imwrite(path, to_uint8(image))
     except BaseException:
         with suppress(OSError):
             path.unlink(missing_ok=True)  # remove an incomplete file

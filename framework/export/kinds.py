@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,10 +35,10 @@ class Kind(NamedTuple):
     """Class of its settings."""
     suffixes: tuple[str, ...]
     """Suffixes that its file may have."""
-    write: Callable[[Loaded, Path, Any, Sequence[Region]], None]
-    """Function of what is exported, the file, settings and regions that writes the file."""
+    write: Callable[..., None]
+    """Function of what is exported, the file and settings that writes the file."""
     is_cropped: bool = False
-    """Whether it takes regions."""
+    """Whether the function also takes regions."""
 
 
 def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequence[Region] = ()) -> None:
@@ -65,7 +66,7 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
     path.parent.mkdir(parents=True, exist_ok=True)
     if loaded.scale.is_known:
         say(loaded.scale.words())
-    kind.write(loaded, path, settings, regions)
+    kind.write(loaded, path, settings, *([regions] if kind.is_cropped else []))
 
 
 def check_scale(loaded: Loaded) -> None:
@@ -89,49 +90,14 @@ def kind_named(name: str) -> Kind:
     return KINDS[name]
 
 
-# Each imports on use, so that the help of the command is fast.
+def _on_use(name: str) -> Callable[..., None]:
+    """Return `module.function` of this room, imported when it is called, so that the help of the command is fast."""
 
+    def write(*arguments: Any) -> None:
+        module, function = name.split(".")
+        getattr(import_module(f"nerfloom.export.{module}"), function)(*arguments)
 
-def _points(loaded: Loaded, path: Path, settings: PointSettings, regions: Sequence[Region]) -> None:
-    from nerfloom.export.point_cloud import export_points
-
-    export_points(loaded, path, settings, regions)
-
-
-def _level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings, _: Sequence[Region]) -> None:
-    from nerfloom.export.run_mesh import export_level_set
-
-    export_level_set(loaded, path, settings)
-
-
-def _fused(loaded: Loaded, path: Path, settings: TsdfSettings, _: Sequence[Region]) -> None:
-    from nerfloom.export.run_mesh import export_fused
-
-    export_fused(loaded, path, settings)
-
-
-def _gaussians(loaded: Loaded, path: Path, settings: SplatSettings, regions: Sequence[Region]) -> None:
-    from nerfloom.export.run_gaussians import export_gaussians
-
-    export_gaussians(loaded, path, settings, regions)
-
-
-def _levels(loaded: Loaded, path: Path, settings: LevelsSettings, regions: Sequence[Region]) -> None:
-    from nerfloom.export.run_levels import export_levels
-
-    export_levels(loaded, path, settings, regions)
-
-
-def _cameras(loaded: Loaded, path: Path, settings: CameraSettings, _: Sequence[Region]) -> None:
-    from nerfloom.export.run_cameras import export_cameras
-
-    export_cameras(loaded, path, settings)
-
-
-def _occupancy(loaded: Loaded, path: Path, settings: OccupancySettings, _: Sequence[Region]) -> None:
-    from nerfloom.export.run_occupancy import export_occupancy
-
-    export_occupancy(loaded, path, settings)
+    return write
 
 
 def _page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[Region]) -> None:
@@ -142,13 +108,15 @@ def _page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[R
 
 
 KINDS: dict[str, Kind] = {
-    "pointcloud": Kind(PointSettings, (".ply",), _points, is_cropped=True),
-    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set),
-    "tsdf": Kind(TsdfSettings, MESHES, _fused),
-    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, is_cropped=True),
-    "levels": Kind(LevelsSettings, (".levels",), _levels, is_cropped=True),
-    "cameras": Kind(CameraSettings, (".json",), _cameras),
-    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
+    "pointcloud": Kind(PointSettings, (".ply",), _on_use("point_cloud.export_points"), is_cropped=True),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _on_use("run_mesh.export_level_set")),
+    "tsdf": Kind(TsdfSettings, MESHES, _on_use("run_mesh.export_fused")),
+    "gaussian-splat": Kind(
+        SplatSettings, (".ply", ".spz", ".sog", ".glb"), _on_use("run_gaussians.export_gaussians"), is_cropped=True
+    ),
+    "levels": Kind(LevelsSettings, (".levels",), _on_use("run_levels.export_levels"), is_cropped=True),
+    "cameras": Kind(CameraSettings, (".json",), _on_use("run_cameras.export_cameras")),
+    "occupancy": Kind(OccupancySettings, (".npz",), _on_use("run_occupancy.export_occupancy")),
     "web": Kind(WebSettings, (".html",), _page, is_cropped=True),
 }
 """Kinds of export by name."""

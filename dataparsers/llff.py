@@ -154,10 +154,8 @@ def faces_forward(poses: Tensor) -> bool:
 def corner_directions(poses: Tensor, intrinsics: Tensor, sizes: Tensor) -> Tensor:
     """Return directions (M, 4, 3) of depth 1 through the image corners of M pinhole cameras.
 
-    Args:
-        poses: (M, 3, 4) camera-to-world.
-        intrinsics: (M, 4) fx, fy, cx, cy, pixels.
-        sizes: (M, 2) width and height, pixels.
+    `poses` are (M, 3, 4) camera-to-world, `intrinsics` (M, 4) fx, fy, cx, cy and `sizes` (M, 2) widths and heights,
+    pixels.
     """
     sides = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
     x, y = ((sides * sizes[:, None] - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]).unbind(-1)

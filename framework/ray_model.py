@@ -180,7 +180,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
 
     @property
     def grid_density(self) -> DensityFunction:
-        """The density by which the sampler finds occupied cells; the field's."""
+        """The density that tells the sampler which cells are occupied; the field's."""
         return self.field.density
 
     def density(self, points: Points) -> Tensor:

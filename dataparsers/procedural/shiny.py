@@ -57,14 +57,7 @@ class Material(NamedTuple):
 
 
 class Solid(NamedTuple):
-    """A solid with its place and material.
-
-    Args:
-        shape: the solid around its own origin.
-        centre: position of its origin, scene units.
-        yaw: rotation about z, radians.
-        material: its material.
-    """
+    """A solid: a `shape` around its own origin, at `centre`, turned by `yaw` radians about z, of a `material`."""
 
     shape: Shape
     centre: Colour
@@ -111,14 +104,7 @@ SCENES: Mapping[str, tuple[Solid, ...]] = {
 
 @torch.no_grad()
 def light_along(origin: Tensor, directions: Tensor, solids: tuple[Solid, ...], environment: Environment) -> Light:
-    """Return the light of the first surface along rays.
-
-    Args:
-        origin: (3, 1) where the rays start, outside of the solids.
-        directions: (3, R) unit directions.
-        solids: the solids.
-        environment: the light around them.
-    """
+    """Return the light of the first of `solids` along `directions` (3, R) from `origin` (3, 1), in `environment`."""
     parts = {str(i): Part(s.shape, s.centre, s.yaw, s.material.texture, 0.0) for i, s in enumerate(solids)}
     hit = trace_rows(origin, directions, 0.0, colour=False, parts=parts)
     diffuse, specular, roughness = (torch.zeros_like(each) for each in (directions, directions, directions[0]))

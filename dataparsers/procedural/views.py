@@ -129,12 +129,10 @@ def render_view(
 def visible_parts(
     camera_to_world: npt.ArrayLike, size: tuple[int, int], parts: Parts
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
-    """Return depth (H, W) and index of the part (H, W) at the pixel centres, inf and -1 for background, at time 0.
+    """Return depth and index of the part, both (H, W), at the centres of `size` pixels; inf and -1 for background.
 
-    Args:
-        camera_to_world: (3, 4) or (4, 4), as for `render_view`; the angle is `CAMERA_ANGLE`.
-        size: width and height of the image, pixels.
-        parts: the solids of the scene.
+    `camera_to_world` is (3, 4) or (4, 4), as for `render_view`, with `CAMERA_ANGLE`; `parts` are the solids at time
+    0.
     """
     column, row = _pixel_grid(size)
     rays = _camera_rays(camera_to_world, CAMERA_ANGLE, size, column + 0.5, row + 0.5)
@@ -261,14 +259,7 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 def lay_out(
     folder: Path, split: str, poses: Sequence[npt.NDArray[np.float64]], moving: bool
 ) -> list[tuple[Path, npt.NDArray[np.float64], float]]:
-    """Write the JSON file of a split, and return the file, pose and time of each view.
-
-    Args:
-        folder: folder of the data set.
-        split: train, val or test.
-        poses: camera-to-world matrices (4, 4).
-        moving: whether each frame has a time.
-    """
+    """Write the JSON file of a `split` in `folder`, with times if `moving`; return file, pose and time of `poses`."""
     (folder / split).mkdir(parents=True, exist_ok=True)
     frames, jobs = [], []
     for index, pose in enumerate(poses):

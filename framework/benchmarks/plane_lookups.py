@@ -33,13 +33,7 @@ def planes_of(table: Tensor, layout: PlanesLayout) -> list[Tensor]:
 
 
 def grid_samples(positions: Tensor, images: list[Tensor], layout: PlanesLayout) -> Tensor:
-    """Return features (N, G * F): products of the factors of each of G groups.
-
-    Args:
-        positions: (N, D) positions in [0, 1].
-        images: factors from `planes_of`.
-        layout: axes and resolutions of the factors.
-    """
+    """Return products (N, G * F) of the factors, `images` of `layout`, of each of G groups at `positions` (N, D)."""
     remaining, groups = iter(images), []
     for factors in layout.axes:
         values = []

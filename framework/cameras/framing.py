@@ -12,13 +12,9 @@ from nerfloom.cameras.cameras import Cameras
 
 
 def perspective(poses: Tensor, width: int, height: int, fov: Tensor | float) -> Cameras:
-    """Return pinhole cameras with square pixels, whose axes meet the images in the middle.
+    """Return pinhole cameras at `poses` (M, 3, 4) with square pixels and the axis in the middle of the image.
 
-    Args:
-        poses: (M, 3, 4) camera-to-scene, OpenGL axes.
-        width: width of the images, pixels.
-        height: height of the images, pixels.
-        fov: vertical field of view, degrees; of all cameras, or (M,) of each.
+    Images have `width` x `height` pixels; `fov` is the vertical field of view of all, or (M,) of each, in degrees.
     """
     count, device = len(poses), poses.device
     half = torch.deg2rad(torch.as_tensor(fov, dtype=torch.float64)) / 2

@@ -30,14 +30,7 @@ class View:
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:
-        """Return the view of one of several cameras.
-
-        Args:
-            cameras: M cameras.
-            index: number of the camera.
-            times: (M,) time of each camera in [0, 1]; None for a static scene.
-            stride: distance in pixels between the rows and columns that are rendered.
-        """
+        """Return the view of camera `index` of M `cameras`, with its time of `times` (M,), if any, at a `stride`."""
         return cls(cameras[index : index + 1], None if times is None else float(times[index]), stride=stride)
 
     @property

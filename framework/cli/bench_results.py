@@ -21,13 +21,9 @@ PICTURES = Path("docs/pictures")
 def run_benchmark(
     command: str, arguments: list[str], kinds: Mapping[str, tuple[type, Callable[[Any], None]]], usage: str
 ) -> None:
-    """Run the benchmark that the first argument names, or print the help.
+    """Run the benchmark of `kinds`, flags and function by name, that `arguments` name, or print the help.
 
-    Args:
-        command: the command, for the help.
-        arguments: its arguments.
-        kinds: flags and function of each benchmark by name.
-        usage: text of the help.
+    `command` and `usage` are for the help.
     """
     if (chosen := chosen_kind(arguments, kinds, usage, "there is no benchmark")) is None:
         return

@@ -280,13 +280,9 @@ def write_columns(
 def header_text(
     count: int, kinds: Sequence[tuple[str, str]], faces: int | None = None, comments: Sequence[str] = ()
 ) -> bytes:
-    """Return the header of a binary file, little endian.
+    """Return the header of a binary file, little endian, of `count` vertices with properties of `kinds`.
 
-    Args:
-        count: number of vertices.
-        kinds: names of their properties, and PLY's names of their types.
-        faces: number of triangles behind them; None for no such element.
-        comments: further lines.
+    `faces` is the number of triangles behind them, None for no such element; `comments` are further lines.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     lines += [f"element vertex {count}"]

@@ -33,13 +33,6 @@ def other_images(dataset: Dataset, images: Tensor, pose: Tensor) -> Tensor:
 
 
 def nearest_in_direction(dataset: Dataset, images: Tensor, pose: Tensor, count: int) -> Tensor:
-    """Return the images whose cameras look in the directions most similar to a camera's, most similar first.
-
-    Args:
-        dataset: the images.
-        images: (K,) indices of the images to choose from, on the CPU.
-        pose: (3, 4) camera-to-world of the camera.
-        count: number of images; all if there are fewer.
-    """
+    """Return `count` of `images` (K,) of `dataset` that look most like `pose` (3, 4), most similar first."""
     likeness = (dataset.cameras.camera_to_worlds[:, :, 2] * pose[:, 2]).sum(-1).cpu()
     return images[likeness[images].argsort(descending=True, stable=True)[:count]]

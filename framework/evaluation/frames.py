@@ -32,7 +32,7 @@ FACTS = "render.json"
 SUFFIX = ".frames"
 """Suffix of the folder of frames, appended to the name of the rendered file."""
 TIMED = 2
-"""The frame by whose time that of the others is foretold. The first also prepares what all of them use."""
+"""The frame that tells how long the others take. The first also prepares what all of them use."""
 PIECE = 2**24
 """Number of bytes of a file hashed at a time."""
 

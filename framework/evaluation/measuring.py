@@ -114,13 +114,9 @@ def seeing_cameras(model: Renderable, cameras: Cameras, point: Tensor, time: flo
 
 
 def located(model: Renderable, cameras: Cameras, point: Tensor, time: float | None = None) -> Tensor:
-    """Return the covariance (3, 3) of a point that was found in a picture; infinite if fewer than two cameras see it.
+    """Return the covariance (3, 3) of a `point` found in a picture; infinite if fewer than two cameras see it.
 
-    Args:
-        model: the model in evaluation mode.
-        cameras: M cameras of photographs, on the CPU.
-        point: (3,) scene coordinates.
-        time: time in [0, 1] of a moving scene.
+    `cameras` are those of M photographs of `model`, on the CPU; `time` in [0, 1] is that of a moving scene.
     """
     seeing = seeing_cameras(model, cameras, point, time)
     jacobians = projection_jacobians(cameras[seeing], point)

@@ -36,9 +36,9 @@ SMOOTHING = 24
 MIN_WIDTH = 0.5
 """Minimum of that standard deviation, cameras."""
 CONTINUED = 4.0
-"""Length, in such deviations, by which a stretch is continued beyond its ends for the means there."""
+"""Continuation of a stretch beyond its ends, for the means there, in such deviations."""
 MEASURED = 1000
-"""Number of positions by which the length of a stretch of a path is measured."""
+"""Number of positions that measure the length of a stretch of a path."""
 MIN_MEAN_DIRECTION = 0.7
 """Cameras look the same way if the mean of their unit viewing directions is at least this long."""
 SMALL_RADIUS = 0.1

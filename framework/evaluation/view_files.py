@@ -32,13 +32,9 @@ class Judged(NamedTuple):
 
 
 class ViewFiles:
-    """Writer of the files of selected evaluated views.
+    """Writer of the files of the evaluated `views`, and `with_worst` of the worst one, into `folder` unless None.
 
-    Args:
-        folder: folder of the files; None to write none.
-        names: names of all images.
-        views: indices of the views whose files are written.
-        with_worst: whether to write the files of the view with the lowest PSNR as well.
+    `names` are those of all images.
     """
 
     def __init__(self, folder: Path | None, names: Sequence[str], views: Collection[int], with_worst: bool) -> None:

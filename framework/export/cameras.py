@@ -24,13 +24,7 @@ ORTHONORMAL_STEPS = 2
 
 
 def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) -> list[dict[str, Any]]:
-    """Return file names and camera-to-world matrices (3 x 4, OpenGL axes) in the input's frame, in nerfstudio's format.
-
-    Args:
-        cameras: M cameras in the scene's frame.
-        names: M file names.
-        placement: the transform from the input's frame to the scene's.
-    """
+    """Return `names` and M poses (3 x 4) of `cameras` in the input's frame by `placement`, in nerfstudio's format."""
     poses = input_poses(cameras, placement)
     return [{"file_path": name, "transform": pose} for name, pose in zip(names, poses.tolist(), strict=True)]
 

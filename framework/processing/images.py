@@ -210,14 +210,7 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dic
 
 
 def in_parallel(work: Callable[[T], R], items: Iterable[T], title: str, total: int) -> list[R]:
-    """Apply a function to every item in threads, with a progress bar; an interruption cancels items not yet started.
-
-    Args:
-        work: the function.
-        items: its arguments.
-        title: title of the progress bar.
-        total: number of items.
-    """
+    """Apply `work` to all `items` in threads, with a bar of `title` and `total`; interrupts cancel what is left."""
     pool = ThreadPoolExecutor()
     try:
         return list(track(pool.map(work, items), title, total=total))

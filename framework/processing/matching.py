@@ -63,14 +63,7 @@ def pairs_of(left: list[str], names: list[str], state: Reconstruction) -> list[t
 
 
 def match(state: Reconstruction, pairs: list[tuple[str, str]], count: int, rule: str) -> None:
-    """Match pairs of images.
-
-    Args:
-        state: the reconstruction, with features.
-        pairs: pairs of names; pairs in the database are not matched again.
-        count: number of images.
-        rule: description of the pairs for messages.
-    """
+    """Match `pairs` of names of `count` images in `state`, without those in the database; `rule` describes them."""
     known = database.pairs(state.database)
     missing = [pair for pair in pairs if pair not in known]
     kept = f", {len(pairs) - len(missing)} of them reused" if len(missing) < len(pairs) else ""

@@ -41,14 +41,7 @@ def write_frames(video: Path, folder: Path, target: int) -> list[Path]:
 
 
 def line(times: np.ndarray, fresh: int, target: int, written: int) -> str:
-    """Return a line of text with the numbers of frames in the video, of repeats, and of written frames.
-
-    Args:
-        times: (N,) times of all frames, seconds.
-        fresh: number of distinct frames.
-        target: number of requested frames.
-        written: number of written frames.
-    """
+    """Return a line on frames at `times` (N,), seconds: `fresh` ones differ, and `written` of `target` were taken."""
     count, gaps = len(times), np.diff(times)
     uneven = " at uneven times" if count > 2 and gaps.max() > 1.5 * max(np.median(gaps), 1e-9) else ""
     text = f"video: {count} frames in {times[-1] - times[0]:.1f} s{uneven}"

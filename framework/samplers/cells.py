@@ -25,13 +25,9 @@ def places(cells: Tensor, resolution: int) -> Tensor:
 
 
 def beside(cells: Tensor, resolution: int, parts: int, in_time: bool) -> Tensor:
-    """Return a random neighbour (N,) int64 of each cell, or the cell itself.
+    """Return a random neighbour (N,) int64 of each of `cells` (N,), or the cell itself.
 
-    Args:
-        cells: (N,) indices of cells, as in `places`.
-        resolution: cells along each axis.
-        parts: number of boxes or slices.
-        in_time: whether neighbours include adjacent slices; otherwise they are in the same box.
+    `resolution` is that of each of `parts` boxes or slices; only if `in_time`, neighbours include adjacent slices.
     """
     n, place = resolution, places(cells, resolution).long()
     moved = place if in_time else place[:, 1:]

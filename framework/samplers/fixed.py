@@ -84,14 +84,7 @@ def sample_into_slots(
 
 
 def attached(samples: Samples, surface: HasAlpha | None, stopping: Tensor, features: Tensor) -> Samples:
-    """Return samples with features, and with their density or, for a surface, their opacity.
-
-    Args:
-        samples: N samples.
-        surface: the field, if it has opacities.
-        stopping: (N,) density or opacity.
-        features: (N, F) features.
-    """
+    """Return `samples` with `features` (N, F), and with `stopping` (N,): density, or opacity of a `surface`."""
     return samples.evaluated(stopping, features) if surface is None else samples.with_alpha(stopping, features)
 
 

@@ -192,13 +192,9 @@ def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor,
 
 @torch.no_grad()
 def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution: int) -> PixelSet:
-    """Return the pixels that may see a cell of the hull, counted over all images; all others see only background.
+    """Return the pixels, counted over all images, that may see the `hull` (n^3,); others see only background.
 
-    Args:
-        silhouettes: silhouettes of the images.
-        hull: (n^3,) bool, from `visual_hull`.
-        box: (2, 3) minimum and maximum corner.
-        resolution: number n of cells along each axis.
+    `silhouettes` are those of the images. `box` (2, 3) has `resolution` n cells along each axis.
     """
     cells = hull.nonzero().squeeze(-1)
     centers = box[0] + (cell_corners(cells, resolution) + 0.5) * (box[1] - box[0]) / resolution

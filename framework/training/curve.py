@@ -83,12 +83,9 @@ def rows(points: Sequence[Point]) -> list[dict[str, Any]]:
 
 
 def num_rays(sizes: Sequence[tuple[int, int]], stride: int, rays_per_pixel: int) -> int:
-    """Return the number of rays in every n-th row and column of images.
+    """Return the rays in every `stride`-th row and column of images of `sizes` (height, width), `rays_per_pixel` each.
 
-    Args:
-        sizes: (height, width) of each image, pixels.
-        stride: n, the distance between rendered rows and columns, pixels.
-        rays_per_pixel: rays per rendered pixel.
+    The sum is over all images.
     """
     return rays_per_pixel * sum(math.ceil(height / stride) * math.ceil(width / stride) for height, width in sizes)
 
@@ -110,13 +107,9 @@ def pixel_stride(sizes: Sequence[tuple[int, int]], rays_per_pixel: int, rays: fl
 
 
 def is_due(points: Sequence[Point], seconds: float, cost: float, *, last: bool = False) -> bool:
-    """Return whether it is time to evaluate a few images.
+    """Return whether to evaluate a few images, at a `cost` in seconds, after `seconds` of training with `points`.
 
-    Args:
-        points: evaluations of a few images so far.
-        seconds: seconds of training so far.
-        cost: estimated seconds of the evaluation.
-        last: whether training ends here.
+    `last` tells that training ends here.
     """
     spent = sum(point.evaluation_seconds or 0.0 for point in points)
     if spent + cost > PLANNED_SHARE * MAX_TIME_SHARE * seconds:

@@ -87,12 +87,9 @@ def random_directions(count: int, like: Tensor) -> Tensor:
 def point_errors(
     density: Tensor, rgb: Tensor, true_density: Tensor, true_rgb: Tensor, length: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the mean squared errors () of opacities and of colours.
+    """Return the mean squared errors () of opacities of a `length`, and of colours, at N points.
 
-    Args:
-        density, true_density: (N,) densities, 1/scene unit.
-        rgb, true_rgb: (N, 3) colours in [0, 1].
-        length: the length whose opacity is compared, scene units.
+    `density` and `true_density` are (N,) in 1/scene unit, `rgb` and `true_rgb` (N, 3) in [0, 1].
     """
     opacity, true = (-torch.expm1(-sigma * length) for sigma in (density, true_density))
     weights = true.clamp(min=MIN_WEIGHT)

@@ -102,14 +102,7 @@ class HeldOut:
         board.image("eval/comparison", composed(panels), step)
 
     def look_if_due(self, state: State, report: StepReport, board: TensorBoard, *, last: bool) -> None:
-        """Evaluate a few of the images, if due.
-
-        Args:
-            state: the run's state; its `looks` receive the evaluation.
-            report: report of the last training step.
-            board: receives the results.
-            last: whether training ends with that step.
-        """
+        """Evaluate a few images if due after `report`, the `last` one or not, into `state` and on `board`."""
         if self._few is None:
             return
         point = self._few.look_if_due(self.model, state.looks, report, last=last)

@@ -277,13 +277,7 @@ def _decay(schedule: str, final: float, progress: float) -> float:
 
 
 def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress: float) -> None:
-    """Set each group's learning rate for a step, from the run's schedule and warm-up or the group's own.
-
-    Args:
-        optimizer: the optimiser; each group has its initial learning rate as `initial_lr`.
-        step: number of training steps done.
-        progress: fraction of the budget spent, 0 to 1.
-    """
+    """Set the rate of each group of `optimizer` from its `initial_lr`, at `step` and spent share `progress`."""
     for group in optimizer.param_groups:
         own = group.get("schedule"), group.get("warmup_steps")
         group["lr"] = group["initial_lr"] * learning_rate_factor(config, step, progress, *own)

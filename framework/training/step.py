@@ -80,13 +80,9 @@ def learn(model: Model[Any], optimizer: Adam, batch: Any, step: int, progress: f
 
 
 def forward(model: Model[Any], batch: Any, step: int, progress: float, bfloat16: bool = False) -> Loss:
-    """Return the loss of a model on a batch, in training mode.
+    """Return the loss of `model` on a `batch` after `step` steps, at the spent share `progress`, in training mode.
 
-    Args:
-        batch: pixels or views, as the model's loss takes them.
-        step: number of training steps done.
-        progress: fraction of the budget spent, 0 to 1.
-        bfloat16: whether networks run in bfloat16, which has the range of float32 and needs no gradient scaling.
+    Networks run in bfloat16 with `bfloat16`; it has the range of float32 and needs no gradient scaling.
     """
     _before(model, step, progress, bfloat16)
     return _loss(model, batch, step, bfloat16)

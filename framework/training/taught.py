@@ -68,13 +68,7 @@ def known_depths(picture: Picture) -> Tensor:
 
 
 class TaughtPixels(BatchSource):
-    """Draws pixels of views that a teacher renders for the batch.
-
-    Args:
-        teacher: the teacher.
-        dataset: the training images, whose cameras say what can be seen.
-        background: background of transparent pixels, one colour for a view.
-    """
+    """Draws pixels of views that `teacher` renders, near the cameras of `dataset`, over a `background`."""
 
     def __init__(self, teacher: Teacher, dataset: Dataset, background: Background) -> None:
         self.teacher, self.dataset, self.background = teacher, dataset, background
@@ -178,7 +172,7 @@ class MixedSource(BatchSource):
         photographs: source of the photographs.
         taught: source of the teacher's views.
         share: share of the teacher at the start; it falls linearly.
-        until: fraction of the budget from which on the share is 0, more than 0.
+        until: fraction of the budget, more than 0, after which the share is 0.
     """
 
     varies = "a teacher renders some of the batches"

@@ -186,14 +186,7 @@ def _write(
 
 
 def _colored_range(settings: PathSettings, frames: Frames, name: str, unit: str | None) -> tuple[float, float]:
-    """Return and print the values at the ends of an output's colour map; settings give the range of distances.
-
-    Args:
-        settings: settings of the path.
-        frames: the rendered frames.
-        name: name of the output.
-        unit: end of the message about distances; None for other numbers.
-    """
+    """Return and print the ends of the colours of output `name` in `frames`; `settings` give those of distances."""
     given = settings.depth_near_plane, settings.depth_far_plane
     near, far = (None, None) if unit is None else given
     if near is None or far is None:

@@ -103,13 +103,9 @@ def camera_path_views(settings: CameraPathSettings, loaded: Loaded) -> Views:
 
 
 def path_views(settings: FramesSettings, loaded: Loaded, cameras: Cameras, moment: float | None = None) -> Views:
-    """Return the views of cameras that follow from the data's.
+    """Return the views of F `cameras` as large as the images of `loaded`, by `settings`.
 
-    Args:
-        settings: settings of the path.
-        loaded: what is rendered.
-        cameras: F cameras, as large as the images that the model has learnt from.
-        moment: time of all frames of a moving scene; None if it runs from 0 to 1.
+    `moment` is the time of all frames of a moving scene; None if it runs from 0 to 1.
     """
     times, count = None, len(cameras)
     if loaded.model.scene.moving:

@@ -59,13 +59,7 @@ def draw_beside(
 
 
 def joined(left: Arrays, right: Arrays, divider: float) -> Arrays:
-    """Join the left part of one picture's arrays to the right part of another's.
-
-    Args:
-        left: arrays (H, W, ...) of the picture on the left.
-        right: as many arrays of the same shapes; those of `left` give the names.
-        divider: width of the left part, as a fraction of the whole.
-    """
+    """Join arrays (H, W, ...) of the picture `left` of the fraction `divider` to those of the picture `right` of it."""
     found = {}
     for (name, one), other in zip(left.items(), right.values(), strict=True):
         column = round(divider * one.shape[1])

@@ -60,28 +60,14 @@ class Browser:
         return Waiting(new, self.drawn is not None and (bool(self.pieces) or old), self.asked_at, self.served_at)
 
     def begin(self, request: Request, stride: int, step: int, kept: Arrays, left: list[Piece]) -> None:
-        """Show a coarse picture for a new request.
-
-        Args:
-            stride: stride of the picture.
-            step: training step of the model.
-            kept: arrays of the picture.
-            left: pieces that complete it.
-        """
+        """Show the coarse arrays `kept`, at a `stride`, of training step `step`; the pieces `left` complete them."""
         self.drawn, self.stride, self.step, self.pieces = request, stride, step, left
         self._canvas = dict(kept)
         self._range = None if (name := number_kept(kept)) is None else distance_range([kept], name)
         self._show(ROUGH_QUALITY if left else FINE_QUALITY)
 
     def renew(self, speed: Speed, rays: Rays, step: int, seconds: float) -> None:
-        """Start to redraw the finished picture for a changed model.
-
-        Args:
-            speed: measured speed.
-            rays: rays per pixel.
-            step: training step of the model.
-            seconds: time limit for a piece.
-        """
+        """Start to redraw the picture, of `rays` per pixel, for a model of `step`, `seconds` a piece at `speed`."""
         assert self.drawn is not None
         self.step = step
         self.pieces = refinement(speed, self.drawn.width, self.drawn.height, 1, rays, seconds)

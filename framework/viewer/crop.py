@@ -76,13 +76,9 @@ def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor
 
 
 def picture_within(model: Renderable, view: View, crop: Crop, background: Tensor) -> Picture:
-    """Return a picture (H, W) of the scene inside a crop; `meaning` describes it for each kind of model.
+    """Return a picture (H, W) by `model` of a `view` of stride 1 inside `crop`, over `background` (3,).
 
-    Args:
-        model: the model in evaluation mode.
-        view: the view, whose stride is 1.
-        crop: the box and the distances.
-        background: (3,) colour behind the scene.
+    `meaning` describes it for each kind of model.
     """
     camera = view.camera
     if isinstance(model, RendersGaussians):

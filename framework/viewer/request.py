@@ -122,12 +122,10 @@ def smaller(width: int, height: int, stride: int) -> tuple[int, int]:
 
 
 def pose_of(wxyz: Any, position: Any, fov: Any) -> Pose | None:
-    """Return the camera reported by a browser; None if the numbers are invalid.
+    """Return the camera that a browser reports; None if the numbers are invalid.
 
-    Args:
-        wxyz: quaternion from the camera's axes (x right, y down, z forward) to the scene.
-        position: three coordinates, scene units.
-        fov: vertical field of view, radians.
+    `wxyz` is the quaternion from its axes (x right, y down, z ahead) to the scene, `position` has three
+    coordinates, `fov` is vertical, in radians.
     """
     quaternion, place, angle = _numbers(wxyz, 4), _numbers(position, 3), _numbers([fov], 1)
     if quaternion is None or place is None or angle is None:

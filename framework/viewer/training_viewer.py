@@ -66,14 +66,7 @@ class Turns:
 
 
 class Status:
-    """Numbers of a run in training, and its pause button, in the panel of all browsers.
-
-    Args:
-        server: the server.
-        page: the page, with the learning curve.
-        trainer: the run's trainer.
-        turns: turns of the viewer.
-    """
+    """Numbers of `trainer`'s run, and its pause button for `turns`, in all browsers of `server`, with the `page`."""
 
     def __init__(self, server: viser.ViserServer, page: Page, trainer: Trainer, turns: Turns) -> None:
         self._page, self._trainer, self._turns = page, trainer, turns

@@ -47,13 +47,7 @@ class PixelMemory:
 
 
 def cache_path(folder: Path, files: list[Path | None], numbers: list[int]) -> Path:
-    """Return the path of the cached pixels of image files.
-
-    Args:
-        folder: the cache folder.
-        files: files that the pixels depend on, identified by absolute path, size and time of modification.
-        numbers: other numbers that the pixels depend on.
-    """
+    """Return the path in `folder` of pixels that depend on `files` (path, size, modification) and `numbers`."""
     digest = hashlib.blake2b(repr((FORMAT, numbers)).encode(), digest_size=16)
     for file in files:
         identity: tuple[object, ...] = (None,)

@@ -47,17 +47,21 @@ def process(name: str, flags: OutputFlags) -> None:
         Stopped: if a signal ends it; the message says how to continue.
     """
     flags.check()
-    from nerfloom.processing.output import check_apart
-
     try:
-        if not flags.data.exists():
-            raise DataError(f"--data {flags.data}: there is no such file or folder")
-        check_apart(flags.output_dir, flags.data)
+        _check_input(flags)
         KINDS[name].write(flags)
     except KeyboardInterrupt as stop:
         kept = "--resume continues with the features and matches so far, " if flags.can_resume else ""
         note = f"interrupted; {flags.output_dir} is unfinished; {kept}--overwrite starts again"
         raise Stopped(signal_of(stop), note) from None
+
+
+def _check_input(flags: OutputFlags) -> None:
+    from nerfloom.processing.output import check_apart
+
+    if not flags.data.exists():
+        raise DataError(f"--data {flags.data}: there is no such file or folder")
+    check_apart(flags.output_dir, flags.data)
 
 
 def _is_finished(flags: ColmapFlags) -> bool:

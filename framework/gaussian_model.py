@@ -98,7 +98,12 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         return STRATEGIES[self.config.strategy](self.config)
 
     def at_time(self, gaussians: Gaussians, time: float | None) -> Gaussians:
-        """Return `gaussians` at a `time` in [0, 1], None for a still scene, with gradient; by default unchanged."""
+        """Return the Gaussians at a time, with gradient; by default `gaussians`.
+
+        Args:
+            gaussians: N Gaussians at rest, with all columns.
+            time: in [0, 1]; None for a still scene.
+        """
         return gaussians
 
     def at_rest(self) -> Gaussians:
@@ -106,7 +111,11 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         return as_gaussians(self.columns, self.extent)
 
     def learnt_gaussians(self, time: float | None = None) -> Gaussians:
-        """Return the Gaussians at a `time` in [0, 1], or None if the scene is still, with gradient."""
+        """Return the Gaussians at a time, with gradient.
+
+        Args:
+            time: in [0, 1]; None for a still scene.
+        """
         return self.at_time(self.at_rest(), time)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
@@ -116,7 +125,11 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         return self.config.look()
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
-        """Set the Gaussians at rest; `gaussians` have the settings' harmonics, and 0 for a column they lack."""
+        """Replace the Gaussians.
+
+        Args:
+            gaussians: the new ones at rest, with harmonics of the settings' degree. A column that they lack is 0.
+        """
         for name, rows in as_rows(self.columns, gaussians, self.extent).items():
             self.columns[name].values.data = rows.contiguous()
         self._prepared = None
@@ -124,7 +137,11 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
     # -- training ---------------------------------------------------------------------------------------------
 
     def keep_pace(self, pace: Pace) -> None:
-        """Choose image sizes and the steps between changes from measured step times, before the step of `pace`."""
+        """Choose the size of images and the steps between changes from measured step times.
+
+        Args:
+            pace: the run before a step.
+        """
         config = self.config
         if not config.paced:
             return
@@ -139,13 +156,23 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         self._prepared = None
 
     def on_image(self, gaussians: Gaussians, camera: SplatCamera, degree: int) -> Projected:
-        """Project `gaussians` to the image of a `camera`, with harmonics up to `degree`, and show the strategy."""
+        """Project Gaussians to a training image and show them to the strategy.
+
+        Args:
+            gaussians: all N Gaussians, in their order.
+            camera: of the image.
+            degree: highest degree of the harmonics that count.
+        """
         shown = self.rasteriser.project(gaussians, camera, degree)
         self.strategy.watch(shown.records, camera)
         return shown
 
     def aligns_normals(self, progress: float) -> bool:
-        """Return whether `surface_terms` compares normals with drawn distances at the spent share `progress`."""
+        """Return whether `surface_terms` compares normals with drawn distances at a point of the run.
+
+        Args:
+            progress: share of the budget that is spent.
+        """
         return self.config.normal_loss_mult > 0 and progress >= NORMALS_FROM
 
     def surface_terms(

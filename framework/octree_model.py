@@ -49,7 +49,13 @@ class OctreeConfig(
 
 
 class LeafTable(nn.Module):
-    """Learnt values of the leaves, `width` for each, with the learning rate `rate`, which logs call `name`."""
+    """Learnt values of the leaves.
+
+    Args:
+        name: name of the learning rate in logs.
+        rate: learning rate.
+        width: number of values of a leaf.
+    """
 
     def __init__(self, name: str, rate: float, width: int) -> None:
         super().__init__()
@@ -59,7 +65,12 @@ class LeafTable(nn.Module):
 
 
 class OctreeModel(Model[OctreeConfig], DrawsOctree):
-    """An octree with learnt density and colour, for `config` and `scene`; `set_octree` places its leaves."""
+    """An octree with learnt density and colour; `set_octree` sets the positions of its leaves.
+
+    Args:
+        config: the settings.
+        scene: the scene.
+    """
 
     batches: ClassVar[Literal["pixels", "views"]] = "pixels"
 

@@ -31,12 +31,20 @@ MAX_CANDIDATES = 32
 
 
 def appearance_of(model: Renderable) -> Appearance | None:
-    """Return the appearance vectors of the training images; None if `model` has none."""
+    """Return the appearance vectors of the training images; None if the model has none.
+
+    Args:
+        model: a model of any method.
+    """
     return model.appearance if isinstance(model, HasAppearance) else None
 
 
 def right_half(image: Tensor) -> Tensor:
-    """Return the right half of an `image` (H, W, ...), the columns from W / 2 rounded down, used for metrics."""
+    """Return the right half (H, W - W // 2, ...) of an image, used for metrics.
+
+    Args:
+        image: (H, W, ...) image.
+    """
     return image[:, image.shape[1] // 2 :]
 
 
@@ -103,7 +111,12 @@ def nearest_camera(scene: Scene, view: View) -> int:
 
 @contextmanager
 def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]:
-    """Let `model` render other views than training images with a `vector` (D,), or None, within a `with` block."""
+    """Render views other than training images with an appearance vector, within a `with` block.
+
+    Args:
+        model: the model.
+        vector: (D,) appearance vector; None to change nothing.
+    """
     appearance = appearance_of(model)
     with nullcontext() if appearance is None or vector is None else appearance.shown(vector):
         yield

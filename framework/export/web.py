@@ -98,7 +98,10 @@ def upright(cameras: Cameras) -> Tensor:
 
 
 def pinhole(cameras: Cameras) -> Cameras:
-    """Return pinhole cameras in the places of M `cameras` with a centre of projection, which see about as much.
+    """Return pinhole cameras in the same places, which see about as much.
+
+    Args:
+        cameras: M cameras of any model with a centre of projection.
 
     Raises:
         ConfigError: if they have none.
@@ -115,7 +118,12 @@ def pinhole(cameras: Cameras) -> Cameras:
 
 
 def shown_cameras(count: int, start: int) -> list[int]:
-    """Return the numbers of at most MAX_CAMERAS of `count` cameras in a page, evenly spaced, and `start`."""
+    """Return the numbers of the cameras in a page: at most MAX_CAMERAS, evenly spaced, and `start` among them.
+
+    Args:
+        count: number of all cameras.
+        start: number of the camera from which the page starts.
+    """
     if count <= MAX_CAMERAS:
         return list(range(count))
     chosen = [rank * count // MAX_CAMERAS for rank in range(MAX_CAMERAS)]
@@ -142,7 +150,12 @@ def camera_rows(cameras: Cameras, names: Sequence[str], turn: Tensor) -> list[li
 
 
 def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
-    """Return the position nearest to the axes of M `cameras`, after the scene's `turn`, in front of most of them."""
+    """Return the position that cameras look at: nearest to all their axes, and in front of most of them.
+
+    Args:
+        cameras: M cameras.
+        turn: (3, 3) rotation of the scene.
+    """
     point = looked_at(cameras.camera_to_worlds)
     if point is None:
         poses = cameras.camera_to_worlds.double().cpu()
@@ -174,7 +187,10 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
 
 
 def check_size(max_megabytes: float) -> None:
-    """Check the limit of a page's size, `max_megabytes`, in millions of bytes.
+    """Check the limit of a page's size.
+
+    Args:
+        max_megabytes: the limit, in millions of bytes.
 
     Raises:
         ConfigError: if it is not positive, or above MAX_MEGABYTES.
@@ -186,7 +202,12 @@ def check_size(max_megabytes: float) -> None:
 
 
 def page(payload: bytes, facts: PageFacts) -> str:
-    """Return the page of an SPZ file with the content `payload`, and further `facts`."""
+    """Return the page of an SPZ file.
+
+    Args:
+        payload: content of the file.
+        facts: further data of the page.
+    """
     folder = files("nerfloom.export") / "page"
     plain = json.dumps(asdict(facts), separators=(",", ":"), allow_nan=False)
     parts = {
@@ -224,7 +245,10 @@ def preview_tags(facts: PageFacts) -> str:
 
 
 def payload_of(text: str) -> bytes:
-    """Return the SPZ file in a page with the content `text`.
+    """Return the SPZ file in a page.
+
+    Args:
+        text: content of the page.
 
     Raises:
         DataError: if there is none.
@@ -237,7 +261,10 @@ def payload_of(text: str) -> bytes:
 
 
 def gaussians_of(text: str) -> Gaussians:
-    """Return the Gaussians in a page with the content `text`, as they are drawn there.
+    """Return the Gaussians in a page, as they are drawn there.
+
+    Args:
+        text: content of the page.
 
     Raises:
         DataError: if there are none, or they are damaged.

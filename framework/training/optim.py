@@ -133,7 +133,11 @@ class Adam:
         return parameter.grad
 
     def finite(self, loss: Tensor) -> bool | Tensor:
-        """Return whether a scalar `loss` and all gradients are finite; () bool if still on the device."""
+        """Return whether a loss and all gradients are finite; () bool if still on the device.
+
+        Args:
+            loss: a scalar.
+        """
         return all_finite([loss.detach(), *(grad for p in self.parameters for grad in self._gradients(p))])
 
     def _gradients(self, parameter: Tensor) -> list[Tensor]:
@@ -176,7 +180,10 @@ class Adam:
 
     @torch.no_grad()
     def change_rows(self, change: RowChange) -> None:
-        """Replace rows of a parameter and of its state by `change`; the state of fresh rows is zero.
+        """Replace rows of a parameter and of its state; the state of fresh rows is zero.
+
+        Args:
+            change: the parameter, its kept rows, and the rows to append.
 
         Raises:
             ValueError: if this optimiser does not hold the parameter.
@@ -227,7 +234,11 @@ class Adam:
 
 
 def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
-    """Return Adam over the parameter groups of `model`, with defaults of `config` and rates as `initial_lr`.
+    """Return Adam over the model's parameter groups, each with its initial learning rate as `initial_lr`.
+
+    Args:
+        model: the model; `Model.groups` gives the parameter groups.
+        config: the run's settings, which are the groups' defaults.
 
     Raises:
         ConfigError: if the parameters and Adam's state need more memory than the machine has.
@@ -277,7 +288,13 @@ def _decay(schedule: str, final: float, progress: float) -> float:
 
 
 def set_learning_rate(optimizer: Adam, config: TrainConfig, step: int, progress: float) -> None:
-    """Set the rate of each group of `optimizer` from its `initial_lr`, at `step` and spent share `progress`."""
+    """Set each group's learning rate for a step, from the run's schedule and warm-up or the group's own.
+
+    Args:
+        optimizer: the optimiser; each group has its initial learning rate as `initial_lr`.
+        step: number of training steps done.
+        progress: fraction of the budget spent, 0 to 1.
+    """
     for group in optimizer.param_groups:
         own = group.get("schedule"), group.get("warmup_steps")
         group["lr"] = group["initial_lr"] * learning_rate_factor(config, step, progress, *own)

@@ -138,12 +138,7 @@ def _values(
     elif fx is None and fy is None:
         raise DataError(f"{label}: there is no focal length, neither 'fl_x' nor 'camera_angle_x'")
     cx, cy = (_number(frame, content, key, label) for key in ("cx", "cy"))
-    return (
-        fx or fy or 0.0,
-        fy or fx or 0.0,
-        size[0] / 2 if cx is None else cx,
-        size[1] / 2 if cy is None else cy,
-    )
+    return (fx or fy or 0.0, fy or fx or 0.0, size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy)
 
 
 def _focal(frame: dict[str, Any], content: dict[str, Any], axis: str, length: int, label: str) -> float | None:

@@ -212,13 +212,7 @@ class Cylinder(Shape):
 
 @dataclass(frozen=True)
 class Torus(Shape):
-    """A ring around y, or its upper half.
-
-    Args:
-        major: radius of the circle in the middle of the tube.
-        minor: radius of the tube.
-        half: whether to keep only the part with z > 0, an arch with its feet inside another solid.
-    """
+    """A ring around y: a tube of radius `minor` around a circle of radius `major`, or its `half` above z = 0."""
 
     major: float
     minor: float

@@ -60,10 +60,7 @@ def _render_geometry(
         depth.append(hit.depth)
         normals.append(hit.normals)
     shape = size[::-1]
-    return (
-        torch.cat(depth).float().reshape(shape).numpy(),
-        torch.cat(normals, 1).T.float().reshape(*shape, 3).numpy(),
-    )
+    return torch.cat(depth).float().reshape(shape).numpy(), torch.cat(normals, 1).T.float().reshape(*shape, 3).numpy()
 
 
 def _render_rgba(

@@ -79,11 +79,7 @@ def module_of(name: str) -> str:
 
 def package_of(name: str) -> dict[str, str]:
     """Return the files of the package of a new method `name`: their text by path, relative to its folder."""
-    words = {
-        "name": name,
-        "module": module_of(name),
-        "Class": "".join(part.capitalize() for part in name.split("-")),
-    }
+    words = {"name": name, "module": module_of(name), "Class": "".join(part.capitalize() for part in name.split("-"))}
     files = {}
     for path in sorted(TEMPLATES.rglob(f"*{SUFFIX}")):
         relative = path.relative_to(TEMPLATES).as_posix().removesuffix(SUFFIX)

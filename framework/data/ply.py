@@ -250,10 +250,7 @@ def in_full(positions: Tensor) -> str:
 
 
 def write_columns(
-    file: Path,
-    columns: Sequence[tuple[str, np.ndarray]],
-    faces: Tensor | None = None,
-    comments: Sequence[str] = (),
+    file: Path, columns: Sequence[tuple[str, np.ndarray]], faces: Tensor | None = None, comments: Sequence[str] = ()
 ) -> None:
     """Write vertices to a binary PLY file, little endian, as a whole or not at all.
 

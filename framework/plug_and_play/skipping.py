@@ -109,12 +109,7 @@ class OccupancyGrid(nn.Module):
 
 
 def sample(
-    rays: Rays,
-    sigma_fn: SigmaFunction | None,
-    grid: OccupancyGrid,
-    *,
-    early_stop: float = 1e-4,
-    jitter: bool = False,
+    rays: Rays, sigma_fn: SigmaFunction | None, grid: OccupancyGrid, *, early_stop: float = 1e-4, jitter: bool = False
 ) -> Samples:
     """Return samples of rays in occupied cells, up to an early stop.
 

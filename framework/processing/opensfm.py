@@ -104,8 +104,7 @@ def lens_of(camera: dict[str, Any], kind: str, where: str) -> Lens:
     if kind in SPHERICAL:
         half = longer / 2
         return Lens(
-            "EQUIRECTANGULAR",
-            {"w": width, "h": height, "fl_x": half, "fl_y": half, "cx": width / 2, "cy": height / 2},
+            "EQUIRECTANGULAR", {"w": width, "h": height, "fl_x": half, "fl_y": half, "cx": width / 2, "cy": height / 2}
         )
     given = _numbers(camera, kind, where)
     values = {

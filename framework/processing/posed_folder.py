@@ -38,13 +38,7 @@ class _Posed:
 
 
 def write_capture(
-    folder: Path,
-    capture: Capture,
-    placed: PlacedImages,
-    output: Path,
-    num_downscales: int,
-    views: Views,
-    whole: bool,
+    folder: Path, capture: Capture, placed: PlacedImages, output: Path, num_downscales: int, views: Views, whole: bool
 ) -> None:
     """Write the data folder of a capture, and report how many of its cameras are in it and why others are not.
 

@@ -97,10 +97,7 @@ class SamplingConfig(RayConfig):
 class HierarchicalConfig(SamplingConfig):
     """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as in NeRF."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "num_coarse_samples": (MIN_COARSE, 2**14),
-        "num_fine_samples": (1, 2**14),
-    }
+    RANGES: ClassVar[dict[str, Range]] = {"num_coarse_samples": (MIN_COARSE, 2**14), "num_fine_samples": (1, 2**14)}
     """Minimum and maximum of these settings."""
     sampler: Auto[Literal["hierarchical", "occupancy", "proposal"]] = AUTO  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and

@@ -19,12 +19,7 @@ from nerfloom.training.run import TRANSFORMS, Run, read_run
 from nerfloom.training.trained import load_trained
 
 
-def load_blocks(
-    file: Path,
-    device_type: Any = "auto",
-    data: Path | None = None,
-    **settings: Any,
-) -> Loaded:
+def load_blocks(file: Path, device_type: Any = "auto", data: Path | None = None, **settings: Any) -> Loaded:
     """Load a scene in blocks.
 
     Args:

@@ -289,10 +289,7 @@ def _distance(some: Sequence[Tensor], others: Sequence[Tensor]) -> Tensor:
 
 
 def make_graphs(
-    mode: str,
-    device: torch.device,
-    learnt: Callable[[], Sequence[Tensor]],
-    loss: Callable[[Any], Tensor] | None = None,
+    mode: str, device: torch.device, learnt: Callable[[], Sequence[Tensor]], loss: Callable[[Any], Tensor] | None = None
 ) -> StepGraphs[Any] | None:
     """Return the step graphs of a run; None if they are off or the device has none.
 

@@ -247,11 +247,7 @@ class Loaded:
         write_scale(self.folder, self.scale)
 
     def _measured(
-        self,
-        start: Tensor | Sequence[float],
-        end: Tensor | Sequence[float],
-        scale: Scale,
-        time: float | None,
+        self, start: Tensor | Sequence[float], end: Tensor | Sequence[float], scale: Scale, time: float | None
     ) -> Length:
         self._check_lengths()
         ends = self.placement.points(torch.stack([torch.as_tensor(p, dtype=torch.float64) for p in (start, end)]))

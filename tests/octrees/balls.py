@@ -31,7 +31,7 @@ def ball(degree: int = 1, depth: float = 5.0) -> Octree:
 
 
 def grains(degree: int, share: float = 0.4) -> Octree:
-    """Cells of all densities and colours in a ball and far from it in a corner, with empty bricks and octants around."""
+    """Cells of all densities and colours in a ball and in a corner far from it, with empty bricks around."""
     torch.manual_seed(degree)
     size, cell = (6, 4, 5), 0.04
     cells = torch.cartesian_prod(*(torch.arange(8 * bricks) for bricks in size))

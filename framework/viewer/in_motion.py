@@ -22,7 +22,7 @@ def draw_in_motion(loaded: Loaded, quick: Loaded, request: Request, piece: Piece
 
     Args:
         loaded: the run.
-        quick: the file, whose scene may be placed in another way.
+        quick: the file; its scene may be placed in another way.
         request: the view, in the frame of the run's scene.
         piece: rows at a stride.
     """

@@ -145,7 +145,7 @@ class RenderQueue:
         request, step, budget = browser.wanted, self.loaded.step, self._piece_seconds
         assert request is not None
         if request != browser.drawn:
-            # The run's first picture measures its speed, which the size of its pieces depends on.
+            # The run draws its first picture itself: its speed determines the size of its pieces.
             quick = self._quick if self._speed.measured and is_shared(request) else None
             speed = self._speed if quick is None else self._quick_speed
             stride = coarse_stride(speed, request.width, request.height, self.coarse_seconds, browser.stride)

@@ -53,7 +53,7 @@ ASLANT = torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]],
 
 
 def octree_facts(turn: Tensor) -> PageFacts:
-    """Facts about those cameras, of an octree whose frame is turned."""
+    """Facts about those cameras, for an octree in a turned frame."""
     cameras = some_cameras()
     rows = camera_rows(cameras, ["a.png", "b.png", "c.png", "d.png"], turn)
     return PageFacts("test", "About.", (1.0, 1.0, 1.0), 0.05, None, focus_of(cameras, turn), rows)

@@ -102,7 +102,7 @@ def test_the_browser_draws_fewer_harmonics(browser: str, tmp_path: Path, degree:
 
 @pytest.fixture(scope="module")
 def aslant(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page of an octree whose axes are not the page's."""
+    """The page of an octree; its axes are not the page's."""
     file = tmp_path_factory.mktemp("octree") / "scene.html"
     file.write_text(octree_text(1), encoding="utf-8")
     return file

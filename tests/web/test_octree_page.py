@@ -156,6 +156,7 @@ def test_the_degree_and_the_leaves_that_fit() -> None:
             chosen(weights, size, (2, 1, 0))
 
 
+@pytest.mark.medium
 def test_larger_cells_hold_as_much_and_look_alike() -> None:
     octree = ball(depth=1.0)
     found = halved(octree)

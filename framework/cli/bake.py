@@ -26,8 +26,9 @@ class BakeFlags(RunFlags):
     max_megabytes: float = 30.0
     """Maximum size of the file, millions of bytes. It limits the degree of harmonics first, then the number of
     leaves."""
-    resolution: int = 512
-    """Cells along the longest edge of the box of all matter, 16 to 1024."""
+    resolution: int | None = None
+    """Cells along the longest edge of the box of all matter, 16 to 1024. Default: up to 512, fewer for small images or
+    if half of the leaves would not fit."""
     degree: int | None = None
     """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes."""
     fine_tune_seconds: float = 30.0
@@ -69,7 +70,7 @@ def _check(flags: BakeFlags) -> None:
         raise FlagError(f"--output-path is {flags.output_path}; octrees are written to .octree files")
     if not 0 < flags.max_megabytes < math.inf:
         raise FlagError(f"--max-megabytes is {flags.max_megabytes:g}; it must be more than 0 and finite")
-    if not MIN_RESOLUTION <= flags.resolution <= MAX_RESOLUTION:
+    if flags.resolution is not None and not MIN_RESOLUTION <= flags.resolution <= MAX_RESOLUTION:
         raise FlagError(f"--resolution is {flags.resolution}; it must be from {MIN_RESOLUTION} to {MAX_RESOLUTION}")
     if flags.degree is not None and not 0 <= flags.degree <= 3:
         raise FlagError(f"--degree is {flags.degree}; it must be from 0 to 3")

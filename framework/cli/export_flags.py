@@ -104,7 +104,7 @@ class LevelsFlags(LevelsSettings, RegionFlags, ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class WebFlags(WebSettings, RegionFlags, ExportFlags):
-    """Write scene.html: a page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field.
+    """Write scene.html: a page that shows the scene's Gaussians or octree, or ones that are made from a field.
 
     Beside it, scene.jpg is the start view, for link previews.
     """

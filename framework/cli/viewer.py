@@ -11,6 +11,7 @@ from nerfloom.base.machine_config import ViewerConfig
 from nerfloom.cli.common import run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.run_flags import OPENS, RunFlags
+from nerfloom.training.run_path import trained_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +20,8 @@ class ViewerFlags(RunFlags):
 
     beside: Path | None = None
     """A second run or file of the same data, shown right of a divider. The flag's name may be omitted."""
+    while_moving: Path | None = None
+    """A faster file of the same scene, such as its octree, drawn while the camera moves. At rest, the run is drawn."""
     websocket_host: str = ViewerConfig.websocket_host
     """Interface to listen on; 0.0.0.0: all, so that other machines can connect. There is no password."""
     websocket_port: int = ViewerConfig.websocket_port
@@ -38,12 +41,15 @@ def _command(arguments: list[str]) -> None:
         raise ConfigError(f"the viewer needs viser: {command}")
     other = None if flags.beside is None else replace(flags, load_config=flags.beside, load_checkpoint=None)
     found, second = flags.check(), None if other is None else other.check()
+    file = None if flags.while_moving is None else trained_run(flags.while_moving, None, None)
+    from nerfloom.training.load import load
     from nerfloom.viewer.trained_viewer import view_loaded
 
     loaded = flags.load(found, named)
     follow = flags.load_checkpoint is None and loaded.is_run
     beside = None if other is None or second is None else other.load(second, named)
-    view_loaded(loaded, flags.websocket_host, flags.websocket_port, follow, beside)
+    quick = None if file is None else load(file, device_type=flags.device_type)
+    view_loaded(loaded, flags.websocket_host, flags.websocket_port, follow, beside, quick)
 
 
 def _without_prefix(word: str) -> str:

@@ -17,7 +17,8 @@ from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.octree_cells import MatterSearch
-from nerfloom.export.octree_colors import Seen, fitted_colors, seen_leaves
+from nerfloom.export.octree_colors import Seen, field_colors, fitted_colors, seen_leaves
+from nerfloom.export.octree_size import DEGREES, chosen, is_too_fine, visible_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.method import Method
@@ -31,24 +32,21 @@ from nerfloom.training.trainer import Trainer
 
 METHOD = Method(OctreeConfig(), paper="arXiv:2103.14024", model=OctreeModel, name="octree")
 """Learning of an octree from photographs."""
-MIN_WEIGHT = 0.02
-"""Leaves with a smaller largest weight on training rays are left out."""
 MAX_BYTES = 30e6
 """Default of the maximum size of a file, bytes."""
-COMPRESSED = 0.85
-"""Expected size of a file, relative to its leaves' bytes."""
-DEGREES = (2, 1, 0)
-"""Degrees of harmonics to choose from, best first."""
-FULL_SHARE = {2: 0.9, 1: 0.7, 0: 0.0}
-"""Share of the visible leaves that must fit into the file with each degree; otherwise a smaller degree is chosen."""
+MIN_RESOLUTION, MAX_RESOLUTION = 32, 512
+"""Range of the cells along the longest edge, if no number is given."""
+CELLS_PER_PIXEL = 1.28
+"""Cells along the longest edge, if no number is given, relative to the pixels along the images' longer side. Images do
+not see each of much smaller cells, and pictures from elsewhere have holes."""
 
 
 @dataclass(frozen=True)
 class Baking:
     """Settings of baking."""
 
-    resolution: int = 512
-    """Cells along the longest edge of the matter's box."""
+    resolution: int | None = None
+    """Cells along the longest edge of the matter's box; None to choose them by the images' size and `max_bytes`."""
     max_bytes: float = MAX_BYTES
     """Maximum size of the file, bytes."""
     degree: int | None = None
@@ -69,13 +67,26 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     """
     model, dataset = _bakeable(loaded), loaded.dataset("train").to("cpu")
     seed_step(loaded.run.config.machine.seed, 0)
-    layout, raw, seen = _visible(model, dataset, settings.resolution)
-    degree, kept = _chosen(seen.largest, settings)
+    degrees = DEGREES if settings.degree is None else (settings.degree,)
+    pixels = int(CELLS_PER_PIXEL * model.scene.image_size)
+    resolution = settings.resolution or min(max(pixels, MIN_RESOLUTION), MAX_RESOLUTION)
+    layout, raw, seen = _visible(model, dataset, resolution)
+    while settings.resolution is None and resolution > MIN_RESOLUTION:
+        if not is_too_fine(seen.largest, settings.max_bytes, degrees):
+            break
+        resolution //= 2
+        say(f"half of these would not fit; {resolution} cells along the longest edge instead")
+        layout, raw, seen = _visible(model, dataset, resolution)
+    degree, kept = chosen(seen.largest, settings.max_bytes, degrees)
+    visible = len(visible_leaves(seen.largest))
+    if len(kept) < visible:
+        say(f"the size leaves room for {len(kept):,} of {visible:,} leaves: those with the largest weights")
     layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
     kept = kept[rows]
     raw, seen = raw[kept], replace(seen, largest=seen.largest[kept], by_view=seen.by_view[kept])
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
-    coefficients = fitted_colors(model, layout.centers(), layout.cell, seen, degree)
+    centers = layout.centers()
+    coefficients = fitted_colors(field_colors(model, centers, layout.cell), centers, seen, degree)
     depths = depths_of(raw[:, 0])
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
@@ -89,7 +100,7 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     """Return the run's model; refuse what an octree of a box cannot show."""
     model, name = loaded.model, loaded.method
     if not isinstance(model, RayModel):
-        raise ConfigError(f"ns-bake: {name} has no field to bake; take a run of a method that casts rays")
+        raise ConfigError(f"{name} has no field to bake; take a run of a method that casts rays")
     reason = None
     if isinstance(model, RendersFromImages):
         reason = "it renders from images, and has no field without them"
@@ -100,7 +111,7 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     elif model.scene.unbounded:
         reason = "its scene extends beyond its box, where an octree ends"
     if reason is not None:
-        raise ConfigError(f"ns-bake: this run of {name} cannot be baked: {reason}; 'ns-export web' shows it in a page")
+        raise ConfigError(f"this run of {name} cannot be baked: {reason}; 'ns-export web' shows it as Gaussians")
     return model
 
 
@@ -111,36 +122,13 @@ def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[O
     cells, depths = search.cells(grid)
     layout, rows = OctreeLayout.build(grid.origin, grid.cell, grid.size, cells)
     if not layout.num_leaves:
-        raise ConfigError("ns-bake: the run has no matter in its box; is it trained?")
+        raise ConfigError("the run has no matter in its box; is it trained?")
     raw = raw_of(depths[rows])[:, None]
     seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
-    visible = int((seen.largest > MIN_WEIGHT).sum())
+    visible = len(visible_leaves(seen.largest))
     edges = " x ".join(str(8 * count) for count in grid.size)
     say(f"{layout.num_leaves:,} of {edges} cells have matter, and training images see {visible:,} of these")
     return layout, raw, seen
-
-
-def _chosen(largest: Tensor, settings: Baking) -> tuple[int, Tensor]:
-    """Return the degree of harmonics, and the leaves (L,) int64 that fit: those with the largest weights.
-
-    Args:
-        largest: (N,) largest weight of each leaf.
-        settings: the size.
-    """
-    visible = (largest > MIN_WEIGHT).nonzero()[:, 0]
-    if not len(visible):
-        raise ConfigError("ns-bake: no training image sees matter in the box; is the run trained?")
-    degrees = DEGREES if settings.degree is None else (settings.degree,)
-    for degree in degrees:
-        room = int(settings.max_bytes / (COMPRESSED * (1 + 3 * (degree + 1) ** 2)))
-        if room >= FULL_SHARE.get(degree, 0.0) * len(visible) or degree == degrees[-1]:
-            break
-    if room < 1:
-        raise ConfigError(f"ns-bake: no leaf fits into {settings.max_bytes / 1e6:g} MB; give --max-megabytes 1 or more")
-    if room < len(visible):
-        say(f"the size leaves room for {room:,} of {len(visible):,} leaves: those with the largest weights")
-        visible = visible[largest[visible].topk(room).indices].sort().values
-    return degree, visible
 
 
 def learnt(

@@ -1,7 +1,9 @@
-"""Colours of an octree's leaves: visibility in the training images, and harmonics fitted to the field's colours."""
+"""Colours of an octree's leaves: visibility in the training images, and harmonics fitted to the colours seen there."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +17,7 @@ from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.packed import PackedLeaves
 from nerfloom.kernels.octree.weights import raise_weights
 from nerfloom.ray_model import RayModel
 
@@ -30,6 +33,8 @@ STOP = 1e-3
 """Transmittance below which rays end."""
 RAYS_AT_ONCE = 2**18
 """Rays that are traced together."""
+Colors = Callable[[Tensor, Tensor], Tensor]
+"""Function from B leaves (B,) int64 and unit directions (B, D, 3) to the colours (B, D, 3) seen there, on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +77,14 @@ def seen_leaves(layout: OctreeLayout, raw: Tensor, cameras: Cameras, near: float
 
 
 @torch.no_grad()
-def fitted_colors(model: RayModel[Any], centers: Tensor, size: float, seen: Seen, degree: int) -> Tensor:
-    """Return coefficients (L, 3 K) of harmonics: weighted least squares, leaf by leaf, to the field's colours.
+def fitted_colors(colors: Colors, centers: Tensor, seen: Seen, degree: int) -> Tensor:
+    """Return coefficients (L, 3 K) of harmonics: weighted least squares, leaf by leaf, to colours.
 
     Each leaf's colour is evaluated in the directions of the cameras that see it best.
 
     Args:
-        model: the model in evaluation mode.
+        colors: the colours, of a field or of other harmonics.
         centers: (L, 3) centres of the leaves.
-        size: edge of a leaf, scene units.
         seen: what training images see of the leaves; weights are those of the fit.
         degree: degree of the harmonics, 0 to 3.
     """
@@ -90,10 +94,36 @@ def fitted_colors(model: RayModel[Any], centers: Tensor, size: float, seen: Seen
         weights, order = seen.by_view[part].float().topk(min(DIRECTIONS[degree], seen.by_view.shape[1]))
         away = centers[part, None] - seen.positions[order]
         directions = torch.nn.functional.normalize(away, dim=-1)
-        with model.rendering():
-            found = _colors(model.field, centers[part].to(model.device), directions.to(model.device), size)
-        out[part] = fitted(directions, found.cpu(), weights + 1e-3, degree)
+        out[part] = fitted(directions, colors(part, directions), weights + 1e-3, degree)
     return out
+
+
+def field_colors(model: RayModel[Any], centers: Tensor, size: float) -> Colors:
+    """Return the colours of a field in leaves.
+
+    Args:
+        model: the model in evaluation mode.
+        centers: (L, 3) centres of the leaves.
+        size: edge of a leaf, scene units.
+    """
+
+    def colors(leaves: Tensor, directions: Tensor) -> Tensor:
+        with model.rendering():
+            return _colors(model.field, centers[leaves].to(model.device), directions.to(model.device), size).cpu()
+
+    return colors
+
+
+def leaf_colors(leaves: PackedLeaves) -> Colors:
+    """Return the colours of an octree's own leaves, on the CPU."""
+    terms = leaves.colors.shape[1] // 3
+
+    def colors(chosen: Tensor, directions: Tensor) -> Tensor:
+        basis = spherical_harmonics(directions.reshape(-1, 3).contiguous(), math.isqrt(terms))
+        coefficients = leaves.colors[chosen].float() * leaves.scales + leaves.offsets
+        return torch.einsum("bdk,bck->bdc", basis.view(len(chosen), -1, terms), coefficients.view(-1, 3, terms))
+
+    return colors
 
 
 def _colors(field: Field, positions: Tensor, directions: Tensor, size: float) -> Tensor:

@@ -1,29 +1,26 @@
-"""The web page of a run or a file: its own or fitted Gaussians, the page, and its closeness to the method."""
+"""The web page of a run or a file: its own Gaussians or octree, or fitted ones, and its closeness to the method."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 
 import torch
-from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.console import say, track
+from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, nearest, printable, shown
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.framing import framed
-from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import measure, spread, views_to_judge
 from nerfloom.evaluation.images import to_uint8
-from nerfloom.evaluation.metrics import psnr
 from nerfloom.evaluation.paths import around
 from nerfloom.evaluation.videos import write_images
-from nerfloom.export.settings import WebSettings
+from nerfloom.export.bake import Baking, bake
+from nerfloom.export.page_closeness import closeness
+from nerfloom.export.page_scenes import ScenePage, gaussian_page, octree_page
+from nerfloom.export.settings import PageKind, WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
     PICTURE,
@@ -31,50 +28,25 @@ from nerfloom.export.web import (
     camera_rows,
     check_size,
     focus_of,
-    gaussians_of,
-    make_page,
     pinhole,
+    room,
     shown_cameras,
     upright,
 )
-from nerfloom.geometry.regions import Region, inside_all
-from nerfloom.kernels.splats.project import SplatCamera
+from nerfloom.geometry.regions import Region
 from nerfloom.method import Method
+from nerfloom.octrees.drawn import DrawnOctree
+from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
-from nerfloom.splats.drawing import DRAWN, draw_colors, smallest_depth, splat_camera
+from nerfloom.splats.drawing import smallest_depth
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
-from nerfloom.splats.transform import transformed
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
 
 PICTURE_SUFFIX = ".jpg"
 """Suffix of the picture of link previews, beside the page."""
-MAX_VIEWS = 5
-"""Maximum number of views for comparing a page with the model."""
-
-
-@dataclass(frozen=True)
-class Closeness:
-    """Metrics of a page's Gaussians compared with the model, drawn by Nerfloom."""
-
-    views: str
-    """The compared views, as text."""
-    method: float
-    """PSNR against the method's own pictures, dB."""
-    photographs: float | None
-    """PSNR against the photographs, dB; None if they are of other moments, or have a lens for which Gaussians cannot be
-    drawn."""
-    method_itself: float | None
-    """PSNR of the method's own pictures against the photographs, dB; None likewise."""
-
-    def line(self) -> str:
-        """Return the metrics as a line of text."""
-        text = f"on {self.views}: PSNR {self.method:.2f} dB against the method's own pictures"
-        if self.photographs is None:
-            return text
-        return f"{text}, {self.photographs:.2f} dB against the photographs (the method: {self.method_itself:.2f} dB)"
 
 
 def export_page(
@@ -104,18 +76,14 @@ def export_page(
     start = start_of([names[index] for index in order], settings.start_view)
     ranks = shown_cameras(len(order), start)
     chosen = torch.tensor([order[rank] for rank in ranks])
-    near = smallest_depth(model.scene)
-    found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment, splatting)
-    good = _finite(found)
-    good = good[inside_all(loaded.placement.original_points(good.means), regions)]
-    turn = upright(cameras)
+    kind, turn = settings.kind or kind_of(model), upright(cameras)
     red, green, blue = model.background.tolist()
     facts = PageFacts(
         title=_title(loaded) if settings.title is None else printable(settings.title),
-        about=_about(loaded, moment),
+        about=_about(loaded, kind, moment),
         background=(red, green, blue),
-        near=near,
-        look=look,
+        near=smallest_depth(model.scene),
+        look=None,
         focus=focus_of(cameras, turn),
         cameras=camera_rows(cameras[chosen], [printable(names[i]) for i in chosen.tolist()], turn),
         unit_length=loaded.unit,
@@ -126,20 +94,29 @@ def export_page(
         url=settings.url or "",
         picture=path.with_suffix(PICTURE_SUFFIX).name,
     )
-    text, costs = make_page(transformed(good, turn, 1.0, torch.zeros(3)), facts, settings.max_megabytes)
-    for cost in costs:
+    if kind == "octree":
+        octree = _octree(loaded, settings.fit_seconds, room(facts, settings.max_megabytes))
+        page = octree_page(loaded, octree, cameras, facts, turn, settings.max_megabytes, regions)
+    else:
+        found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment, splatting)
+        page = gaussian_page(loaded, found, look, facts, turn, settings.max_megabytes, regions)
+    for cost in page.costs:
         say(cost)
-    content = text.encode("utf-8", "replace")
+    content = page.text.encode("utf-8", "replace")
     write_atomically(path, lambda file: file.write(content))
-    drawn = gaussians_of(text)
-    say(f"{len(content) / 1e6:.2f} MB, {len(drawn):,} Gaussians of degree {drawn.degree}: {path}")
+    say(f"{len(content) / 1e6:.2f} MB, {page.words}: {path}")
     if moment is not None:
         say(f"the scene moves, and the page shows it at time {moment:g}, still")
-    back = transformed(drawn, turn.T, 1.0, torch.zeros(3)).map(lambda values: values.to(model.device))
     camera = framed(cameras[order[start] : order[start] + 1], *PICTURE).to(model.device)
-    _write_picture(path.with_suffix(PICTURE_SUFFIX), back, splat_camera(camera, near, look), model.background)
+    with torch.no_grad():
+        write_images([path.with_suffix(PICTURE_SUFFIX)], [to_uint8(page.draw(camera))])
     if not regions:
-        say(_closeness_to(loaded, back, dataset, cameras, near, look, moment).line())
+        _say_closeness(loaded, page, dataset, cameras, moment)
+
+
+def kind_of(model: Renderable) -> PageKind:
+    """Return what the page of `model` shows if no setting says it: an octree if the model is one, else Gaussians."""
+    return "octree" if isinstance(model, DrawnOctree) else "gaussians"
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
@@ -148,13 +125,6 @@ def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[
         cameras = around(model.scene)
         return cameras, [f"view {number + 1}" for number in range(len(cameras))]
     return pinhole(dataset.cameras), list(dataset.names)
-
-
-def _write_picture(path: Path, gaussians: Gaussians, camera: SplatCamera, background: Tensor) -> None:
-    """Write the picture of link previews."""
-    with torch.no_grad():
-        picture = draw_colors(gaussians, camera, 1, background)
-    write_images([path], [to_uint8(picture)])
 
 
 def start_of(names: Sequence[str], wanted: str | None) -> int:
@@ -182,21 +152,15 @@ def check_url(url: str | None) -> None:
         raise FlagError(f"--url is {shown(url)}; it must begin with https:// or http://")
 
 
-def _closeness_to(
-    loaded: Loaded,
-    drawn: Gaussians,
-    dataset: Dataset | None,
-    cameras: Cameras,
-    near: float,
-    look: Look,
-    moment: float | None,
-) -> Closeness:
-    """Compare Gaussians in the scene's frame, on the model's device, on held-out views if there are any."""
+def _say_closeness(
+    loaded: Loaded, page: ScenePage, dataset: Dataset | None, cameras: Cameras, moment: float | None
+) -> None:
+    """Compare a page with the model, on held-out views if there are any."""
     model = loaded.model
     held_out = None if loaded.source is None else first_split(loaded.source, ("test", "val"))
     views = dataset if held_out is None else _at(with_refined_poses(model, held_out.to(model.device)), moment)
     seen = cameras.to(model.device) if views is None else views.cameras
-    return closeness(model, drawn, seen, views, near, look, moment)
+    say(closeness(model, page, seen, views, moment).line())
 
 
 def _gaussians(
@@ -208,65 +172,21 @@ def _gaussians(
         return model.gaussians(moment), model.look()
     if not isinstance(model, RendersRays) or dataset is None:
         raise ConfigError(f"ns-export web: {loaded.method} has neither Gaussians nor rays, so it cannot be shown")
-    if not seconds > 0:
-        raise FlagError(f"--fit-seconds is {seconds:g}; it must be positive")
+    _check_seconds(seconds)
     return fit_gaussians(model, splatting, dataset, cameras, seconds, loaded.run.config.machine), OURS
 
 
-def _finite(found: Gaussians) -> Gaussians:
-    """Return the finite Gaussians, on the CPU, and report the number of others."""
-    found = found.map(lambda values: values.detach().cpu())
-    good = found[found.finite()]
-    if len(good) < len(found):
-        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are dropped")
-    if not len(good):
-        raise ConfigError("there are no Gaussians to show; train the run again")
-    return good
+def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:
+    """Return the octree of a file, or the octree of a field, which is baked; on the CPU."""
+    if isinstance(loaded.model, DrawnOctree):
+        return loaded.model.octree.to("cpu")
+    _check_seconds(seconds)
+    return bake(loaded, Baking(max_bytes=max_bytes, seconds=seconds))
 
 
-def closeness(
-    model: Renderable,
-    gaussians: Gaussians,
-    cameras: Cameras,
-    dataset: Dataset | None,
-    near: float,
-    look: Look,
-    moment: float | None,
-) -> Closeness:
-    """Compare Gaussians with the model that they represent.
-
-    Args:
-        model: the model.
-        gaussians: N Gaussians in the scene's frame, on the model's device.
-        cameras: M cameras to compare from.
-        dataset: their images, on the model's device; None without any.
-        near: Gaussians whose centre has a smaller depth are not drawn, scene units.
-        look: how the Gaussians are drawn.
-        moment: time of the views; None for a static scene.
-    """
-    background = model.background
-    judged = (views_to_judge(dataset) if dataset else []) or list(range(len(cameras)))
-    chosen = [judged[rank] for rank in spread(len(judged), MAX_VIEWS)]
-    as_seen = cameras.model in DRAWN
-    cameras = cameras if as_seen else pinhole(cameras)
-    own: list[float] = []
-    photographs: list[tuple[float, float]] = []
-    for index in track(chosen, "Comparing", total=len(chosen)):
-        view = View.of(cameras, index, None if dataset is None else dataset.times)
-        rgb = model.render_rgb(view, background).clamp(0, 1).float()
-        with torch.no_grad():
-            shown = draw_colors(gaussians, splat_camera(view.camera, near, look), 1, background).clamp(0, 1)
-        own.append(psnr(shown, rgb))
-        if dataset is not None and as_seen and moment is None:
-            target = composite(dataset.image(index).float() / 255, background)
-            kept = dataset.kept_of(index)
-            photographs.append((measure(shown, target, kept).psnr, measure(rgb, target, kept).psnr))
-    kind = "views around it" if dataset is None else f"{'training' if dataset.training else 'held-out'} views"
-    views = f"{len(chosen)} {kind}"
-    if not photographs:
-        return Closeness(views, fmean(own), None, None)
-    page, method = zip(*photographs, strict=True)
-    return Closeness(views, fmean(own), fmean(page), fmean(method))
+def _check_seconds(seconds: float) -> None:
+    if not seconds > 0:
+        raise FlagError(f"--fit-seconds is {seconds:g}; it must be positive")
 
 
 def moment_of(moving: bool, asked: float | None) -> float | None:
@@ -296,12 +216,14 @@ def _title(loaded: Loaded) -> str:
     return printable(f"{experiment} · {loaded.method}")
 
 
-def _about(loaded: Loaded, moment: float | None) -> str:
-    method = loaded.method
+def _about(loaded: Loaded, kind: PageKind, moment: float | None) -> str:
+    method, model = loaded.method, loaded.model
     made = f"with {method}" if loaded.is_run else f"from {printable(loaded.origin.name)}"
     parts = [f"Made by Nerfloom {made}."]
-    if not isinstance(loaded.model, HasGaussians):
+    if kind == "gaussians" and not isinstance(model, HasGaussians):
         parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
+    if kind == "octree" and not isinstance(model, DrawnOctree):
+        parts.append(f"The octree shown here is baked from {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")
     return " ".join([*parts, "The page works offline and requests nothing from any host."])

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+PageKind = Literal["gaussians", "octree"]
+"""What a web page shows."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointSettings:
@@ -69,12 +72,15 @@ class LevelsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class WebSettings:
-    """A page that shows the scene's Gaussians, or Gaussians fitted to pictures of a field."""
+    """A page that shows the scene's Gaussians or octree, or ones that are made from a field."""
 
+    kind: PageKind | None = None
+    """What the page shows. octree: a run is baked, as by ns-bake; gaussians: they are fitted to what has none. Default:
+    the octree of an octree's file, else Gaussians."""
     max_megabytes: float = 30.0
-    """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians last."""
+    """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians or leaves last."""
     fit_seconds: float = 60.0
-    """Seconds for fitting Gaussians to a field: rendering pictures of it and training on them."""
+    """Seconds for fitting Gaussians to pictures of a field, or for an octree to learn from the photographs."""
     time: float | None = None
     """Time of a moving scene, 0 to 1. Default: 0."""
     title: str | None = None

@@ -1,7 +1,8 @@
-"""A web page of Gaussians: one HTML file that opens from disk, offline, in any browser with WebGL 2.
+"""A web page of a scene: one HTML file that opens from disk, offline, in any browser with WebGL 2.
 
-The page (`page/`) is our own: it draws as `framework/kernels/splats/project.py` does, requests nothing from any host,
-and holds the Gaussians as an SPZ file (`framework/splats/spz.py`) in base64, and facts about them as JSON.
+The page (`page/`) is our own, requests nothing from any host, and holds the scene in base64 and facts about it as JSON.
+Gaussians are an SPZ file (`framework/splats/spz.py`), drawn as `framework/kernels/splats/project.py` does. Octrees have
+their own form (`octree_page.py`) and are drawn as `framework/kernels/octree/walk.h` does. All else is the same program.
 """
 
 from __future__ import annotations
@@ -39,17 +40,20 @@ MAX_CAMERAS = 300
 """Maximum number of the capture's cameras in a page, evenly spaced."""
 PICTURE = (1200, 630)
 """Width and height of the picture of link previews, pixels, in the aspect ratio that most programs show."""
-SCRIPTS = ("spz.js", "splats.js", "measure.js", "viewer.js")
-"""Files of the page's program, in their order."""
+SCRIPTS = {
+    "gaussians": ("unpack.js", "webgl.js", "splats.js", "measure.js", "viewer.js"),
+    "octree": ("unpack.js", "webgl.js", "octree.js", "measure.js", "viewer.js"),
+}
+"""Files of the program of each kind of page, in their order."""
 LEVEL = 0.5
 """The scene is turned if the cosine between z and the cameras' mean up direction is below this."""
 DATA = re.compile(r'<script id="data" type="text/plain">([^<]*)</script>')
-"""The Gaussians in a page."""
+"""The scene in a page."""
 
 
 @dataclass(frozen=True)
 class PageFacts:
-    """Facts about the scene that a page holds in addition to its Gaussians."""
+    """Facts that a page holds in addition to the scene."""
 
     title: str
     """Heading and title of the page."""
@@ -58,9 +62,10 @@ class PageFacts:
     background: tuple[float, float, float]
     """Colour behind everything, 0 to 1."""
     near: float
-    """Gaussians whose centre has a smaller depth are not drawn, scene units."""
-    look: Look
-    """How Gaussians are drawn."""
+    """Gaussians whose centre has a smaller depth, and parts of an octree at a smaller distance, are not drawn, scene
+    units."""
+    look: Look | None
+    """How Gaussians are drawn; None for an octree."""
     focus: list[float]
     """Position x, y, z that the cameras look at, scene units."""
     cameras: list[list[Any]]
@@ -80,6 +85,11 @@ class PageFacts:
     """Address that the page will have; empty if unknown."""
     picture: str = ""
     """Name of a picture of PICTURE pixels beside the page, for link previews; empty for none."""
+
+    @property
+    def kind(self) -> str:
+        """What the page draws, a key of `SCRIPTS`."""
+        return "gaussians" if self.look else "octree"
 
 
 def upright(cameras: Cameras) -> Tensor:
@@ -166,7 +176,7 @@ def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
 
 
 def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> tuple[str, list[str]]:
-    """Return a web page of limited size, and sentences about what was removed to fit it.
+    """Return a web page of Gaussians of limited size, and sentences about what was removed to fit it.
 
     Args:
         gaussians: N Gaussians on the CPU, in a frame where z is up.
@@ -175,15 +185,30 @@ def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> t
 
     Raises:
         ConfigError: if the limit is above MAX_MEGABYTES, or no Gaussian fits.
+        ValueError: if `facts` do not say how Gaussians are drawn.
     """
-    check_size(max_megabytes)
-    empty = page(b"", facts)
-    most = (1e6 * max_megabytes - len(empty.encode())) // 4 * 3
+    if facts.look is None:
+        raise ValueError("a page of Gaussians says how they are drawn")
+    most = room(facts, max_megabytes)
     payload, lost, changes = encoded(gaussians, BITS, facts.look), out_of_range(gaussians), ""
     if len(payload) > most:
         payload, lost, changes = fitted_spz(gaussians, most, facts.look)
         changes = changes or "harmonics in 5 and 4 bits instead of 8"
     return page(payload, facts), [f"{max_megabytes:g} MB hold {changes}", *lost] if changes else lost
+
+
+def room(facts: PageFacts, max_megabytes: float) -> float:
+    """Return the number of bytes that a page has for its scene.
+
+    Args:
+        facts: further data of the page.
+        max_megabytes: maximum size of the page, in millions of bytes.
+
+    Raises:
+        ConfigError: if the limit is above MAX_MEGABYTES.
+    """
+    check_size(max_megabytes)
+    return (1e6 * max_megabytes - len(page(b"", facts).encode())) // 4 * 3
 
 
 def check_size(max_megabytes: float) -> None:
@@ -202,10 +227,10 @@ def check_size(max_megabytes: float) -> None:
 
 
 def page(payload: bytes, facts: PageFacts) -> str:
-    """Return the page of an SPZ file.
+    """Return the page of a scene.
 
     Args:
-        payload: content of the file.
+        payload: content of its SPZ file, or of an octree (`octree_page.py`).
         facts: further data of the page.
     """
     folder = files("nerfloom.export") / "page"
@@ -217,7 +242,7 @@ def page(payload: bytes, facts: PageFacts) -> str:
         "preview": preview_tags(facts),
         "version": html.escape(nerfloom.__version__),
         "style": (folder / "viewer.css").read_text(encoding="utf-8"),
-        "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS),
+        "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS[facts.kind]),
         "facts": plain.replace("<", "\\u003c"),  # no name ends the element
         "data": base64.b64encode(payload).decode(),
     }
@@ -245,7 +270,7 @@ def preview_tags(facts: PageFacts) -> str:
 
 
 def payload_of(text: str) -> bytes:
-    """Return the SPZ file in a page.
+    """Return the scene in a page, as given to `page`.
 
     Args:
         text: content of the page.
@@ -261,7 +286,7 @@ def payload_of(text: str) -> bytes:
 
 
 def gaussians_of(text: str) -> Gaussians:
-    """Return the Gaussians in a page, as they are drawn there.
+    """Return the Gaussians in a page of Gaussians, as they are drawn there.
 
     Args:
         text: content of the page.

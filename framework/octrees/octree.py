@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import Scene
@@ -44,11 +46,32 @@ class Octree:
         )
 
     @property
+    def degree(self) -> int:
+        """Degree of the harmonics of colours."""
+        return math.isqrt(self.leaves.colors.shape[1] // 3) - 1
+
+    def part(self, kept: Tensor) -> Octree:
+        """Return the octree with some of its leaves.
+
+        Args:
+            kept: (N,) int64 indices of the leaves that are kept, each once.
+        """
+        layout, leaves = self.layout, self.leaves
+        layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
+        kept = kept[rows]
+        return replace(
+            self, layout=layout, leaves=replace(leaves, codes=leaves.codes[kept], colors=leaves.colors[kept])
+        )
+
+    @property
     def scene(self) -> Scene:
-        """The scene as far as the octree knows it, without cameras."""
+        """The scene as far as the octree knows it, without cameras.
+
+        It starts at a camera itself: `near` is for the training cameras, and others may stand closer.
+        """
         return Scene(
             box=self.layout.box,
-            near=self.near,
+            near=0.0,
             far=self.far,
             num_cameras=0,
             has_alpha=self.has_alpha,

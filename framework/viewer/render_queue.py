@@ -17,6 +17,7 @@ from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.beside import draw_beside
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.drawing import Truth
+from nerfloom.viewer.in_motion import draw_in_motion, is_shared
 from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
 from nerfloom.viewer.request import Request, smaller
 
@@ -44,6 +45,7 @@ class RenderQueue:
         ndc: function that returns the normalised device coordinates of the scene; None if it has none.
         truth: true images for the output `error` and the overlay.
         second: a second run or file, drawn beside the first; None for none.
+        quick: a faster file of the same scene, drawn while the camera moves; None for the run itself.
     """
 
     def __init__(
@@ -54,12 +56,13 @@ class RenderQueue:
         ndc: Ndc | None = None,
         truth: Truth | None = None,
         second: Loaded | None = None,
+        quick: Loaded | None = None,
     ) -> None:
-        self.loaded, self.second = loaded, second
+        self.loaded, self.second, self._quick = loaded, second, quick
         self.coarse_seconds, self.piece_seconds = coarse_seconds, piece_seconds
         self.hurried = False
         self._ndc, self._truth = ndc, truth
-        self._speed = Speed()
+        self._speed, self._quick_speed = Speed(), Speed()
         self._browsers: dict[int, Browser] = {}
         self._tasks: deque[Callable[[], None]] = deque()
         self._lock = threading.Lock()
@@ -142,11 +145,14 @@ class RenderQueue:
         request, step, budget = browser.wanted, self.loaded.step, self._piece_seconds
         assert request is not None
         if request != browser.drawn:
-            stride = coarse_stride(self._speed, request.width, request.height, self.coarse_seconds, browser.stride)
+            # The run draws its first picture itself: its speed determines the size of its pieces.
+            quick = self._quick if self._speed.measured and is_shared(request) else None
+            speed = self._speed if quick is None else self._quick_speed
+            stride = coarse_stride(speed, request.width, request.height, self.coarse_seconds, browser.stride)
             whole = Piece(stride, 1, 0, smaller(request.width, request.height, stride)[1])
-            kept = self._timed(request, whole)
+            kept = self._timed(request, whole) if quick is None else self._quickly(quick, request, whole)
             left: list[Piece] = []
-            if stride > 1 or self._rays > 1:
+            if quick is not None or stride > 1 or self._rays > 1:
                 left = refinement(self._speed, request.width, request.height, stride, self._rays, budget)
             browser.begin(request, stride, step, kept, left)
             return
@@ -168,9 +174,20 @@ class RenderQueue:
         """Draw a piece and measure its time."""
         start = time.perf_counter()
         kept = draw_beside(self.loaded, self.second, request, piece, self._ndc, self._truth)
-        pixels = smaller(request.width, request.height, piece.stride)[0] * (piece.bottom - piece.top)
-        self._speed = self._speed.with_one(pixels * piece.rays, time.perf_counter() - start)
+        self._speed = self._speed.with_one(_rays_of(request, piece), time.perf_counter() - start)
         return kept
+
+    def _quickly(self, quick: Loaded, request: Request, piece: Piece) -> Arrays:
+        """Draw a piece of the faster file and measure its time."""
+        start = time.perf_counter()
+        kept = draw_in_motion(self.loaded, quick, request, piece)
+        self._quick_speed = self._quick_speed.with_one(_rays_of(request, piece), time.perf_counter() - start)
+        return kept
+
+
+def _rays_of(request: Request, piece: Piece) -> int:
+    columns, _ = smaller(request.width, request.height, piece.stride)
+    return columns * (piece.bottom - piece.top) * piece.rays
 
 
 def _reason(error: BaseException) -> str:

@@ -20,7 +20,9 @@ SECONDS_PER_LOOK = 2.0
 """Seconds between checks for a newer checkpoint."""
 
 
-def view_loaded(loaded: Loaded, host: str, port: int, follow: bool, second: Loaded | None = None) -> None:
+def view_loaded(
+    loaded: Loaded, host: str, port: int, follow: bool, second: Loaded | None = None, quick: Loaded | None = None
+) -> None:
     """Serve a run, a file of Gaussians or an octree to browsers until Ctrl-C.
 
     Args:
@@ -29,6 +31,7 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool, second: Load
         port: port to listen on; the next free one if it is taken.
         follow: whether to show newer checkpoints of the run as they are written.
         second: a second run or file of the same data, which is shown beside the first; None for none.
+        quick: a faster file of the same scene, which is drawn while the camera moves; None for none.
 
     Raises:
         ConfigError: if viser is missing, the address cannot be used, or the two cannot be shown side by side.
@@ -36,10 +39,11 @@ def view_loaded(loaded: Loaded, host: str, port: int, follow: bool, second: Load
     """
     queue: RenderQueue
     photographs = Photographs(loaded.source, lambda: queue.loaded.model)
-    if second is not None:
-        check_beside(loaded, second)
+    for other in (second, quick):
+        if other is not None:
+            check_beside(loaded, other)
     ndc = _ndc(loaded.model.scene.warped, photographs)
-    queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=second)
+    queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=second, quick=quick)
     server = open_server(host, port, "nerfloom")
     page = Page(server, queue, photographs, may_start=follow)
     say("Ctrl-C ends it")

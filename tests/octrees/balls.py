@@ -28,3 +28,21 @@ def ball(degree: int = 1, depth: float = 5.0) -> Octree:
     leaves, _ = packed(torch.full((len(rows),), depth), coefficients.view(len(rows), -1))
     placement = Placement.of(torch.eye(3, 4), 0.25)
     return Octree(layout, leaves, placement, 0.1, 10.0, True, 400)
+
+
+def grains(degree: int, share: float = 0.4) -> Octree:
+    """Cells of all densities and colours in a ball and in a corner far from it, with empty bricks around."""
+    torch.manual_seed(degree)
+    size, cell = (6, 4, 5), 0.04
+    cells = torch.cartesian_prod(*(torch.arange(8 * bricks) for bricks in size))
+    centers = cell * (cells + 0.5 - 4 * torch.tensor(size))
+    inside = (centers.norm(dim=-1) < 0.5) & (torch.rand(len(cells)) < share)
+    corner = (cells < 3).all(-1)
+    origin = -4 * cell * torch.tensor(size)
+    layout, rows = OctreeLayout.build(origin, cell, size, cells[inside | corner])
+    coefficients = 0.15 * torch.randn(len(rows), 3, (degree + 1) ** 2)
+    coefficients[..., 0] = 0.5 / CONSTANT + 0.8 * torch.randn(len(rows), 3)
+    depths = torch.exp(torch.randn(len(rows)))
+    placement = Placement.of(torch.eye(3, 4), 0.25)
+    leaves, _ = packed(depths, coefficients.view(len(rows), -1))
+    return Octree(layout, leaves, placement, 0.1, 10.0, True, 200)

@@ -1,8 +1,9 @@
-"""A few Gaussians and cameras, and a page of them."""
+"""A few Gaussians and cameras, and pages of them and of octrees."""
 
 import math
 
 import torch
+from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.evaluation.paths import look_at
@@ -45,3 +46,14 @@ def some_facts(title: str = "test", look: Look = OURS) -> PageFacts:
     cameras, turn = some_cameras(), torch.eye(3, dtype=torch.float64)
     rows = camera_rows(cameras, ["a.png", "b.png", "c.png", "</script>"], turn)
     return PageFacts(title, "About.", (1.0, 1.0, 1.0), 0.05, look, focus_of(cameras, turn), rows)
+
+
+ASLANT = torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]], dtype=torch.float64)
+"""A rotation about no axis of the frame."""
+
+
+def octree_facts(turn: Tensor) -> PageFacts:
+    """Facts about those cameras, for an octree in a turned frame."""
+    cameras = some_cameras()
+    rows = camera_rows(cameras, ["a.png", "b.png", "c.png", "d.png"], turn)
+    return PageFacts("test", "About.", (1.0, 1.0, 1.0), 0.05, None, focus_of(cameras, turn), rows)

@@ -13,15 +13,19 @@ import pytest
 import torch
 
 from nerfloom.cameras.triangulation import point_covariance, projection_jacobians, reading_error
+from nerfloom.cameras.view import View
 from nerfloom.evaluation.measuring import Length
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.evaluation.paths import look_at
+from nerfloom.export.octree_page import make_octree_page
 from nerfloom.export.web import camera_rows, gaussians_of, make_page
+from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.splats.drawing import draw_colors, splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
+from tests.octrees.balls import grains
 from tests.patience import PATIENCE
-from tests.web.helpers import SIZE, some_cameras, some_facts, some_gaussians
+from tests.web.helpers import ASLANT, SIZE, octree_facts, some_cameras, some_facts, some_gaussians
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 CLOSE = 45.0
@@ -56,12 +60,17 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def compared(browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "", look: Look = OURS) -> float:
-    """PSNR of the browser's picture against our own."""
+def pictured(browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "") -> torch.Tensor:
+    """What the browser shows of a camera, (H, W, 3)."""
     shot = tmp_path / "shot.png"
     opened(browser, tmp_path, f"{scene.as_uri()}#camera={camera}&plain=1{more}", f"--screenshot={shot}")
     width, height = SIZE
-    seen = torch.from_numpy(iio.imread(shot)[:height, :width, :3].copy()).float() / 255
+    return torch.from_numpy(iio.imread(shot)[:height, :width, :3].copy()).float() / 255
+
+
+def compared(browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "", look: Look = OURS) -> float:
+    """PSNR of the browser's picture against our own."""
+    seen = pictured(browser, scene, tmp_path, camera, more)
     gaussians = gaussians_of(scene.read_text(encoding="utf-8"))
     chosen = splat_camera(some_cameras()[camera : camera + 1], 0.05, look)
     own = draw_colors(gaussians, chosen, 1, torch.ones(3)).clamp(0, 1)
@@ -89,6 +98,72 @@ def test_the_browser_draws_fewer_harmonics(browser: str, tmp_path: Path, degree:
     facts = some_facts(look=look)
     file.write_text(make_page(some_gaussians(1500, degree), facts, 30)[0], encoding="utf-8")
     assert compared(browser, file, tmp_path, 2, look=look) > CLOSE
+
+
+@pytest.fixture(scope="module")
+def aslant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of an octree; its axes are not the page's."""
+    file = tmp_path_factory.mktemp("octree") / "scene.html"
+    file.write_text(octree_text(1), encoding="utf-8")
+    return file
+
+
+def octree_text(degree: int) -> str:
+    """The page of an octree."""
+    return make_octree_page(grains(degree), ASLANT, some_cameras(), octree_facts(ASLANT), 30)[0]
+
+
+def our_octree(degree: int) -> DrawnOctree:
+    """The same octree as we draw it; the page's rays start at a distance of 0.05, too."""
+    octree = grains(degree)
+    return DrawnOctree(octree, replace(octree.scene, near=0.05))
+
+
+def octrees_compared(browser: str, scene: Path, tmp_path: Path, degree: int, camera: int) -> float:
+    """PSNR of the browser's picture against our own."""
+    seen = pictured(browser, scene, tmp_path, camera)
+    own = our_octree(degree).render_rgb(View(some_cameras()[camera : camera + 1]), torch.ones(3))
+    assert float(own.std()) > 0.05  # there is something to see
+    found = psnr(seen, own)
+    print(f"octree of degree {degree}, camera {camera}: PSNR of the browser's picture against ours {found:.1f} dB")
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [0, 3])
+def test_the_browser_traces_what_we_trace(browser: str, aslant: Path, tmp_path: Path, camera: int) -> None:
+    assert octrees_compared(browser, aslant, tmp_path, 1, camera) > CLOSE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_the_browser_traces_other_harmonics(browser: str, tmp_path: Path, degree: int) -> None:
+    file = tmp_path / "scene.html"
+    file.write_text(octree_text(degree), encoding="utf-8")
+    assert octrees_compared(browser, file, tmp_path, degree, 1) > CLOSE
+
+
+@pytest.mark.slow
+def test_the_page_of_an_octree_measures_on_its_surface(browser: str, aslant: Path, tmp_path: Path) -> None:
+    """Where half of the light is gone: as far away as we find it."""
+    view, pixels = 1, [(97.0, 71.0), (110.0, 80.0)]
+    camera = some_cameras()[view : view + 1]
+    picture = our_octree(1).render_view(View(camera), torch.ones(3))
+    expected = []
+    for column, row in pixels:
+        rays = camera.rays(torch.zeros(1).long(), torch.tensor([column]), torch.tensor([row]), 0.05, 10.0)
+        depth = picture.median_depth[int(row), int(column)]
+        assert float(depth) < 5  # the ray meets the octree
+        expected.append((rays.origins + depth * rays.directions)[0])
+    script = MEASURE.replace("SIZE", "{}, {}".format(*SIZE))
+    script = script.replace("PLACES", str([[column + 0.5, row + 0.5] for column, row in pixels]))
+    file = tmp_path / "measure.html"
+    file.write_text(aslant.read_text(encoding="utf-8").replace("</body>", script + "</body>"), encoding="utf-8")
+    dom = opened(browser, tmp_path, f"{file.as_uri()}#camera={view}", "--dump-dom")
+    points = re.search(r'data-points="([^"]*)"', dom)
+    assert points is not None, dom[:300]
+    picked = torch.tensor([[float(x) for x in each.split()] for each in points[1].split("|")])
+    torch.testing.assert_close(picked, (torch.stack(expected).double() @ ASLANT.T).float(), atol=1e-3, rtol=0)
 
 
 DRAG = """<script>

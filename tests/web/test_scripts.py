@@ -22,7 +22,7 @@ def run(code: str, given: Any) -> Any:
     """Run JavaScript behind the page's functions; it answers by `answer(value)`, and `given` is what it is given."""
     if (node := shutil.which("node")) is None:
         pytest.skip("there is no Node.js; the page's program is not run")
-    program = "".join((PAGE / name).read_text(encoding="utf-8") for name in ("spz.js", "splats.js"))
+    program = "".join((PAGE / name).read_text(encoding="utf-8") for name in ("unpack.js", "webgl.js", "splats.js"))
     start = f"const given = {json.dumps(given)}, answer = (value) => console.log(JSON.stringify(value));\n"
     done = subprocess.run([node, "-"], input=program + start + code, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr

@@ -1,53 +1,7 @@
-// Measuring, as framework/evaluation/measuring.py does it: the surface at a pixel, and a length with its error.
+// Measuring, as framework/evaluation/measuring.py does it: a length between two points of surfaces, with its error.
 
-const HALF = 0.5; // transmittance at the surface, and the error of a point in a photograph in pixels
+const HALF = 0.5; // error of a point in a photograph, pixels
 const SEEN_WITHIN = Math.cos(Math.PI / 3); // angle, seen from a point, between the view and the cameras that see it too
-
-/** Return the surface at a position of a picture, or null: as far away as the Gaussian that makes the ray half opaque. */
-function surfaceAt(gaussians, { look, near }, view, width, height, x, y) {
-  const camera = cameraOf(view, width, height), { right, down, forward } = axesOf(view), bytes = gaussians.table;
-  const byte = (word, k) => (word >>> (8 * k)) & 255, crossed = [];
-  const low = [(-0.15 * width - camera.cx) / camera.fx, (-0.15 * height - camera.cy) / camera.fy];
-  const high = [(1.15 * width - camera.cx) / camera.fx, (1.15 * height - camera.cy) / camera.fy];
-  for (let i = 0; i < gaussians.count; i++) {
-    const at = 4 * gaussians.texels * i, mean = [0, 1, 2].map((k) => gaussians.centers[3 * i + k] - view.eye[k]);
-    const z = dot(mean, forward);
-    if (z <= near) continue;
-    const place = [dot(mean, right) / z, dot(mean, down) / z], scales = [0, 1, 2].map((k) => Math.exp(byte(bytes[at + 4], k) / 16 - 10));
-    const dx = x - camera.fx * place[0] - camera.cx, dy = y - camera.fy * place[1] - camera.cy;
-    const held = place.map((value, k) => Math.min(Math.max(value, low[k]), high[k]));
-    const stretch = 1 + Math.hypot(...held), focal = Math.max(camera.fx, camera.fy) / z;
-    const reach = 3.4 * Math.hypot(focal * stretch * Math.max(...scales), Math.sqrt(look.blur)); // sqrt(2 log 255) is 3.33
-    if (Math.abs(dx) > reach || Math.abs(dy) > reach) continue;
-    // The rows of J W R diag(s), as in the vertex shader.
-    const v = [0, 1, 2].map((k) => (byte(bytes[at + 5], k) / 127.5 - 1) * (k ? -1 : 1));
-    const w = Math.sqrt(Math.max(1 - dot(v, v), 0)), norm = 1 / Math.hypot(...v, w);
-    const [a, b, c, d] = [...v, w].map((value) => value * norm);
-    const columns = [
-      [1 - 2 * (b * b + c * c), 2 * (a * b + d * c), 2 * (a * c - d * b)],
-      [2 * (a * b - d * c), 1 - 2 * (a * a + c * c), 2 * (b * c + d * a)],
-      [2 * (a * c + d * b), 2 * (b * c - d * a), 1 - 2 * (a * a + b * b)],
-    ];
-    const seen = (axis) => columns.map((column, k) => dot(axis, column) * scales[k]), rowZ = seen(forward);
-    const rowX = seen(right).map((value, k) => (camera.fx / z) * (value - held[0] * rowZ[k]));
-    const rowY = seen(down).map((value, k) => (camera.fy / z) * (value - held[1] * rowZ[k]));
-    const flat = Math.hypot(...cross(rowX, rowY)) ** 2, xy = dot(rowX, rowY);
-    const xx = dot(rowX, rowX) + look.blur, yy = dot(rowY, rowY) + look.blur;
-    const det = flat + look.blur * (xx + yy) - look.blur * look.blur;
-    let opacity = Math.min(Math.max(bytes[at + 3] >>> 24, 0.25), 254.75) / 255;
-    if (look.antialiased) opacity *= Math.sqrt(Math.max(flat / det, 1e-30));
-    const exponent = (0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy)) / det;
-    if (exponent >= Math.log(opacity * 255)) continue;
-    const alpha = Math.min(opacity * Math.exp(-exponent), 0.999), distance = Math.hypot(...mean);
-    crossed.push({ alpha, distance, order: look.sort === "depth" ? z : distance });
-  }
-  crossed.sort((one, other) => one.order - other.order);
-  let through = 1;
-  const hit = crossed.find(({ alpha }) => { through *= 1 - alpha; return through <= HALF; });
-  if (!hit) return null;
-  const ray = add(add(forward, right, (x - camera.cx) / camera.fx), down, (y - camera.cy) / camera.fy);
-  return add(view.eye, ray, hit.distance / Math.hypot(...ray));
-}
 
 /** Return the covariance of a point, six numbers xx xy xz yy yz zz, by the photographs that see it from about where the
  * view is; null if fewer than two do. */
@@ -91,7 +45,7 @@ function lengthText(facts, [start, end]) {
 }
 
 /** Return the measuring tool: `pick` adds a point, and `follow` moves the line with the view. */
-function ruler(gaussians, facts) {
+function ruler(facts) {
   let points = [], text = "";
   const board = element("ruler"), [line, first, second, label] = board.children;
   const tool = {
@@ -100,9 +54,7 @@ function ruler(gaussians, facts) {
       text = "";
       state.measured = "";
     },
-    pick(view, width, height, x, y) {
-      const point = surfaceAt(gaussians, facts, view, width, height, x, y);
-      if (!point) return;
+    pick(view, point) {
       points = [...(points.length === 1 ? points : []), { point, eye: view.eye }];
       text = points.length === 2 ? lengthText(facts, points) : "";
       state.points = points.map((one) => one.point.map((value) => value.toFixed(5)).join(" ")).join("|");

@@ -3,26 +3,82 @@
 // GPU idle, and costs a call of its own where WebGL runs in software.
 
 const BATCH = 4096; // Gaussians an instance, and places in a row of the texture of their order
+const HEADER = 16; // bytes of an SPZ file of version 2 (framework/splats/spz.py), before one array an attribute
+const TEXEL = 16; // bytes
 
-const HARMONICS = [
-  "-0.4886025119029199 * d.y", "0.4886025119029199 * d.z", "-0.4886025119029199 * d.x",
-  "1.0925484305920792 * d.x * d.y", "-1.0925484305920792 * d.y * d.z",
-  "0.31539156525252005 * (3.0 * d.z * d.z - 1.0)", "-1.0925484305920792 * d.x * d.z",
-  "0.5462742152960396 * (d.x * d.x - d.y * d.y)",
-  "-0.5900435899266435 * d.y * (3.0 * d.x * d.x - d.y * d.y)", "2.890611442640554 * d.x * d.y * d.z",
-  "-0.4570457994644658 * d.y * (5.0 * d.z * d.z - 1.0)", "0.3731763325901154 * d.z * (5.0 * d.z * d.z - 3.0)",
-  "-0.4570457994644658 * d.x * (5.0 * d.z * d.z - 1.0)", "1.445305721320277 * d.z * (d.x * d.x - d.y * d.y)",
-  "-0.5900435899266435 * d.x * (d.x * d.x - 3.0 * d.y * d.y)",
-];
+/** Return the scene of a page: what it is made of, `follow` and `drawer`. Gaussians are sorted by a worker, or `here`. */
+function sceneOf(raw, facts, here) {
+  const gaussians = gaussiansOf(raw), sort = sortingElsewhere(gaussians.centers, here);
+  const sorted = { order: null, times: 0 };
+  let wanted = null, sorting = false;
+  return {
+    count: gaussians.count,
+    things: "Gaussians",
+    /** Have Gaussians sorted for a view; true if there is an order to draw in. `changed` is called at each new one. */
+    follow(view, changed) {
+      const from = { eye: view.eye, axis: facts.look.sort === "depth" ? axesOf(view).forward : null };
+      const numbers = [...from.eye, ...(from.axis || [])];
+      if (!sorting && !(wanted && wanted.every((x, k) => x === numbers[k]))) {
+        sorting = true;
+        wanted = numbers;
+        sort(from, (order) => {
+          sorted.order = order;
+          sorted.times += 1;
+          sorting = false;
+          changed();
+        });
+      }
+      return sorted.order !== null;
+    },
+    drawer: (gl) => drawer(gl, gaussians, sorted, facts),
+  };
+}
+
+/** Return the Gaussians of an unpacked SPZ file: centres (N x 3, scene coordinates), and a table for the GPU.
+ *
+ * The table has 2 texels of four 32-bit words a Gaussian, and more for its harmonics, whose bytes stay as they are:
+ *     x, y, z as float32; colour and opacity, 8 bits each
+ *     three scales, 8 bits each; three components of the quaternion, 8 bits each; two words of 0
+ */
+function gaussiansOf(raw) {
+  const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
+  const refuse = (why) => { throw new Refused(`The data in this page are damaged: ${why}. Export the page again.`); };
+  if (raw.length < HEADER || view.getUint32(0, true) !== 0x5053474e) refuse("they are not an SPZ file");
+  const count = view.getUint32(8, true), degree = raw[12], scale = 2 ** -raw[13];
+  if (view.getUint32(4, true) !== 2 || degree > 3 || raw[13] > 30) refuse("their header is not one of ours");
+  const rest = 3 * ((degree + 1) ** 2 - 1);
+  if (raw.length !== HEADER + count * (19 + rest)) refuse("they are not as long as their header says");
+  const extra = Math.ceil(rest / TEXEL), texels = 2 + extra;
+  const positions = HEADER, alphas = positions + 9 * count, colors = alphas + count, scales = colors + 3 * count;
+  const turns = scales + 3 * count, harmonics = turns + 3 * count;
+  const width = 1024 * texels; // a row of the texture holds 1024 Gaussians
+  const rows = Math.max(Math.ceil(count / 1024), 1);
+  const table = new Uint8Array(rows * width * TEXEL), centers = new Float32Array(3 * count);
+  const floats = new Float32Array(table.buffer);
+  for (let i = 0; i < count; i++) {
+    const to = i * texels * TEXEL;
+    for (let k = 0; k < 3; k++) {
+      const from = positions + 9 * i + 3 * k;
+      const fixed = ((raw[from] | (raw[from + 1] << 8) | (raw[from + 2] << 16)) << 8) >> 8;
+      // SPZ's y and z point the other way.
+      floats[to / 4 + k] = centers[3 * i + k] = (k ? -fixed : fixed) * scale;
+      table[to + 12 + k] = raw[colors + 3 * i + k];
+      table[to + 16 + k] = raw[scales + 3 * i + k];
+      table[to + 20 + k] = raw[turns + 3 * i + k];
+    }
+    table[to + 15] = raw[alphas + i];
+    for (let k = 0, from = harmonics + rest * i; k < rest; k++) table[to + 2 * TEXEL + k] = raw[from + k];
+  }
+  return { count, degree, centers, table: new Uint32Array(table.buffer), width, rows, texels };
+}
 
 /** Return the vertex shader for harmonics up to a degree. */
 function vertexShader(degree) {
-  const byte = (i) => `float((t${i >> 4}[${(i >> 2) & 3}] >> ${8 * (i & 3)}u) & 255u)`;
   const terms = (degree + 1) ** 2 - 1, extra = Math.ceil((3 * terms) / 16);
   let sum = "";
   for (let i = 0; i < extra; i++) sum += `  uvec4 t${i} = texelFetch(table, at + ivec2(${2 + i}, 0), 0);\n`;
   for (let k = 0; k < terms; k++) {
-    const value = [0, 1, 2].map((c) => byte(3 * k + c)).join(", ");
+    const value = [0, 1, 2].map((c) => byteOf(3 * k + c)).join(", ");
     sum += `  rgb += (vec3(${value}) / 128.0 - 1.0) * (${HARMONICS[k]});\n`;
   }
   return `#version 300 es
@@ -114,57 +170,28 @@ void main() {
   drawn = vec4(color.rgb * alpha, alpha);
 }`;
 
-const WHOLE = `#version 300 es
-void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID >> 1) * 4 - 1), 0.0, 1.0); }`;
-
 const COPY = `#version 300 es
 precision highp float;
 uniform sampler2D image;
 out vec4 drawn;
 void main() { drawn = vec4(clamp(texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb, 0.0, 1.0), 1.0); }`;
 
-function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    gl.attachShader(made, shader);
-  }
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
-    throw new Refused(`This browser's graphics cannot draw the page: ${gl.getProgramInfoLog(made) || "no reason given"}`);
-  }
-  const uniforms = {};
-  for (let i = 0; i < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); i++) {
-    const { name } = gl.getActiveUniform(made, i);
-    uniforms[name] = gl.getUniformLocation(made, name);
-  }
-  return { made, uniforms };
-}
-
-/** Return functions that draw Gaussians on a canvas: `setOrder(order)`, `draw(camera, background)`.
+/** Return functions that draw Gaussians on a canvas, in the order that `sorted` holds, and that find surfaces.
  *
  * Colours are summed in 16-bit floats where the browser can: in 8 bits each of a hundred layers would be rounded.
  */
-function drawer(gl, gaussians, { look, near }) {
+function drawer(gl, gaussians, sorted, facts) {
+  const { look, near } = facts;
   const splat = program(gl, vertexShader(gaussians.degree), FRAGMENT), copy = program(gl, WHOLE, COPY);
   const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
   if (gaussians.width > most || gaussians.rows > most) {
     throw new Refused("This device's graphics cannot hold this many Gaussians; export with a lower --max-megabytes.");
   }
-  const texture = (unit, format, width, height) => {
-    gl.activeTexture(unit);
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  };
   const { width: tableWidth, rows: tableRows } = gaussians;
-  texture(gl.TEXTURE0, gl.RGBA32UI, tableWidth, tableRows);
+  texture(gl, gl.TEXTURE0, gl.RGBA32UI, tableWidth, tableRows);
   gl.texSubImage2D(
     gl.TEXTURE_2D, 0, 0, 0, tableWidth, tableRows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, gaussians.table);
-  texture(gl.TEXTURE2, gl.R32UI, BATCH, Math.max(Math.ceil(gaussians.count / BATCH), 1));
+  texture(gl, gl.TEXTURE2, gl.R32UI, BATCH, Math.max(Math.ceil(gaussians.count / BATCH), 1));
 
   const whole = gl.createVertexArray(), each = gl.createVertexArray();
   gl.bindVertexArray(each);
@@ -190,17 +217,23 @@ function drawer(gl, gaussians, { look, near }) {
     return buffer;
   };
 
+  let held = 0;
+  const holdOrder = () => {
+    const { order, times } = sorted;
+    if (held === times) return;
+    held = times;
+    drawn = order.length;
+    const rows = Math.floor(drawn / BATCH), rest = drawn % BATCH;
+    gl.activeTexture(gl.TEXTURE2);
+    const upload = (row, width, height, part) => gl.texSubImage2D(
+      gl.TEXTURE_2D, 0, 0, row, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, part);
+    if (rows) upload(0, BATCH, rows, order.subarray(0, rows * BATCH));
+    if (rest) upload(rows, rest, 1, order.subarray(rows * BATCH));
+  };
+
   return {
-    setOrder(order) {
-      drawn = order.length;
-      const rows = Math.floor(drawn / BATCH), rest = drawn % BATCH;
-      gl.activeTexture(gl.TEXTURE2);
-      const upload = (row, width, height, part) => gl.texSubImage2D(
-        gl.TEXTURE_2D, 0, 0, row, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, part);
-      if (rows) upload(0, BATCH, rows, order.subarray(0, rows * BATCH));
-      if (rest) upload(rows, rest, 1, order.subarray(rows * BATCH));
-    },
     draw(camera, background) {
+      holdOrder();
       const { width, height } = gl.canvas, { made, uniforms } = splat, first = target(width, height);
       gl.viewport(0, 0, width, height);
       gl.clearColor(...background, 1);
@@ -229,6 +262,7 @@ function drawer(gl, gaussians, { look, near }) {
       gl.uniform1i(copy.uniforms.image, 1);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
+    surfaceAt: (...where) => surfaceAt(gaussians, facts, ...where),
   };
 }
 
@@ -298,4 +332,50 @@ onmessage = ({ data }) => {
     waiting = [from, done];
     worker.postMessage(from);
   };
+}
+
+/** Return the surface at a position of a picture, or null: as far away as the Gaussian that makes the ray half opaque. */
+function surfaceAt(gaussians, { look, near }, view, width, height, x, y) {
+  const camera = cameraOf(view, width, height), { right, down, forward } = axesOf(view), bytes = gaussians.table;
+  const byte = (word, k) => (word >>> (8 * k)) & 255, crossed = [];
+  const low = [(-0.15 * width - camera.cx) / camera.fx, (-0.15 * height - camera.cy) / camera.fy];
+  const high = [(1.15 * width - camera.cx) / camera.fx, (1.15 * height - camera.cy) / camera.fy];
+  for (let i = 0; i < gaussians.count; i++) {
+    const at = 4 * gaussians.texels * i, mean = [0, 1, 2].map((k) => gaussians.centers[3 * i + k] - view.eye[k]);
+    const z = dot(mean, forward);
+    if (z <= near) continue;
+    const place = [dot(mean, right) / z, dot(mean, down) / z], scales = [0, 1, 2].map((k) => Math.exp(byte(bytes[at + 4], k) / 16 - 10));
+    const dx = x - camera.fx * place[0] - camera.cx, dy = y - camera.fy * place[1] - camera.cy;
+    const held = place.map((value, k) => Math.min(Math.max(value, low[k]), high[k]));
+    const stretch = 1 + Math.hypot(...held), focal = Math.max(camera.fx, camera.fy) / z;
+    const reach = 3.4 * Math.hypot(focal * stretch * Math.max(...scales), Math.sqrt(look.blur)); // sqrt(2 log 255) is 3.33
+    if (Math.abs(dx) > reach || Math.abs(dy) > reach) continue;
+    // The rows of J W R diag(s), as in the vertex shader.
+    const v = [0, 1, 2].map((k) => (byte(bytes[at + 5], k) / 127.5 - 1) * (k ? -1 : 1));
+    const w = Math.sqrt(Math.max(1 - dot(v, v), 0)), norm = 1 / Math.hypot(...v, w);
+    const [a, b, c, d] = [...v, w].map((value) => value * norm);
+    const columns = [
+      [1 - 2 * (b * b + c * c), 2 * (a * b + d * c), 2 * (a * c - d * b)],
+      [2 * (a * b - d * c), 1 - 2 * (a * a + c * c), 2 * (b * c + d * a)],
+      [2 * (a * c + d * b), 2 * (b * c - d * a), 1 - 2 * (a * a + b * b)],
+    ];
+    const seen = (axis) => columns.map((column, k) => dot(axis, column) * scales[k]), rowZ = seen(forward);
+    const rowX = seen(right).map((value, k) => (camera.fx / z) * (value - held[0] * rowZ[k]));
+    const rowY = seen(down).map((value, k) => (camera.fy / z) * (value - held[1] * rowZ[k]));
+    const flat = Math.hypot(...cross(rowX, rowY)) ** 2, xy = dot(rowX, rowY);
+    const xx = dot(rowX, rowX) + look.blur, yy = dot(rowY, rowY) + look.blur;
+    const det = flat + look.blur * (xx + yy) - look.blur * look.blur;
+    let opacity = Math.min(Math.max(bytes[at + 3] >>> 24, 0.25), 254.75) / 255;
+    if (look.antialiased) opacity *= Math.sqrt(Math.max(flat / det, 1e-30));
+    const exponent = (0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy)) / det;
+    if (exponent >= Math.log(opacity * 255)) continue;
+    const alpha = Math.min(opacity * Math.exp(-exponent), 0.999), distance = Math.hypot(...mean);
+    crossed.push({ alpha, distance, order: look.sort === "depth" ? z : distance });
+  }
+  crossed.sort((one, other) => one.order - other.order);
+  let through = 1;
+  const hit = crossed.find(({ alpha }) => { through *= 1 - alpha; return through <= 0.5; });
+  if (!hit) return null;
+  const ray = add(add(forward, right, (x - camera.cx) / camera.fx), down, (y - camera.cy) / camera.fy);
+  return add(view.eye, ray, hit.distance / Math.hypot(...ray));
 }

@@ -3,6 +3,10 @@
 // In the address, behind a #: camera=N starts at the Nth camera; plain=1 shows nothing but that camera's picture, pixel
 // by pixel; spin=1 turns around the scene; quality=full draws every pixel and quality=fast a quarter of them; sort=here
 // and inflate=here do without worker and DecompressionStream.
+//
+// What the scene is made of is the matter of splats.js or octree.js: sceneOf(raw, facts, here) returns how many `things`
+// there are, follow(view, changed), true if it can be drawn, and drawer(gl), which has draw(camera, background) and
+// surfaceAt(view, width, height, x, y).
 
 const element = (id) => document.getElementById(id);
 const canvas = element("canvas"), options = new URLSearchParams(location.hash.slice(1));
@@ -88,24 +92,24 @@ function cameraOf(view, width, height) {
 async function main() {
   await new Promise((done) => { setTimeout(done); }); // the page is shown first
   const facts = JSON.parse(element("facts").textContent), data = element("data");
-  const gaussians = gaussiansOf(await gunzip(bytesOf(data.textContent), options.get("inflate") === "here"));
+  const raw = await gunzip(bytesOf(data.textContent), options.get("inflate") === "here");
   data.remove();
+  const scene = sceneOf(raw, facts, plain || options.get("sort") === "here");
   const settings = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
   const gl = canvas.getContext("webgl2", settings);
   if (!gl) {
     throw new Refused("This page needs WebGL 2, which this browser does not have or has switched off. Any browser since" +
       " 2022 has it; where graphics acceleration is off in the settings, switch it on.");
   }
-  show(gl, gaussians, facts);
+  show(gl, scene, facts);
 }
 
-function show(gl, gaussians, facts) {
-  let drawn = drawer(gl, gaussians, facts), lost = false, needsOrder = true, measuring = false;
-  const measure = ruler(gaussians, facts);
-  const sort = sortingElsewhere(gaussians.centers, plain || options.get("sort") === "here");
+function show(gl, scene, facts) {
+  let drawn = scene.drawer(gl), lost = false, measuring = false;
+  const measure = ruler(facts);
   const cameras = facts.cameras, asked = chosen(options.get("camera")), start = asked >= 0 ? asked : facts.start;
   let camera = start, view = viewOf(cameras[start], facts.focus), background = facts.background;
-  let spinning = options.get("spin") === "1" && !plain, dirty = true, order = null, sortedFor = null, sorting = false;
+  let spinning = options.get("spin") === "1" && !plain, dirty = true;
   let quality = Math.max(QUALITIES.indexOf(options.get("quality")), 0);
   const keys = new Set();
 
@@ -130,18 +134,7 @@ function show(gl, gaussians, facts) {
     }
   }
 
-  function requestOrder() {
-    const from = { eye: view.eye, axis: facts.look.sort === "depth" ? axesOf(view).forward : null };
-    const numbers = [...from.eye, ...(from.axis || [])];
-    if (sorting || (sortedFor && sortedFor.every((x, k) => x === numbers[k]))) return;
-    sorting = true;
-    sortedFor = numbers;
-    sort(from, (sorted) => {
-      order = sorted;
-      sorting = false;
-      needsOrder = dirty = true;
-    });
-  }
+  const changed = () => { dirty = true; };
 
   function frame(now) {
     requestAnimationFrame(frame);
@@ -152,12 +145,9 @@ function show(gl, gaussians, facts) {
     if (moving && before && drew) adapt(took);
     drew = false;
     if (lost) return;
-    if (dirty) requestOrder();
-    if (dirty && order) {
+    if (dirty && scene.follow(view, changed)) {
       dirty = false;
       resize();
-      if (needsOrder) drawn.setOrder(order);
-      needsOrder = false;
       drawn.draw(cameraOf(view, canvas.width, canvas.height), background);
       measure.follow(view, canvas.clientWidth, canvas.clientHeight);
       frames += 1;
@@ -177,13 +167,13 @@ function show(gl, gaussians, facts) {
     element("message").hidden = true;
     state.state = "ready";
     state.seconds = (performance.now() / 1000).toFixed(2);
-    state.count = gaussians.count;
+    state.count = scene.count;
   }
 
   function report(now) {
     const rate = (1000 * frames) / (now - since);
     if (frames > 1 && moving) state.rate = rate.toFixed(1);
-    const text = `${gaussians.count.toLocaleString("en")} Gaussians · ${frames > 1 && moving ? `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s` : "still"}`;
+    const text = `${scene.count.toLocaleString("en")} ${scene.things} · ${frames > 1 && moving ? `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s` : "still"}`;
     if (text !== line) element("line").textContent = line = text;
     frames = 0;
     since = now;
@@ -269,8 +259,8 @@ function show(gl, gaussians, facts) {
   }
   canvas.addEventListener("pointerup", ({ clientX: x, clientY: y, button }) => {
     if (!measuring || button !== 0 || Math.hypot(x - tapped.x, y - tapped.y) > 4) return;
-    const box = canvas.getBoundingClientRect();
-    measure.pick(view, box.width, box.height, x - box.left, y - box.top);
+    const point = surface(x, y);
+    if (point) measure.pick(view, point);
     dirty = true;
   });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -281,21 +271,18 @@ function show(gl, gaussians, facts) {
     settled = performance.now() + 250;
   }, { passive: false });
 
-  /** Turn about what is seen at a position of the page: the nearest Gaussian of some opacity there. */
+  /** Return the point of the scene that is seen at a position of the page; null for none. */
+  function surface(x, y) {
+    const box = canvas.getBoundingClientRect();
+    return drawn.surfaceAt(view, box.width, box.height, x - box.left, y - box.top);
+  }
+
+  /** Turn about what is seen at a position of the page. */
   function centre(x, y) {
-    const box = canvas.getBoundingClientRect(), seen = cameraOf(view, box.width, box.height), bytes = gaussians.table;
-    const { right, down, forward } = axesOf(view);
-    let nearest = Infinity;
-    for (let i = 0; i < gaussians.count; i++) {
-      const at = [0, 1, 2].map((k) => gaussians.centers[3 * i + k] - view.eye[k]), depth = dot(at, forward);
-      if (depth <= facts.near || depth >= nearest || bytes[4 * gaussians.texels * i + 3] >>> 24 < 100) continue;
-      const column = (seen.fx * dot(at, right)) / depth + seen.cx, row = (seen.fy * dot(at, down)) / depth + seen.cy;
-      if (Math.hypot(column - x + box.left, row - y + box.top) < 8) nearest = depth;
-    }
-    if (!Number.isFinite(nearest)) return;
-    const to = [(x - box.left - seen.cx) / seen.fx, (y - box.top - seen.cy) / seen.fy];
-    const pivot = add(add(add(view.eye, right, to[0] * nearest), down, to[1] * nearest), forward, nearest);
-    look({ ...view, distance: nearest, eye: add(pivot, forward, -nearest) });
+    const point = surface(x, y), { forward } = axesOf(view);
+    if (!point) return;
+    const distance = dot(add(point, view.eye, -1), forward);
+    look({ ...view, distance, eye: add(point, forward, -distance) });
   }
 
   function spin(on) {
@@ -374,9 +361,9 @@ function show(gl, gaussians, facts) {
   });
   canvas.addEventListener("webglcontextrestored", () => {
     try {
-      drawn = drawer(gl, gaussians, facts);
+      drawn = scene.drawer(gl);
       lost = false;
-      needsOrder = dirty = true;
+      dirty = true;
     } catch (error) {
       refuse(error);
     }

@@ -1,7 +1,4 @@
-// Gaussians from an SPZ file of version 2 (framework/splats/spz.py): base64, gzip, then one array an attribute.
-
-const HEADER = 16;
-const TEXEL = 16; // bytes
+// The data of a page: base64, and what gzip has compressed.
 
 /** What the page cannot show; its message is for people. */
 class Refused extends Error {}
@@ -141,42 +138,4 @@ function inflate(input, size) {
   }
   if (end !== size) throw new Error("truncated");
   return out;
-}
-
-/** Return the Gaussians of an unpacked SPZ file: centres (N x 3, scene coordinates), and a table for the GPU.
- *
- * The table has 2 texels of four 32-bit words a Gaussian, and more for its harmonics, whose bytes stay as they are:
- *     x, y, z as float32; colour and opacity, 8 bits each
- *     three scales, 8 bits each; three components of the quaternion, 8 bits each; two words of 0
- */
-function gaussiansOf(raw) {
-  const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
-  const refuse = (why) => { throw new Refused(`The data in this page are damaged: ${why}. Export the page again.`); };
-  if (raw.length < HEADER || view.getUint32(0, true) !== 0x5053474e) refuse("they are not an SPZ file");
-  const count = view.getUint32(8, true), degree = raw[12], scale = 2 ** -raw[13];
-  if (view.getUint32(4, true) !== 2 || degree > 3 || raw[13] > 30) refuse("their header is not one of ours");
-  const rest = 3 * ((degree + 1) ** 2 - 1);
-  if (raw.length !== HEADER + count * (19 + rest)) refuse("they are not as long as their header says");
-  const extra = Math.ceil(rest / TEXEL), texels = 2 + extra;
-  const positions = HEADER, alphas = positions + 9 * count, colors = alphas + count, scales = colors + 3 * count;
-  const turns = scales + 3 * count, harmonics = turns + 3 * count;
-  const width = 1024 * texels; // a row of the texture holds 1024 Gaussians
-  const rows = Math.max(Math.ceil(count / 1024), 1);
-  const table = new Uint8Array(rows * width * TEXEL), centers = new Float32Array(3 * count);
-  const floats = new Float32Array(table.buffer);
-  for (let i = 0; i < count; i++) {
-    const to = i * texels * TEXEL;
-    for (let k = 0; k < 3; k++) {
-      const from = positions + 9 * i + 3 * k;
-      const fixed = ((raw[from] | (raw[from + 1] << 8) | (raw[from + 2] << 16)) << 8) >> 8;
-      // SPZ's y and z point the other way.
-      floats[to / 4 + k] = centers[3 * i + k] = (k ? -fixed : fixed) * scale;
-      table[to + 12 + k] = raw[colors + 3 * i + k];
-      table[to + 16 + k] = raw[scales + 3 * i + k];
-      table[to + 20 + k] = raw[turns + 3 * i + k];
-    }
-    table[to + 15] = raw[alphas + i];
-    for (let k = 0, from = harmonics + rest * i; k < rest; k++) table[to + 2 * TEXEL + k] = raw[from + k];
-  }
-  return { count, degree, centers, table: new Uint32Array(table.buffer), width, rows, texels };
 }

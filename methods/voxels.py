@@ -55,6 +55,8 @@ class VoxelsConfig(
     OctreeConfig,
     max_num_iterations=20_000,
     learning_rate=0.05,
+    lr_schedule="hold-exponential",
+    lr_final=0.05,
     density_rate=3.0,
     samples_per_batch=2**17,
 ):
@@ -263,7 +265,7 @@ class Voxels(OctreeModel[VoxelsConfig]):
         inside, box = self.hull.inside, self.hull.box
         around = box_around_cells(inside, box)
         low, high = box if around is None else around
-        edge = float((high - low).max()) / cells
+        edge = float((high - low).max() / cells)  # rounded to float32, as in a checkpoint
         size = [max(math.ceil(length / (BRICK * edge) - 1e-4), 1) for length in (high - low).tolist()]
         places = overlapped(inside, box, low, edge, [BRICK * count for count in size]).nonzero()
         layout, _ = OctreeLayout.build(low, edge, size, places)

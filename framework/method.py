@@ -103,12 +103,17 @@ class Method:
 
         Raises:
             ConfigError: if the settings do not fit the scene or each other, if the model does not fit into memory, or
-                if the data shows several scenes and the method learns one.
+                if the method cannot learn such data: several scenes, or a scene without an end.
         """
         if scene.num_scenes > 1 and not issubclass(self.model, RendersFromImages):
             raise ConfigError(
                 f"the data shows {scene.num_scenes} scenes, and {self.name} learns one: choose a method that learns "
                 "several, such as pixel-nerf, or data of one scene"
+            )
+        if scene.unbounded and self.model.ends_at_box:
+            raise ConfigError(
+                f"{self.name} learns what is in a box, and this scene extends beyond its box: take a method for "
+                "captures, such as gaussian-splatting or nerfacto"
             )
         try:
             return self._built(config, scene)

@@ -54,6 +54,9 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
     resizes: ClassVar[bool] = False
     """Whether `after_step` may change the rows of parameters."""
 
+    ends_at_box: ClassVar[bool] = False
+    """Whether it learns only scenes that end at their box; `Method.build` refuses others."""
+
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()
         self.config = config

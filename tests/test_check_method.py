@@ -67,7 +67,7 @@ def test_the_method_in_the_guide_passes(tmp_path: Path, monkeypatch: pytest.Monk
     source = re.findall(r"```python\n(.*?)```", guide, re.DOTALL)[0]
     (tmp_path / "method_in_the_guide.py").write_text(source, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert_method(importlib.import_module("method_in_the_guide").METHOD, "voxels")
+    assert_method(importlib.import_module("method_in_the_guide").METHOD, "plain-grid")
 
 
 # -- a small method of each kind --------------------------------------------------------------------------------------

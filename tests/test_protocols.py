@@ -15,11 +15,11 @@ from nerfloom.base.protocols import SeesRegistered
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.appearance import Appearance
 from nerfloom.renderable import HasAppearance, RefinesPoses
-from nerfloom.samplers.base import SkipsCells, StopsEarly
+from nerfloom.samplers.base import Carved, SkipsCells, StopsEarly
 from nerfloom.samplers.occupancy import OccupancySampler
 
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
-WITH_ATTRIBUTES = (SkipsCells, StopsEarly, HasAppearance, RefinesPoses, DefersGradient)
+WITH_ATTRIBUTES = (Carved, SkipsCells, StopsEarly, HasAppearance, RefinesPoses, DefersGradient)
 
 
 class WithAppearance(nn.Module):
@@ -45,6 +45,7 @@ def asked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 def test_buffers_parameters_and_parts_are_seen() -> None:
     grid = OccupancySampler(CUBE, resolution=4)
     assert isinstance(grid, SkipsCells)
+    assert isinstance(grid, Carved)
     assert isinstance(grid, StopsEarly)
     assert isinstance(WithAppearance(), HasAppearance)
     assert isinstance(HashGrid(num_levels=2, log2_table_size=8), DefersGradient)

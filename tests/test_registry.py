@@ -29,6 +29,7 @@ BUILT_IN = {
     "tensorf",
     "vanilla-nerf",
     "volsdf",
+    "voxels",
     "zip-nerf",
 }
 
@@ -147,12 +148,12 @@ def install(folder: Path, package: str, methods: str) -> None:
 def test_two_packages_with_one_name_are_refused_and_the_rest_goes_on(
     environment: Callable[..., Path], tmp_path: Path
 ) -> None:
-    install(tmp_path, "voxels-one", "voxels = voxels_one:METHOD")
-    install(tmp_path, "voxels-two", "voxels = voxels_two:METHOD")
+    install(tmp_path, "cubes-one", "cubes = cubes_one:METHOD")
+    install(tmp_path, "cubes-two", "cubes = cubes_two:METHOD")
     environment()
-    with pytest.raises(ConfigError, match="method 'voxels' cannot be used: it is registered by both") as raised:
-        registry.load_method("voxels")
-    assert set(re.findall(r"voxels-\w+", str(raised.value))) == {"voxels-one", "voxels-two"}
+    with pytest.raises(ConfigError, match="method 'cubes' cannot be used: it is registered by both") as raised:
+        registry.load_method("cubes")
+    assert set(re.findall(r"cubes-\w+", str(raised.value))) == {"cubes-one", "cubes-two"}
     assert registry.load_method("kplanes").paper
 
 

@@ -29,7 +29,7 @@ from tests.training.helpers import TINY
 SHARED_BY = type(load_method("instant-ngp").config)
 METHODS = (
     "dnerf", "instant-ngp", "kilo-nerf", "kplanes", "mip-nerf", "mip-nerf-360", "nerf-plus-plus", "nerf-w", "nerfacto",
-    "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "zip-nerf",
+    "neus", "pixel-nerf", "ref-nerf", "tensorf", "vanilla-nerf", "volsdf", "voxels", "zip-nerf",
 )  # fmt: skip
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 STILL = Scene(BOX, 2.0, 6.0, num_cameras=3, has_alpha=True, moving=False, image_size=20)

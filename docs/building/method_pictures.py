@@ -34,6 +34,7 @@ COMMANDS = {
     "nerfacto": "nerfacto {}",
     "neus": "neus {}",
     "volsdf": "volsdf {}",
+    "voxels": "voxels {}",
     "ref-nerf": "ref-nerf {}",
     "pixel-nerf": "pixel-nerf {} procedural --num-scenes 200 --size 32",
     "gaussian-splatting": "gaussian-splatting {}",

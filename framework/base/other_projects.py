@@ -30,6 +30,8 @@ ELSEWHERE: dict[str, str] = {
     "nerfplusplus": "here it is called 'nerf-plus-plus'",
     "refnerf": "here it is called 'ref-nerf'",
     "kilonerf": "here it is called 'kilo-nerf'",
+    "plenoxels": "here it is called 'voxels'",
+    "svraster": "here it is called 'voxels', with leaves of one size",
     "pixelnerf": "here it is called 'pixel-nerf'",
     "instant-ngp-bounded": "here it is called 'instant-ngp'; it detects whether a scene is bounded",
     "nerfacto-big": f"{_LARGER} --max-resolution 4096 --log2-table-size 21 --hidden-width 128",

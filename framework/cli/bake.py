@@ -19,7 +19,8 @@ MIN_RESOLUTION, MAX_RESOLUTION = 16, 1024
 class BakeFlags(RunFlags):
     """Bake a trained run into an octree (.octree), which ns-eval, ns-render and ns-viewer open like a run.
 
-    The scene must lie in a box and be still. Colours are fitted to the field, and then learnt from the photographs."""
+    The scene must lie in a box and be still. Colours are fitted to the field, and then learnt from the photographs. A
+    run of voxels is an octree already: its leaves are kept, and --resolution and --fine-tune-seconds have no effect."""
 
     output_path: Path | None = None
     """File to write, NAME.octree. Default: scene.octree in the run's folder."""
@@ -30,7 +31,7 @@ class BakeFlags(RunFlags):
     """Cells along the longest edge of the box of all matter, 16 to 1024. Default: up to 512, fewer for small images or
     if half of the leaves would not fit."""
     degree: int | None = None
-    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes."""
+    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes; that of a run of voxels."""
     fine_tune_seconds: float = 30.0
     """Time to learn from the photographs; 0: none."""
 

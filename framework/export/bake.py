@@ -1,11 +1,12 @@
 """Baking: turn a trained field into an octree, which a CPU draws in real time.
 
 The steps are those of PlenOctrees (Yu et al. 2021): find the cells with matter that training images see, fit harmonics
-to the field's colours, then learn all leaves from the photographs.
+to the field's colours, then learn all leaves from the photographs. A model that is an octree already keeps its leaves.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,11 +19,12 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, field_colors, fitted_colors, seen_leaves
-from nerfloom.export.octree_size import DEGREES, chosen, is_too_fine, visible_leaves
+from nerfloom.export.octree_size import DEGREES, chosen, is_too_fine, room_for, visible_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.method import Method
 from nerfloom.octree_model import OctreeConfig, OctreeModel
+from nerfloom.octrees.drawn import DrawsOctree
 from nerfloom.octrees.octree import Octree
 from nerfloom.octrees.packing import packed
 from nerfloom.ray_model import RayModel
@@ -65,6 +67,37 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     Raises:
         ConfigError: if an octree of a box cannot show what the run shows.
     """
+    model = loaded.model
+    layout, depths, coefficients = (
+        _as_learnt(model, loaded, settings) if isinstance(model, DrawsOctree) else _baked(loaded, settings)
+    )
+    leaves, lost = packed(depths, coefficients)
+    say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
+    scene = model.scene
+    return Octree(layout, leaves, loaded.input_placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
+
+
+def _as_learnt(model: DrawsOctree, loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tensor]:
+    """Return the leaves of a model that is an octree, on the CPU, without those that do not fit into the file.
+
+    They are the layout, the optical depths (L,) and the coefficients (L, 3 K).
+    """
+    layout, depths, coefficients = model.layout.to("cpu"), model.depths().cpu(), model.coefficients().cpu()
+    degree = math.isqrt(coefficients.shape[1] // 3) - 1
+    if settings.degree not in (None, degree):
+        raise ConfigError(f"--degree is {settings.degree}, and the run's leaves have {degree}: leave it out")
+    if layout.num_leaves > room_for(settings.max_bytes, degree):
+        cameras, scene = loaded.dataset("train").to("cpu").cameras, model.scene
+        seen = seen_leaves(layout, raw_of(depths)[:, None], cameras, scene.near, scene.far)
+        kept = chosen(seen.largest, settings.max_bytes, (degree,))[1]
+        layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
+        depths, coefficients = depths[kept[rows]], coefficients[kept[rows]]
+    say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, as they were learnt")
+    return layout, depths, coefficients
+
+
+def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tensor]:
+    """Return leaves with the density and the colours of a field: layout, depths (L,) and coefficients (L, 3 K)."""
     model, dataset = _bakeable(loaded), loaded.dataset("train").to("cpu")
     seed_step(loaded.run.config.machine.seed, 0)
     degrees = DEGREES if settings.degree is None else (settings.degree,)
@@ -90,10 +123,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     depths = depths_of(raw[:, 0])
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
-    leaves, lost = packed(depths, coefficients)
-    say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
-    scene = model.scene
-    return Octree(layout, leaves, loaded.input_placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
+    return layout, depths, coefficients
 
 
 def _bakeable(loaded: Loaded) -> RayModel[Any]:

@@ -40,7 +40,7 @@ def is_too_fine(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> bo
         max_bytes: maximum size of the file.
         degrees: degrees of harmonics to choose from, best first.
     """
-    return _room(max_bytes, degrees[-1]) < MIN_SHARE * len(visible_leaves(largest))
+    return room_for(max_bytes, degrees[-1]) < MIN_SHARE * len(visible_leaves(largest))
 
 
 def chosen(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> tuple[int, Tensor]:
@@ -58,7 +58,7 @@ def chosen(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> tuple[i
     if not len(visible):
         raise ConfigError("no training image sees matter in the octree's box; is the run trained?")
     for degree in degrees:
-        room = _room(max_bytes, degree)
+        room = room_for(max_bytes, degree)
         if room >= FULL_SHARE[degree] * len(visible) or degree == degrees[-1]:
             break
     if room < 1:
@@ -68,7 +68,7 @@ def chosen(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> tuple[i
     return degree, visible
 
 
-def _room(max_bytes: float, degree: int) -> int:
+def room_for(max_bytes: float, degree: int) -> int:
     """Return the number of leaves with harmonics of a degree that a file has room for."""
     return max(int(max_bytes / (COMPRESSED * (1 + 3 * (degree + 1) ** 2))), 0)
 

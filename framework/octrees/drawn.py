@@ -13,16 +13,20 @@ from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import OctreeLight, error_bound
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.kernels.octree.walk import leaf_at
 from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import RendersRays
+from nerfloom.rendering.outputs import Output
 from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.rendering.volume import mean_distance
 
 RAYS_AT_ONCE = 2**18
 """Number of rays that are traced in one call."""
+LEAVES = Output("leaves", "scalar", "leaves that a ray meets")
+"""Number of leaves that the ray of a pixel meets before it ends: the work that the pixel takes."""
 
 
 class DrawsOctree(RendersRays):
@@ -30,6 +34,23 @@ class DrawsOctree(RendersRays):
 
     early_stop: float = 1 / 255
     """Maximum error of a colour channel in [0, 1] from ending rays where little light is left."""
+
+    @property
+    @abstractmethod
+    def layout(self) -> OctreeLayout:
+        """Where the L leaves are."""
+
+    @abstractmethod
+    def depths(self, leaves: Tensor | None = None) -> Tensor:
+        """Return the optical depth (N,) of a cell's edge in some leaves, without gradient.
+
+        Args:
+            leaves: (N,) int64 their indices; None for all.
+        """
+
+    @abstractmethod
+    def coefficients(self) -> Tensor:
+        """Return the coefficients (L, 3 K) of the leaves' harmonics, without gradient."""
 
     @abstractmethod
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
@@ -59,9 +80,21 @@ class DrawsOctree(RendersRays):
             depth=mean_distance(light.moment, light.opacity.detach(), rays.fars),
             median_depth=light.median,
             accumulation=light.opacity,
-            num_samples=0,
+            num_samples=int(light.visits.sum()),
+            extras={LEAVES.name: light.visits.float()},
             error_bound=self.early_stop,
         )
+
+    def density(self, points: Points) -> Tensor:
+        """Return the density (N,) at `points`, in 1/length."""
+        leaf = leaf_at(self.layout, points.positions)
+        met, density = leaf >= 0, torch.zeros(len(leaf), device=leaf.device)
+        density[met] = self.depths(leaf[met]) / self.layout.cell
+        return density
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return (LEAVES,)
 
     @property
     def rays_at_once(self) -> int:
@@ -76,13 +109,16 @@ class DrawsOctree(RendersRays):
         with self.rendering():
             for some in pixels.reshape(-1).split(max(self.rays_at_once // per_pixel, 1)):
                 rays = view.camera.pixel_rays(some, self.scene.near, self.scene.far, None, offsets)
-                parts.append(self.render(replace(rays, camera_indices=None), background).to_pixels(per_pixel))
+                rendered = self.render(replace(rays, camera_indices=None), background)
+                parts.append(rendered.to_pixels(per_pixel, self.outputs))
         size = tuple(pixels.shape)
         return Picture(
             torch.cat([part.rgb for part in parts]).clamp(0, 1).view(*size, 3),
             torch.cat([part.depth for part in parts]).view(size),
             torch.cat([part.median_depth for part in parts]).view(size),
             torch.cat([part.accumulation for part in parts]).view(size),
+            {LEAVES.name: torch.cat([part.extras[LEAVES.name] for part in parts]).view(size)},
+            self.outputs,
             num_rays=pixels.numel() * per_pixel,
         )
 
@@ -104,16 +140,19 @@ class DrawnOctree(DrawsOctree):
         return self.octree.layout.origin.device
 
     @property
+    def layout(self) -> OctreeLayout:
+        return self.octree.layout
+
+    def depths(self, leaves: Tensor | None = None) -> Tensor:
+        packed = self.octree.leaves
+        return packed.table[(packed.codes if leaves is None else packed.codes[leaves]).long()]
+
+    def coefficients(self) -> Tensor:
+        return self.octree.leaves.coefficients()
+
+    @property
     def largest(self) -> float:
         return max(self._largest, 1.0)
 
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
-        return trace_packed(self.octree.layout, self.octree.leaves, rays, background, stop)
-
-    def density(self, points: Points) -> Tensor:
-        """Return the density (N,) at `points`, in 1/length."""
-        layout, leaves = self.octree.layout, self.octree.leaves
-        leaf = leaf_at(layout, points.positions)
-        met, density = leaf >= 0, torch.zeros(len(leaf), device=leaf.device)
-        density[met] = leaves.table[leaves.codes[leaf[met]].long()] / layout.cell
-        return density
+        return trace_packed(self.layout, self.octree.leaves, rays, background, stop)

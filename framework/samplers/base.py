@@ -71,8 +71,8 @@ class StopsEarly(Protocol, metaclass=SeesRegistered):
 
 
 @runtime_checkable
-class SkipsCells(Protocol, metaclass=SeesRegistered):
-    """A sampler that skips the empty cells of a grid over a box, or over L nested boxes (`Occupancy`)."""
+class Carved(Protocol, metaclass=SeesRegistered):
+    """A part with a grid over a box, or over L nested boxes, where cells that images show to be empty are marked."""
 
     box: Tensor
     """(2, 3) corners of the grid, scene units; of the smallest box if there are several."""
@@ -83,20 +83,25 @@ class SkipsCells(Protocol, metaclass=SeesRegistered):
     slices: int
     """Number T of equal parts of the time from 0 to 1, each with its own cells; 1 for a static scene, or if there are
     several boxes."""
-    occupied: Tensor
-    """(L n^3,) or (T n^3,) bool, True for cells that are sampled; cell (x, y, z) of box or slice l has the index
-    ((l n + x) n + y) n + z."""
     carved: Tensor
-    """(L n^3,) or (T n^3,) bool, True for cells that stay empty. This includes cells in the middle of a box that a
-    smaller box covers."""
+    """(L n^3,) or (T n^3,) bool, True for cells that stay empty; cell (x, y, z) of box or slice l has the index
+    ((l n + x) n + y) n + z. This includes cells in the middle of a box that a smaller box covers."""
+
+    def carve(self, hull: Tensor) -> None:
+        """Mark all cells outside `hull`, (L n^3,) or (T n^3,) bool, as empty, permanently."""
+
+
+@runtime_checkable
+class SkipsCells(Carved, Protocol, metaclass=SeesRegistered):
+    """A sampler that skips the empty cells of a grid (`Occupancy`)."""
+
+    occupied: Tensor
+    """(L n^3,) or (T n^3,) bool, True for cells that are sampled, in the order of `carved`."""
     early_stop: float
     """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
     def occupied_when(self, time: float | None = None) -> Tensor:
         """Return the cells (L n^3,) that are occupied in the time slice of `time`; at any time if it is None."""
-
-    def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull`, (L n^3,) or (T n^3,) bool, as empty, permanently."""
 
     def forget(self) -> None:
         """Discard cached values of `occupied`; must be called after `occupied` has changed."""

@@ -168,7 +168,9 @@ class MethodUnderTest:
     @cached_property
     def scenes(self) -> dict[str, Dataset]:
         """Data sets of all scenes for the method, by the scenes' names in messages."""
-        scenes = {"a still scene in a box": self.still, "photographs without alpha or box": ball_under_a_sky()}
+        scenes = {"a still scene in a box": self.still}
+        if not self.method.model.ends_at_box:
+            scenes["photographs without alpha or box"] = ball_under_a_sky()
         if issubclass(self.method.model, LearnsMotion):
             scenes["a scene that moves"] = moving_ball()
         return scenes

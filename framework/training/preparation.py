@@ -24,7 +24,7 @@ from nerfloom.method import Method
 from nerfloom.model import LearnsMotion, Model
 from nerfloom.ray_model import RayModel
 from nerfloom.renderable import HasAppearance, RefinesPoses, RendersFromImages, parts
-from nerfloom.samplers.base import SkipsCells
+from nerfloom.samplers.base import Carved, SkipsCells
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.folded_poses import angle_between, folded_neighbours, thumbnail
 from nerfloom.scene.moving_hulls import moving_box, moving_hulls
@@ -106,7 +106,7 @@ def profile_of(
     if config.background == "auto":
         reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
         decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
-    if config.silhouette_cells and parts(model, SkipsCells):
+    if config.silhouette_cells and parts(model, Carved):
         obstacle = _no_hull(dataset)
         outside = "what is outside all of them" if scene.moving else "space outside them"
         choice = "not used" if obstacle else f"{outside} is skipped from the start"
@@ -157,10 +157,10 @@ def show_images(model: Model[Any], train_set: Dataset, eval_set: Dataset | None)
 
 
 def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
-    """Empty the cells of the occupancy grids that silhouettes exclude or that no training image shows.
+    """Empty the cells of grids that silhouettes exclude or that no training image shows.
 
     Args:
-        model: the model, whose samplers hold the grids.
+        model: the model, whose parts hold the grids.
         dataset: the training images.
         fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
 
@@ -194,45 +194,47 @@ def skip_unseen(config: TrainConfig, model: Model[Any], dataset: Dataset) -> Non
 
 
 def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: bool) -> Dataset:
-    """Empty the cells of the occupancy grids that are outside the images' silhouettes.
+    """Empty the cells of grids that are outside the images' silhouettes.
 
     `config`, `model`, `dataset`, `fresh` and the result are as in `skip_empty`.
     """
-    samplers = parts(model, SkipsCells)
-    if not samplers or not config.silhouette_cells or _no_hull(dataset) is not None:
+    grids = parts(model, Carved)
+    if not grids or not config.silhouette_cells or _no_hull(dataset) is not None:
         return dataset
     silhouettes, moving = Silhouettes.of(dataset), model.scene.moving
     if fresh:
-        hulls = [_hull(silhouettes, sampler, dataset) for sampler in samplers]
+        hulls = [_hull(silhouettes, grid, dataset) for grid in grids]
         if not all(bool(hull.any()) for hull in hulls):
             say("warning: the photographs' alpha leaves no part of the box; it is not used to skip anything")
             return dataset
-        for sampler, hull in zip(samplers, hulls, strict=True):
-            sampler.carve(hull)
+        for grid, hull in zip(grids, hulls, strict=True):
+            grid.carve(hull)
     # In a moving scene, a pixel that is empty at its time supervises cells that are occupied at other times.
-    if not config.silhouette_pixels or moving or not all(bool(sampler.carved.any()) for sampler in samplers):
+    if not config.silhouette_pixels or moving or not all(bool(grid.carved.any()) for grid in grids):
         return dataset
     near = [
-        pixels_near(silhouettes, kept, box, s.resolution)
-        for s in samplers
-        for kept, box in zip((~s.carved).view(s.levels, -1).cpu(), nested_boxes(s.box.cpu(), s.levels), strict=True)
+        pixels_near(silhouettes, kept, box, grid.resolution)
+        for grid in grids
+        for kept, box in zip(
+            (~grid.carved).view(grid.levels, -1).cpu(), nested_boxes(grid.box.cpu(), grid.levels), strict=True
+        )
     ]
     return dataset.drawing(PixelSet.shared(near, 1))
 
 
-def _hull(silhouettes: Silhouettes, sampler: SkipsCells, dataset: Dataset) -> Tensor:
-    """Return the cells of `sampler` that the `silhouettes` of `dataset` do not exclude."""
+def _hull(silhouettes: Silhouettes, grid: Carved, dataset: Dataset) -> Tensor:
+    """Return the cells of `grid` that the `silhouettes` of `dataset` do not exclude."""
     boxes, n, times, bound = (
-        nested_boxes(sampler.box.cpu(), sampler.levels),
-        sampler.resolution,
+        nested_boxes(grid.box.cpu(), grid.levels),
+        grid.resolution,
         dataset.times,
         dataset.motion_bound,
     )
     if times is None or bound is None:
         hulls = [visual_hull(silhouettes, box, n) for box in boxes]
     else:
-        hulls = [moving_hulls(silhouettes, box, n, times, bound, sampler.slices) for box in boxes]
-    return torch.cat(hulls).to(sampler.box.device)
+        hulls = [moving_hulls(silhouettes, box, n, times, bound, grid.slices) for box in boxes]
+    return torch.cat(hulls).to(grid.box.device)
 
 
 def _no_silhouettes(dataset: Dataset) -> str | None:

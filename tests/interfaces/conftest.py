@@ -10,7 +10,7 @@ from nerfloom import registry
 METHODS = {
     "fog": "plugins.fog",
     "even": "plugins.even",
-    "voxels": "plugins.voxels",
+    "vertices": "plugins.vertices",
     "discs": "methods.discs",
     "cones": "methods.cones",
     "surface": "methods.surface",

@@ -26,18 +26,18 @@ def test_each_is_under_60_lines(file: Path) -> None:
     assert len(file.read_text().splitlines()) < 60
 
 
-@pytest.mark.parametrize("name", ["fog", "even", "voxels"])
+@pytest.mark.parametrize("name", ["fog", "even", "vertices"])
 def test_each_exchanges_one_part_by_one_line(name: str) -> None:
     method, original = load_method(name), instant_ngp.METHOD
     parts = ("field", "sampler", "renderer", "model", "decide", "config")
     changed = [part for part in parts if getattr(method, part) is not getattr(original, part)]
-    assert changed == [{"fog": "renderer", "even": "sampler", "voxels": "field"}[name]]
+    assert changed == [{"fog": "renderer", "even": "sampler", "vertices": "field"}[name]]
     (line,) = [line for line in (HERE / "plugins" / f"{name}.py").read_text().splitlines() if "METHOD = " in line]
     assert line.startswith("METHOD = replace(instant_ngp.METHOD, ")
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("name", ["fog", "even", "voxels"])
+@pytest.mark.parametrize("name", ["fog", "even", "vertices"])
 def test_each_is_trained_and_evaluated_by_the_commands(name: str, tmp_path: Path) -> None:
     done = called(
         "ns-train", name, *TINY, "--output-dir", tmp_path, "--timestamp", "t", "--experiment-name", "e", *SCENE.split()

@@ -85,8 +85,9 @@ def by_hand(layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays,
                 median = float(start[leaf]) + math.log(2 * through) / sigma
             through *= math.exp(-depth)
         color = color + through * behind
-        out.append((color, torch.tensor(1 - through), torch.tensor(moment), torch.tensor(median)))
-    return OctreeLight(*(torch.stack([row[i] for row in out]).double() for i in range(4)))
+        numbers = (torch.tensor(number) for number in (1 - through, moment, median, len(met)))
+        out.append((color, *numbers))
+    return OctreeLight(*(torch.stack([row[i] for row in out]).double() for i in range(5)))
 
 
 def depth_of(raw: float) -> float:
@@ -116,6 +117,7 @@ def test_the_reference_is_the_integral_over_every_leaf(degree: int) -> None:
     truth = by_hand(layout, raw, coefficients, rays, background)
     pick = lambda light: OctreeLight(*(part[slow] for part in light))  # noqa: E731
     same(pick(found), pick(truth), 1e-6)
+    assert torch.equal(pick(found).visits.double(), pick(truth).visits)
 
 
 def test_leaves_and_their_cells(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,6 +153,9 @@ def test_a_closed_form() -> None:
     assert float(found.opacity) == pytest.approx(1 - math.exp(-depth), abs=1e-6)
     half = math.log(2) / depth_of(0.3) * layout.cell
     assert float(found.median) == pytest.approx(5 * layout.cell + half, abs=1e-5)
+    assert found.visits.tolist() == [16]
+    ended = trace_octree(layout, raw, torch.zeros(16, 3), rays, torch.ones(1, 3), stop=math.exp(-2.5 * depth_of(0.3)))
+    assert ended.visits.tolist() == [3]
 
 
 @needs_kernels
@@ -166,6 +171,7 @@ def test_compiled_against_float64(degree: int) -> None:
     slow = rays.directions.abs().amin(-1) > 1e-6
     pick = lambda light: OctreeLight(*(part[slow] for part in light))  # noqa: E731
     same(pick(found), pick(truth), 5e-4, medians=0.01)
+    assert (pick(found).visits != pick(truth).visits).double().mean() < 0.01  # rounding may cut off a corner
     close = trace_octree_reference(layout, raw, coefficients, rays, background)
     same(found, close, 5e-4, medians=0.01)
 
@@ -305,6 +311,24 @@ def test_largest_weights() -> None:
     assert float(found.max()) > 0.9
     raise_weights(layout, raw - 3, rays, found)
     assert bool((found >= truth - 1e-4).all())
+
+
+@pytest.mark.parametrize("trace", [trace_octree, trace_octree_reference])
+@pytest.mark.parametrize("deferred", [False, True])
+def test_peaks_are_the_largest_weights(trace, deferred: bool) -> None:
+    torch.manual_seed(9)
+    layout = layout_of(scattered(0.3))
+    raw, coefficients = (part.requires_grad_() for part in values(layout, 1))
+    rays, background = rays_at(layout, 1000), torch.rand(1000, 3)
+    truth, found = torch.zeros(layout.num_leaves), torch.zeros(layout.num_leaves)
+    raise_weights_reference(layout, raw.detach(), rays, truth)
+    kept = (RowGradient(), RowGradient()) if deferred else None
+    trace(layout, raw, coefficients, rays, background, deferred=kept, peaks=found).color.square().sum().backward()
+    assert float((found - truth).abs().max()) < 1e-4
+    assert float(found.max()) > 0.9
+    before = found.clone()
+    trace(layout, raw - 3, coefficients, rays, background, deferred=kept, peaks=found).color.square().sum().backward()
+    assert bool((found >= before).all())
 
 
 @pytest.mark.parametrize("trace", [trace_octree, trace_octree_reference])

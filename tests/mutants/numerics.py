@@ -39,7 +39,7 @@ MUTANTS = {
             "::test_distances_between_bricks_are_those_by_brute_force"),
     ],
     "nerfloom.kernels.adam.row_gradient": [
-        Mutant("first-gradient-of-rows", "RowGradient.adam", "sum(self.gradients[1:], A)", "A",
+        Mutant("first-gradient-of-rows", "RowGradient._merged", "sum(self.gradients[1:], A)", "A",
             "the length of kilo-nerf's colour layers, or their colours, teach nothing",
             "kernels/test_grouped.py::test_adam_of_networks_is_sparse_adam"),
     ],

@@ -32,6 +32,12 @@ MUTANTS = {
         Mutant("rays-of-given-poses", "RefinedModel.loss", "replace(batch, rays=A)", "batch",
             "poses are never refined", "truth/test_refined_poses.py::test_training_moves_rays_and_rendering_does_not"),
     ],
+    "nerfloom.methods.voxels": [
+        Mutant("split-doubles-depth", "Voxels.after_step", "self.depths(A) / 2", "self.depths(A)",
+            "each split of voxels makes the scene twice as dense", "test_voxels.py::test_a_split_keeps_the_picture"),
+        Mutant("unseen-leaves-stay", "visible", "A >= B", "A >= 0", "voxels that no image shows are never dropped",
+            "test_voxels.py::test_what_stays"),
+    ],
     "nerfloom.methods.gaussian_splatting": [
         Mutant("field-moves-cameras-alone", "GaussianSplatting.start", "self.poses.tangents.copy_(A)", "A",
             "Gaussians start where a field's moved cameras see surfaces, and are learnt from the given cameras",

@@ -25,7 +25,7 @@ from tests.training.helpers import TINY
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 CAPTURE = Scene(0.5 * BOX, 0.05, 100.0, num_cameras=3, has_alpha=False, moving=False, image_size=32)
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
-RAY_METHODS = [name for name in BUILT_IN if name not in ("gaussian-splatting", "moving-gaussians")]
+RAY_METHODS = [name for name in BUILT_IN if name not in ("gaussian-splatting", "moving-gaussians", "voxels")]
 
 
 class Cloud(Field):

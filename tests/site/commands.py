@@ -16,7 +16,7 @@ from nerfloom.registry import load_dataparser, registered
 from nerfloom.training.run import Run
 from tests.site.pages import ROOT
 
-EXAMPLES = ("my-method", "voxels")
+EXAMPLES = ("my-method", "plain-grid")
 """Methods that the documents let their readers write."""
 UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
 """Commands of others, and those that no parser here knows."""

@@ -17,7 +17,7 @@ ELSEWHERE = {
         "tests/plugins/test_installed_plugin.py"
     ),
     r"export NERFLOOM_": "tests/test_registry.py",
-    r"ns-train .*(voxels|path/to/ring)": "tests/site/test_snippets.py",
+    r"ns-train .*(plain-grid|path/to/ring)": "tests/site/test_snippets.py",
     r"ns-train (--help|--version|[\w-]+ --help(-all)?)": "tests/cli/test_commands.py",
     r"ns-train --load-config": "tests/cli/test_train_command.py",
     r"ns-train --resume": "tests/training/test_trainer.py",

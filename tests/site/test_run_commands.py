@@ -22,7 +22,7 @@ from tests.training.helpers import TINY
 pytestmark = pytest.mark.slow
 RUN = re.compile(r"outputs/\w+/([\w-]+)/TIME")
 LEFT_OUT = re.compile(
-    r"camera-path|ns-render time|--resume|--load-config|--vis|--help|--version|my-method|voxels|path/to/ring"
+    r"camera-path|ns-render time|--resume|--load-config|--vis|--help|--version|my-method|plain-grid|path/to/ring"
     r"| (nerfstudio|colmap|blender) --|eval-appearance half|outputs/blocks-|/balls"
 )
 """Commands that need more than a tiny still scene: tests of their own have them."""

@@ -227,6 +227,11 @@ TINY: dict[str, dict[str, Any]] = {
         "learning_rate": 5e-3,
         "start_radius": 0.6,
     },
+    "voxels": {
+        "resolution": 32,
+        "num_splits": 1,
+        "samples_per_batch": 4096,
+    },
     "pixel-nerf": {
         "num_source_views": 3,
         "images_per_batch": 4,

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
-from nerfloom.kernels.adam.adam import sparse_adam
 from nerfloom.kernels.adam.deferred import Parts, waiting
 from nerfloom.kernels.dispatch import CPP, Operation
 
@@ -53,10 +52,7 @@ class RowGradient:
 
         `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
         """
-        rows, first = self.parts[0]
-        if not all(torch.equal(others, rows) for others, _ in self.parts[1:]):
-            return sparse_adam(table, self.summed(table), mean, square, seen, rate, betas, eps)
-        gradient = sum(self.gradients[1:], first).contiguous()
+        rows, gradient = self._merged(len(table))
         shape, count = (table.shape[0], table.shape[1]), len(rows)
         _adam(
             native.pointer(table, "the table", shape), native.pointer(mean, "mean", shape),
@@ -67,6 +63,22 @@ class RowGradient:
         )  # fmt: skip
         self.clear()
         return count
+
+    def _merged(self, num_rows: int) -> tuple[Tensor, Tensor]:
+        """Return the rows (T,) int32 of all parts, each once, and the sum (T, F) of their gradients."""
+        rows, first = self.parts[0]
+        if all(torch.equal(others, rows) for others, _ in self.parts[1:]):
+            return rows, sum(self.gradients[1:], first).contiguous()
+        used = torch.zeros(num_rows, dtype=torch.bool)
+        for some, _ in self.parts:
+            used[some.long()] = True
+        all_rows = used.nonzero()[:, 0]
+        place = torch.empty(num_rows, dtype=torch.int64)
+        place[all_rows] = torch.arange(len(all_rows))
+        total = torch.zeros(len(all_rows), first.shape[1])
+        for some, gradient in self.parts:
+            total[place[some.long()]] += gradient  # each row of a part is there once
+        return all_rows.int(), total
 
 
 def table_rows_reference(table: Tensor, rows: Tensor, deferred: RowGradient | None = None) -> Tensor:

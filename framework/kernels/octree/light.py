@@ -45,6 +45,8 @@ class OctreeLight(NamedTuple):
     """(R,) sum of weight * t, t in the middle of each leaf; without gradient."""
     median: Tensor
     """(R,) distance where the transmittance is 0.5, or the far end; without gradient."""
+    visits: Tensor
+    """(R,) int32 number of leaves that a ray meets before it ends."""
 
 
 def depths_of(raw: Tensor) -> Tensor:
@@ -64,7 +66,13 @@ def raw_of(depths: Tensor) -> Tensor:
 
 
 def light_of(
-    layout: OctreeLayout, depths: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float
+    layout: OctreeLayout,
+    depths: Tensor,
+    coefficients: Tensor,
+    rays: Rays,
+    background: Tensor,
+    stop: float,
+    peaks: Tensor | None = None,
 ) -> OctreeLight:
     """Compute the light of rays in PyTorch, with the walk of `walk.py` and autograd's gradient.
 
@@ -75,6 +83,7 @@ def light_of(
         rays: R rays; the other tensors have their type.
         background: (R, 3) colour of the background.
         stop: transmittance below which a ray ends.
+        peaks: (L,) largest weight of each leaf so far, raised in place; None for none.
     """
     samples, leaves = leaf_samples(layout, rays)
     tau = depths[leaves] * samples.deltas / layout.cell
@@ -93,7 +102,10 @@ def light_of(
         place = torch.where(crosses, samples.t_starts + samples.deltas * within, torch.inf)
         fars = rays.fars.to(color.dtype)
         median = fars.scatter_reduce(0, samples.ray_indices, place.to(fars), "amin")
-    return OctreeLight(color, opacity, moment, median)
+        visits = torch.bincount(samples.ray_indices[~(through < stop)], minlength=len(rays)).int()
+        if peaks is not None:
+            peaks.scatter_reduce_(0, leaves, weights.to(peaks), "amax")
+    return OctreeLight(color, opacity, moment, median, visits)
 
 
 def check_leaves(layout: OctreeLayout, raw: Tensor, coefficients: Tensor) -> None:
@@ -144,6 +156,6 @@ def contiguous(rays: Rays) -> Rays:
 
 def outputs_of(rays: Rays) -> tuple[OctreeLight, tuple[int, ...]]:
     """Return the light of `rays` for a compiled function to fill in, and the addresses of its tensors."""
-    count = len(rays)
-    out = OctreeLight(rays.fars.new_empty(count, 3), *(rays.fars.new_empty(count) for _ in range(3)))
+    count, new = len(rays), rays.fars.new_empty
+    out = OctreeLight(new(count, 3), new(count), new(count), new(count), new(count, dtype=torch.int32))
     return out, tuple(values.data_ptr() for values in out)

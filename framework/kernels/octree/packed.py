@@ -22,7 +22,7 @@ from nerfloom.kernels.octree.light import (
     ray_arguments,
 )
 
-_trace_packed = native.Function("octree_trace_packed", LAYOUT + "pppppi" + RAYS + "pfppppi")
+_trace_packed = native.Function("octree_trace_packed", LAYOUT + "pppppi" + RAYS + "pfpppppi")
 
 
 @dataclass(frozen=True)

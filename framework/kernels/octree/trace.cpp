@@ -68,6 +68,7 @@ void basis_of(const float* direction, int basis, float* out) {
 struct Results {  // of R rays
     const float* background;                     // (R, 3)
     float *color, *opacity, *moment, *median;
+    int32_t* visits;
 };
 
 // Sums over the leaves of a ray. Colours are linear in the coefficients: these are summed with their weights, and meet
@@ -80,11 +81,12 @@ struct Shade {
     float per_cell, limit;
     alignas(64) float sums[LANES][N];
     alignas(64) float through[LANES], moment[LANES], median[LANES];
+    int32_t visits[LANES];
 
     void expect(int32_t leaf) const { leaves.expect(leaf); }
     void start(int lane, int64_t) {
         for (int k = 0; k < N; k++) sums[lane][k] = 0;
-        through[lane] = 1, moment[lane] = 0, median[lane] = -1;
+        through[lane] = 1, moment[lane] = 0, median[lane] = -1, visits[lane] = 0;
     }
 
     void meet(const int32_t* leaf, const float* t0, const float* t1, int32_t* ends) {
@@ -93,6 +95,7 @@ struct Shade {
         store(moment, load(moment) + load(step.weight) * 0.5f * (begin + end));
         for (int lane = 0; lane < LANES; lane++) {
             if (leaf[lane] < 0) continue;
+            visits[lane]++;
             const float weight = step.weight[lane];
             const auto* row = leaves.row(leaf[lane]);
             float* to = sums[lane];
@@ -114,7 +117,7 @@ struct Shade {
             for (int k = 0; k < basis; k++) sum += y[k] * leaves.decoded(c * basis + k, sums[lane][c * basis + k], weight);
             out.color[3 * r + c] = sum;
         }
-        out.opacity[r] = weight, out.moment[r] = moment[lane];
+        out.opacity[r] = weight, out.moment[r] = moment[lane], out.visits[r] = visits[lane];
         out.median[r] = median[lane] < 0 ? beams.fars[r] : std::min(median[lane], beams.fars[r]);
     }
 };
@@ -123,7 +126,7 @@ template <typename Leaves, int N>
 void shade(const octree::Layout& layout, const octree::Beams& beams, const Leaves& leaves, const Results& out,
            int64_t rays, float limit, int threads) {
     for_ranges(threads, rays, RAYS, [&](int64_t begin, int64_t end) {
-        Shade<Leaves, N> light{leaves, beams, out, 1 / layout.cell, limit, {}, {}, {}, {}};
+        Shade<Leaves, N> light{leaves, beams, out, 1 / layout.cell, limit, {}, {}, {}, {}, {}};
         octree::Walk<Shade<Leaves, N>>(layout, beams, light).run(begin, end);
     });
 }
@@ -233,16 +236,17 @@ int64_t give_rows(const std::vector<std::vector<Visit>>& chunks, int64_t leaves,
 
 }  // namespace
 
-// Colour over the background, opacity, sum of weight * t, and median t of R rays. `values` colours a leaf.
+// Colour over the background, opacity, sum of weight * t, median t, and number of leaves of R rays. `values` colours a
+// leaf.
 EXPORT int octree_trace(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
                         const int64_t* masks, const int32_t* firsts, const float* raw, const float* colors, int values,
                         const float* origins, const float* directions, const float* nears, const float* fars,
                         int64_t rays, const float* background, float limit, float* color, float* opacity,
-                        float* moment, float* median, int threads) {
+                        float* moment, float* median, int32_t* visits, int threads) {
     return guarded([&] {
         const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
         shade_any(layout, {origins, directions, nears, fars}, Raw{raw, colors, values},
-                  {background, color, opacity, moment, median}, rays, limit, threads);
+                  {background, color, opacity, moment, median, visits}, rays, limit, threads);
     });
 }
 
@@ -252,23 +256,25 @@ EXPORT int octree_trace_packed(const float* origin, float cell, const int64_t* s
                                const uint8_t* colors, const float* scales, const float* offsets, int values,
                                const float* origins, const float* directions, const float* nears, const float* fars,
                                int64_t rays, const float* background, float limit, float* color, float* opacity,
-                               float* moment, float* median, int threads) {
+                               float* moment, float* median, int32_t* visits, int threads) {
     return guarded([&] {
         const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
         shade_any(layout, {origins, directions, nears, fars}, Packed{codes, colors, table, scales, offsets, values},
-                  {background, color, opacity, moment, median}, rays, limit, threads);
+                  {background, color, opacity, moment, median, visits}, rays, limit, threads);
     });
 }
 
 // The gradient of L leaves. Each thread has a share of the leaves and visits all rays in order, so the sums do not depend
 // on their number. With `touched`, gradients have a row for each leaf that a ray has visited, which it lists; their
-// number is `rows_used`. Without, they have a row for each leaf, and are added to. grad_opacity may be null.
+// number is `rows_used`. Without, they have a row for each leaf, and are added to. `peaks` (L) is raised to each leaf's
+// largest weight on the rays. grad_opacity and peaks may be null.
 EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
                                  const int64_t* masks, const int32_t* firsts, const float* raw, const float* colors,
                                  int values, int64_t leaves, const float* origins, const float* directions,
                                  const float* nears, const float* fars, int64_t rays, const float* background,
                                  float limit, const float* grad_color, const float* grad_opacity, float* grad_raw,
-                                 float* grad_colors, int32_t* touched, int threads, int64_t* rows_used) {
+                                 float* grad_colors, int32_t* touched, float* peaks, int threads,
+                                 int64_t* rows_used) {
     return guarded([&] {
         const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
         const octree::Beams beams{origins, directions, nears, fars};
@@ -312,6 +318,7 @@ EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t*
                     const Visit& v = visits[i];
                     const int32_t at = place(v);
                     if (at < from || at >= to) continue;
+                    if (peaks && v.weight > peaks[v.leaf]) peaks[v.leaf] = v.weight;
                     grad_raw[at] += v.slope;
                     float* row = grad_colors + int64_t(at) * values;
                     const float* harmonic = &y[size_t(v.ray) * 16];

@@ -25,8 +25,8 @@ from nerfloom.kernels.octree.light import (
     ray_arguments,
 )
 
-_trace = native.Function("octree_trace", LAYOUT + "ppi" + RAYS + "pfppppi")
-_backward: Callable[..., int] = native.Function("octree_trace_backward", LAYOUT + "ppiq" + RAYS + "pfpppppi", "q")
+_trace = native.Function("octree_trace", LAYOUT + "ppi" + RAYS + "pfpppppi")
+_backward: Callable[..., int] = native.Function("octree_trace_backward", LAYOUT + "ppiq" + RAYS + "pfppppppi", "q")
 
 
 def trace_octree(
@@ -37,6 +37,7 @@ def trace_octree(
     background: Tensor,
     stop: float = 0.0,
     deferred: tuple[RowGradient, RowGradient] | None = None,
+    peaks: Tensor | None = None,
 ) -> OctreeLight:
     """Return the light of R rays through an octree, with a gradient of its leaves; the reference has all gradients.
 
@@ -48,23 +49,25 @@ def trace_octree(
         background: (R, 3) or (3,) colour of the background.
         stop: transmittance below which a ray ends; see `error_bound`.
         deferred: collects the gradients of `raw` and `coefficients`, on compiled kernels; None to return them.
+        peaks: (L,) largest weight of each leaf so far. The weights on these rays raise it in place: in the backward
+            pass on compiled kernels, since its threads own leaves, and otherwise at once. None for none.
     """
     check_leaves(layout, raw, coefficients)
     background = background.expand(len(rays), 3)
     tensors = (raw, coefficients, rays.origins, rays.directions, background)
-    return TRACE_OCTREE(tensors, layout, raw, coefficients, rays, background, stop, deferred)
+    return TRACE_OCTREE(tensors, layout, raw, coefficients, rays, background, stop, deferred, peaks)
 
 
 def trace_octree_reference(
     layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
-    deferred: tuple[RowGradient, RowGradient] | None = None,
+    deferred: tuple[RowGradient, RowGradient] | None = None, peaks: Tensor | None = None,
 ) -> OctreeLight:  # fmt: skip
     """Compute `trace_octree` in PyTorch, on any device and for any float type.
 
-    The gradient is autograd's. `layout`, `raw`, `coefficients`, `rays`, `background`, `stop` and `deferred` are as in
-    `trace_octree`; `deferred` is not used.
+    The gradient is autograd's. `layout`, `raw`, `coefficients`, `rays`, `background`, `stop`, `deferred` and `peaks`
+    are as in `trace_octree`; `deferred` is not used.
     """
-    return light_of(layout, depths_of(raw[:, 0]), coefficients, rays, background, stop)
+    return light_of(layout, depths_of(raw[:, 0]), coefficients, rays, background, stop, peaks)
 
 
 TRACE_OCTREE: Operation[..., OctreeLight] = Operation("trace_octree", trace_octree_reference)
@@ -76,7 +79,7 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, raw: Tensor, coefficients: Tensor, placeholder: Tensor | None, layout: OctreeLayout, rays: Rays,
-        background: Tensor, stop: float, deferred: tuple[RowGradient, RowGradient] | None,
+        background: Tensor, stop: float, deferred: tuple[RowGradient, RowGradient] | None, peaks: Tensor | None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         out, addresses = outputs_of(rays)
         count, values = coefficients.shape
@@ -86,8 +89,8 @@ class _Trace(torch.autograd.Function):
             native.pointer(background, "the background", (len(rays), 3)), stop, *addresses, native.threads(),
         )  # fmt: skip
         ctx.save_for_backward(raw, coefficients, background)
-        ctx.layout, ctx.rays, ctx.stop, ctx.deferred = layout, rays, stop, deferred
-        ctx.mark_non_differentiable(out.moment, out.median)
+        ctx.layout, ctx.rays, ctx.stop, ctx.deferred, ctx.peaks = layout, rays, stop, deferred, peaks
+        ctx.mark_non_differentiable(out.moment, out.median, out.visits)
         ctx.set_materialize_grads(False)
         return tuple(out)
 
@@ -107,24 +110,25 @@ class _Trace(torch.autograd.Function):
             None if opacity is None else native.pointer(opacity, "the opacity's gradient", (len(rays),)),
             native.pointer(into[0], "the densities' gradient", (count, 1)),
             native.pointer(into[1], "the coefficients' gradient", (count, values)),
-            None if leaves is None else leaves.data_ptr(), native.threads(),
+            None if leaves is None else leaves.data_ptr(),
+            None if ctx.peaks is None else native.pointer(ctx.peaks, "peaks", (count,)), native.threads(),
         )  # fmt: skip
         if leaves is not None:
             for kept, rows in zip(ctx.deferred, into, strict=True):
                 kept.parts.append((leaves[:used], rows[:used]))
         found = into if leaves is None else [None, None]
-        return (*found, None, None, None, None, None, None)
+        return (*found, None, None, None, None, None, None, None)
 
 
 @TRACE_OCTREE.implementation(CPP, differentiable=2)
 def _compiled(
     layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
-    deferred: tuple[RowGradient, RowGradient] | None = None,
+    deferred: tuple[RowGradient, RowGradient] | None = None, peaks: Tensor | None = None,
 ) -> OctreeLight:  # fmt: skip
     inputs = raw.contiguous(), coefficients.contiguous()
     placeholder = None
     if deferred is not None and torch.is_grad_enabled():  # autograd must see a reason to go backward
         inputs = inputs[0].detach(), inputs[1].detach()
         placeholder = torch.zeros(1, requires_grad=True)
-    rest = layout, contiguous(rays), background.contiguous(), stop, deferred
+    rest = layout, contiguous(rays), background.contiguous(), stop, deferred, peaks
     return OctreeLight(*_Trace.apply(*inputs, placeholder, *rest))

@@ -1,0 +1,328 @@
+"""Sparse voxels, learnt from photographs: from a coarse grid of fog to fine leaves on surfaces.
+
+Fridovich-Keil et al., "Plenoxels: Radiance Fields without Neural Networks", CVPR 2022, and Sun et al., "Sparse Voxels
+Rasterization: Real-time High-fidelity Radiance Field Rendering", CVPR 2025. There is no network: each leaf of an octree
+has a density and harmonics of its colour. Training starts with few large leaves. Leaves that no ray sees are dropped,
+and the others are split.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from nerfloom import ConfigError, Dataset, Decision, Loss, Method, PixelBatch, RowChange, Scene
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.console import say
+from nerfloom.base.decisions import Choice, fill
+from nerfloom.base.device import HostValue, relative_speed
+from nerfloom.base.processes import add_up
+from nerfloom.geometry.bounds import box_around_cells
+from nerfloom.kernels.adam.row_gradient import table_rows
+from nerfloom.kernels.encodings.spherical_harmonics import CONSTANT
+from nerfloom.kernels.octree.layout import BRICK, OctreeLayout
+from nerfloom.kernels.octree.light import depths_of, raw_of
+from nerfloom.losses.leaf_variation import leaf_variation
+from nerfloom.octree_model import OctreeConfig, OctreeModel
+
+MAX_RESOLUTION = 2048
+"""Maximum number of cells along an axis."""
+CELLS_PER_PIXEL, MIN_CELLS, MAX_CELLS = 1.28, 64, 640
+"""Default cells along the longest edge per pixel of the images' longer side, and their limits. If the object fills the
+images, a cell is 0.8 pixels wide. The number of leaves grows with the square of the number of cells along an edge."""
+CELLS_IN_A_MINUTE = 384
+"""Default cells along the longest edge after a minute on two CPU threads. Four times the time allows twice as many, as
+a leaf then takes part in the same number of steps."""
+HULL_CELLS = 128
+"""Cells along each axis of the grid that silhouettes carve."""
+FOG = 1.0
+"""Optical depth of the first leaves along the longest edge of their box."""
+VARIED_BRICKS, STEPS_PER_VARIATION = 32, 4
+"""Number of bricks whose total variation is a term of the loss, and number of steps from one such step to the next."""
+COLOR_VARIATION = 0.1
+"""Weight of the total variation of colours, relative to that of opacities."""
+NOT_LEARNT = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
+"""Settings of methods with samples along rays, which have no meaning here."""
+
+
+@dataclass(frozen=True)
+class VoxelsConfig(
+    OctreeConfig,
+    max_num_iterations=20_000,
+    learning_rate=0.05,
+    lr_schedule="hold-exponential",
+    lr_final=0.05,
+    density_rate=3.0,
+    samples_per_batch=2**17,
+):
+    """Settings of voxels."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "resolution": (8, MAX_RESOLUTION),
+        "num_splits": (0, 6),
+        "max_leaves": (8, 2**26),
+        "prune_weight": (0, 1),
+        "total_variation": AT_LEAST_0,
+    }
+    """Allowed range of each numeric setting."""
+    resolution: Auto[int] = AUTO
+    """Cells along the longest edge of the box that silhouettes leave, at the end of training. auto: as many as the
+    images and the training time allow."""
+    num_splits: int = 3
+    """Number of times that leaves are split into eight. Training starts with --resolution / 2^num_splits cells."""
+    max_leaves: int = 2**22
+    """Maximum number of leaves. With more, those with the smallest weights on training rays are dropped."""
+    prune_weight: float = 0.02
+    """Leaves whose weight on every training ray is smaller are dropped. This is the last threshold: earlier ones are
+    smaller."""
+    total_variation: float = 0.01
+    """Weight of the total variation of opacities between neighbouring leaves; colours have a tenth."""
+    silhouette_cells: bool = True
+    """Place no leaf where an image's alpha channel shows empty space."""
+    silhouette_pixels: bool = True
+    """Never draw pixels whose ray passes only through such empty space."""
+
+
+def decide(config: VoxelsConfig, scene: Scene) -> tuple[VoxelsConfig, list[Decision]]:
+    """Fill in the resolution.
+
+    Args:
+        config: the method's settings.
+        scene: properties of the data.
+
+    Returns:
+        Settings without open ones, and a record of each setting that was filled in.
+    """
+    cells = min(max(round(CELLS_PER_PIXEL * scene.image_size), MIN_CELLS), MAX_CELLS)
+    reason = f"the images have {scene.image_size} pixels along a side"
+    if config.max_seconds is not None:
+        minutes = config.max_seconds * relative_speed(config.machine) / 60
+        in_time = max(round(CELLS_IN_A_MINUTE * math.sqrt(minutes)), MIN_CELLS)
+        cells, reason = (in_time, "that suits the time") if in_time < cells else (cells, reason)
+    whole = first_cells(cells, config.num_splits) << config.num_splits
+    return fill(config, Choice("resolution", whole, reason, "cells along the longest edge"))
+
+
+def first_cells(cells: int, num_splits: int) -> int:
+    """Return the number of cells along an edge before leaves are split.
+
+    Args:
+        cells: wanted number of cells after all splits.
+        num_splits: number of splits, each of which doubles the number.
+    """
+    return max(cells >> num_splits, 1)
+
+
+def moments(num_splits: int) -> list[tuple[float, bool]]:
+    """Return when leaves change: spent shares of the budget, each with whether leaves are split or only dropped.
+
+    Each size of leaves lasts twice as long as the one before. Leaves are dropped in the middle and at the end of this
+    time, except at the end of training.
+
+    Args:
+        num_splits: number of splits.
+    """
+    found, total = list[tuple[float, bool]](), 2 ** (num_splits + 1) - 1
+    for level in range(num_splits + 1):
+        begin, length = (2**level - 1) / total, 2**level / total
+        found += [(begin + length / 2, False), (begin + length, True)]
+    return found[:-1]
+
+
+def visible(peaks: Tensor, least: float, most: int) -> Tensor:
+    """Return the leaves (K,) int64 that stay, in ascending order.
+
+    A ray over colours in [0, 1] changes by at most the sum of the weights that the dropped leaves have on it.
+
+    Args:
+        peaks: (L,) largest weight of each leaf on training rays.
+        least: smallest weight of a leaf that stays. If no leaf has it, nothing is known yet, and all qualify.
+        most: maximum number of leaves; those with the largest weights stay.
+    """
+    kept = (peaks >= least).nonzero()[:, 0]
+    kept = kept if len(kept) else torch.arange(len(peaks), device=peaks.device)
+    return kept if len(kept) <= most else kept[peaks[kept].topk(most).indices].sort().values
+
+
+def split(layout: OctreeLayout, cells: Tensor) -> tuple[OctreeLayout, Tensor]:
+    """Return the layout whose leaves are the eighths of some cells.
+
+    Args:
+        layout: the grid of the cells.
+        cells: (K, 3) int64 coordinates of the cells.
+
+    Returns:
+        The layout of 8 K leaves, and the index (8 K,) in `cells` of the cell that each leaf is a part of.
+    """
+    offsets = torch.cartesian_prod(*[torch.arange(2, device=cells.device)] * 3)
+    parts = (2 * cells[:, None] + offsets).reshape(-1, 3)
+    size = [2 * count for count in layout.size]
+    finer, rows = OctreeLayout.build(layout.origin, layout.cell / 2, size, parts)
+    return finer, rows // len(offsets)
+
+
+def overlapped(inside: Tensor, box: Tensor, origin: Tensor, cell: float, counts: Sequence[int]) -> Tensor:
+    """Return the cells (X, Y, Z) bool of a grid that overlap some cells of another grid.
+
+    Args:
+        inside: (n, n, n) bool, True for these cells.
+        box: (2, 3) corners of their grid.
+        origin: (3,) corner of the first cell of the other grid.
+        cell: edge of its cells.
+        counts: number of its cells along each axis.
+    """
+    found = inside.long()
+    for axis, count in enumerate(counts):
+        edge = float(box[1, axis] - box[0, axis]) / len(inside)
+        begins = float(origin[axis] - box[0, axis]) / edge + cell / edge * torch.arange(count, device=box.device)
+        # Faces that two cells share, up to rounding, are no overlap.
+        first = (begins + 1e-3).floor().long().clamp(0, len(inside))
+        last = (begins + cell / edge - 1e-3).ceil().long().clamp(0, len(inside))
+        sums = torch.cat([torch.zeros_like(found.narrow(axis, 0, 1)), found.cumsum(axis)], axis)
+        found = sums.index_select(axis, last) - sums.index_select(axis, first)
+    return found > 0
+
+
+class Hull(nn.Module):
+    """A grid over the box, where cells that images show to be empty are marked (`nerfloom.samplers.base.Carved`).
+
+    Args:
+        box: (2, 3) corners of the box, scene units.
+        resolution: number of cells along each axis.
+    """
+
+    box: Tensor
+    carved: Tensor
+    levels = slices = 1
+
+    def __init__(self, box: Tensor, resolution: int) -> None:
+        super().__init__()
+        self.resolution = resolution
+        self.register_buffer("box", box.clone())
+        self.register_buffer("carved", torch.zeros(resolution**3, dtype=torch.bool))
+
+    @property
+    def inside(self) -> Tensor:
+        """Cells (n, n, n) bool that are not marked, indexed by x, y and z."""
+        return (~self.carved).view(self.resolution, self.resolution, self.resolution)
+
+    def carve(self, hull: Tensor) -> None:
+        """Mark all cells outside `hull`, (n^3,) bool, as empty."""
+        self.carved.copy_(~hull)
+
+
+class Voxels(OctreeModel[VoxelsConfig]):
+    """An octree with leaves that become smaller and fewer during training.
+
+    Args:
+        config: the settings.
+        scene: the scene.
+
+    Raises:
+        ConfigError: if a setting has no meaning here, or there are too many leaves to begin with.
+    """
+
+    resizes = ends_at_box = True
+    changes: Tensor
+    """Number () int64 of changes of the leaves so far."""
+
+    def __init__(self, config: VoxelsConfig, scene: Scene) -> None:
+        super().__init__(config, scene)
+        if scene.warped:
+            raise ConfigError("voxels cannot learn normalised device coordinates: leave out --ndc, or take nerfacto")
+        for name in NOT_LEARNT:
+            if value := getattr(config, name):
+                flag = name.replace("_", "-")
+                raise ConfigError(f"--{flag} is {value}, and voxels learn from colours alone: leave it out")
+        first = first_cells(config.resolution, config.num_splits)
+        if first**3 > config.max_leaves:
+            raise ConfigError(
+                f"--resolution {config.resolution} starts with {first}^3 cells, and --max-leaves is "
+                f"{config.max_leaves:,}: raise --num-splits"
+            )
+        self.hull = Hull(scene.box.cpu(), HULL_CELLS)
+        self.register_buffer("changes", torch.zeros((), dtype=torch.int64))
+        self.peaks = torch.zeros(0)
+        self._moments, self._num_changes = moments(config.num_splits), HostValue()
+        self._begin(first)
+
+    def start(self, dataset: Dataset) -> None:
+        """Set the first leaves: fog wherever the images' silhouettes allow matter, or in the whole box.
+
+        Args:
+            dataset: the training images; not used, since their silhouettes have carved `hull`.
+        """
+        self._begin(first_cells(self.config.resolution, self.config.num_splits))
+
+    @torch.no_grad()
+    def _begin(self, cells: int) -> None:
+        """Set grey fog in a grid with a number of `cells` along the longest edge."""
+        inside, box = self.hull.inside, self.hull.box
+        around = box_around_cells(inside, box)
+        low, high = box if around is None else around
+        edge = float((high - low).max() / cells)  # rounded to float32, as in a checkpoint
+        size = [max(math.ceil(length / (BRICK * edge) - 1e-4), 1) for length in (high - low).tolist()]
+        places = overlapped(inside, box, low, edge, [BRICK * count for count in size]).nonzero()
+        layout, _ = OctreeLayout.build(low, edge, size, places)
+        raw = raw_of(box.new_full((layout.num_leaves, 1), FOG / cells))
+        coefficients = box.new_zeros(layout.num_leaves, 3, (self.config.degree + 1) ** 2)
+        coefficients[..., 0] = 0.5 / CONSTANT
+        self.set_octree(layout, raw, coefficients.flatten(1))
+
+    def loss(self, batch: PixelBatch, step: int) -> Loss:
+        """Return the error of colours and, in some steps, the total variation of some leaves.
+
+        Args:
+            batch: pixels with their true colours, and rays in the frame of the scene.
+            step: number of training steps done.
+        """
+        loss = super().loss(batch, step)
+        if not self.config.total_variation or step % STEPS_PER_VARIATION:
+            return loss
+        return replace(loss, terms=loss.terms | {"variation": self.config.total_variation * self._variation()})
+
+    def _variation(self) -> Tensor:
+        """Return the total variation () of the leaves of some bricks in a row."""
+        firsts = self.layout.firsts[:, 0]
+        begin = int(torch.randint(max(len(firsts) - VARIED_BRICKS, 0) + 1, ()))
+        ends = [*firsts[begin : begin + VARIED_BRICKS + 1].tolist(), self.layout.num_leaves]
+        rows = torch.arange(ends[0], ends[min(VARIED_BRICKS, len(ends) - 1)], device=self.device)
+        cells = self.cells[rows].long()
+        raw, colors = (table_rows(each.table, rows, each.deferred) for each in (self.densities, self.colors))
+        opacities = -torch.expm1(-depths_of(raw))
+        return leaf_variation(opacities, cells) + COLOR_VARIATION * leaf_variation(CONSTANT * colors, cells)
+
+    def changes_rows(self, step: int, progress: float) -> bool:
+        done = int(self._num_changes.of(self.changes))
+        return done < len(self._moments) and progress >= self._moments[done][0]
+
+    @torch.no_grad()
+    def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
+        assert self.peaks is not None
+        done, layout = int(self._num_changes.of(self.changes)), self.layout
+        splits, most = self._moments[done][1], self.config.max_leaves
+        self.changes += 1
+        # Sums over processes are at least the maxima. Thresholds rise, as coarse fog has small weights everywhere.
+        peaks, least = add_up(self.peaks), self.config.prune_weight * (done + 1) / len(self._moments)
+        kept = visible(peaks, least, most // 8 if splits else most)
+        if (dropped := int((peaks >= least).sum()) - len(kept)) > 0:
+            say(f"note: {dropped:,} visible leaves are dropped, since --max-leaves is {most:,}")
+        cells, tables = self.cells[kept].long(), (self.densities.table, self.colors.table)
+        if not splits:
+            finer, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, cells)
+            self.set_layout(finer)
+            return [RowChange(table, kept[rows]) for table in tables]
+        finer, wholes = split(layout, cells)
+        rows, none = kept[wholes], kept[:0]
+        # An edge is half as long, so half as deep. Rows are new for Adam: gradients of smaller leaves are smaller.
+        raw, coefficients = raw_of(self.depths(rows) / 2)[:, None], self.coefficients()[rows]
+        self.set_layout(finer)
+        return [RowChange(table, none, fresh) for table, fresh in zip(tables, (raw, coefficients), strict=True)]
+
+
+METHOD = Method(VoxelsConfig(), paper="arXiv:2112.05131", model=Voxels, decide=decide)

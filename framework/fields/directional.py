@@ -41,9 +41,9 @@ DIFFUSE_BIAS, ROUGHNESS_BIAS = -3.0, -1.0
 reflections learn first. With the paper's -log 3 on a hash grid, diffuse colours learnt everything and reflections
 vanished."""
 SHORTEST = 0.1
-"""Length of a predicted vector below which the normal is shorter than 1. Features of a hash grid start near 0. By exact
-normalisation, the first gradients of normals would be thousands of times those of density and colour. Adam keeps their
-squares for a thousand updates, in which coarse levels would hardly learn anything else."""
+"""Length of a predicted vector below which the normal is shorter than 1. Features of a hash grid start near 0, so that
+with exact normalisation the first gradients of normals would be thousands of times those of density and colour. Adam
+divides later ones by the root of their mean square, which an entry forgets only after hundreds of updates."""
 ENVIRONMENT_LEVELS = 0
 """Levels of the hash grid over reflected directions (`Environment`); 0 for none."""
 COARSEST, FINEST, LOG2_ENVIRONMENT = 8, 128, 15

@@ -16,7 +16,7 @@ from nerfloom.base.config import AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.device import relative_speed
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.fields.directional import DirectionalConfig, PredictedNormalsConfig, reflection_of
+from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
@@ -55,8 +55,7 @@ class InstantNGPConfig(
     HashGridConfig,
     BackgroundConfig,
     FewImagesConfig,
-    DirectionalConfig,
-    PredictedNormalsConfig,
+    DensityDirectionalConfig,
     max_num_iterations=20_000,
     num_rays_per_batch=8_192,
     rays_per_pixel=4,

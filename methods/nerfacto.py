@@ -31,7 +31,7 @@ from nerfloom.base.config import AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
-from nerfloom.fields.directional import DirectionalConfig, PredictedNormalsConfig, reflection_of
+from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
 from nerfloom.kernels.compositing.density import ray_sum
@@ -58,8 +58,7 @@ class NerfactoConfig(
     CaptureConfig,
     FewImagesConfig,
     AppearanceConfig,
-    DirectionalConfig,
-    PredictedNormalsConfig,
+    DensityDirectionalConfig,
     max_num_iterations=30_000,
     num_rays_per_batch=2_048,
     learning_rate=1e-2,

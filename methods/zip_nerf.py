@@ -26,7 +26,7 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, exposed
-from nerfloom.fields.directional import DirectionalConfig, PredictedNormalsConfig, reflection_of
+from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
 from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
@@ -45,8 +45,7 @@ class ZipNeRFConfig(
     HashGridConfig,
     CaptureConfig,
     AppearanceConfig,
-    DirectionalConfig,
-    PredictedNormalsConfig,
+    DensityDirectionalConfig,
     max_num_iterations=25_000,
     num_rays_per_batch=2_048,
     learning_rate=1e-2,

@@ -73,6 +73,11 @@ class PredictedNormalsConfig(TrainConfig):
     """Weight of the penalty on predicted normals that face away from the camera."""
 
 
+@dataclass(frozen=True)
+class DensityDirectionalConfig(DirectionalConfig, PredictedNormalsConfig):
+    """Settings of a method with such colours that learns a density."""
+
+
 class Light(NamedTuple):
     """Light of N points along their rays, linear, and the properties of their surfaces."""
 
@@ -237,7 +242,8 @@ class Reflection(nn.Module):
             more: (N, M) further features.
         """
         features = at_least_float32(features)
-        return self(features[:, PROPERTIES], predicted_normals(features), directions, *more)
+        found: Light = self(features[:, PROPERTIES], predicted_normals(features), directions, *more)
+        return found
 
 
 def reflection_of(config: TrainConfig, width: int, bottleneck: int = BOTTLENECK, more: int = 0) -> Reflection | None:

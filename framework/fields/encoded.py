@@ -210,7 +210,10 @@ class EncodedField(BoxField):
         return self.color_head(*inputs).float()
 
     def light(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Light:
-        """Return the light of points, as `HasLight` does; an appearance changes the reflected light alone."""
+        """Return the light of points, as `HasLight` does; an appearance changes the reflected light alone.
+
+        `features`, `directions` and `camera_indices` are as there; the field has a `Reflection`.
+        """
         assert self.reflection is not None
         vectors = () if self.appearance is None else (self.appearance(camera_indices, len(features)),)
         return self.reflection.of_density(features, directions, *vectors)

@@ -68,7 +68,10 @@ class ReflectiveNetworks(Field):
         return self.light(features, directions).rgb
 
     def light(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Light:
-        """Return the light of points, as `HasLight` does; there are no appearances."""
+        """Return the light of points, as `HasLight` does.
+
+        `features` and `directions` are as there; `camera_indices` do not matter, because there are no appearances.
+        """
         return self.reflection.of_density(features, directions)
 
     def density_normals(self, points: Points) -> Tensor:

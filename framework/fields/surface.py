@@ -169,11 +169,15 @@ class SurfaceField(Field):
         return self.color_head(*inputs).float()
 
     def light(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Light:
-        """Return the light of points, as `HasLight` does; an appearance changes the reflected light alone."""
+        """Return the light of points, as `HasLight` does; an appearance changes the reflected light alone.
+
+        `features`, `directions` and `camera_indices` are as there; the field has a `Reflection`.
+        """
         assert self.reflection is not None
         vectors = () if self.appearance is None else (self.appearance(camera_indices, len(features)),)
         rows = unit_normals(features)
-        return self.reflection(rows[:, PLACED:], rows[:, :3], directions, *vectors)
+        found: Light = self.reflection(rows[:, PLACED:], rows[:, :3], directions, *vectors)
+        return found
 
     @abstractmethod
     def density_at(self, distances: Tensor) -> Tensor:

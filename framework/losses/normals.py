@@ -109,8 +109,7 @@ def drawn(weights: Tensor, share: float) -> tuple[Tensor, Tensor]:
     Returns:
         indices (K,) of the drawn samples, and one over their probabilities (K,).
     """
-    chances = (weights * (share * len(weights) / weights.sum())).clamp(
-        max=1
-    )  # NaN, so that none is drawn, if all are 0
+    # If all weights are 0, the probabilities are NaN, and no sample is drawn.
+    chances = (weights * (share * len(weights) / weights.sum())).clamp(max=1)
     places = (torch.rand_like(chances) < chances).nonzero()[:, 0]
     return places, 1 / chances.index_select(0, places)

@@ -14,8 +14,8 @@ from nerfloom.fields.base import Field
 from nerfloom.model import Model
 from nerfloom.ray_model import RayModel
 from nerfloom.renderable import RendersFromImages
+from nerfloom.rendering.choice import volume_renderer
 from nerfloom.rendering.renderer import Renderer
-from nerfloom.rendering.volume import volume_renderer
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.choice import sampler_choice
 

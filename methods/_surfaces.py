@@ -18,6 +18,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
 from nerfloom.fields.base import DensityFunction, Field
+from nerfloom.fields.directional import NUM_PROPERTIES, DirectionalConfig, reflection_of
 from nerfloom.fields.distance import Distance, GridDistance, NetworkDistance
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.nerf import NeRFField
@@ -39,6 +40,7 @@ from nerfloom.methods._captures import RefinedConfig, RefinedModel, refinement_c
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
+from nerfloom.rendering.reflections import ReflectionRenderer
 from nerfloom.rendering.renderer import Renderer
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground, foreground_sphere
@@ -71,6 +73,7 @@ class SurfaceConfig(
     BackgroundConfig,
     RefinedConfig,
     AppearanceConfig,
+    DirectionalConfig,
     max_num_iterations=20_000,
     learning_rate=AUTO,
     lr_schedule="hold-exponential",
@@ -218,6 +221,7 @@ def surface_field(
         color_bias=large,
         direction_frequencies=config.direction_frequencies if large else None,
         appearance=appearance,
+        reflection=reflection_of(config, config.hidden_width, distance.num_features - NUM_PROPERTIES, size),
     )
 
 
@@ -261,9 +265,9 @@ def make_background(config: SurfaceConfig, scene: Scene) -> Field:
 
 def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     """Return the renderer, with a background if the scene has one."""
-    return background_renderer(
-        config, scene, make_background, SurfaceRenderer(scaled_up_to(config, scene), config.thin_gradients)
-    )
+    kind = ReflectionRenderer if config.directional == "reflected" else SurfaceRenderer
+    shown = kind(scaled_up_to(config, scene), config.thin_gradients)
+    return background_renderer(config, scene, make_background, shown)
 
 
 class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):

@@ -11,14 +11,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
-from nerfloom import Decision, Method, Scene
+from nerfloom import ConfigError, Decision, Method, Scene
 from nerfloom.base.config import AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.device import relative_speed
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
+from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
 from nerfloom.ray_model import RayModel
 from nerfloom.rendering.background import background_renderer
@@ -53,6 +55,7 @@ class InstantNGPConfig(
     HashGridConfig,
     BackgroundConfig,
     FewImagesConfig,
+    DensityDirectionalConfig,
     max_num_iterations=20_000,
     num_rays_per_batch=8_192,
     rays_per_pixel=4,
@@ -163,7 +166,12 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
 
     Returns:
         Settings without open ones, and a record of each setting that was filled in.
+
+    Raises:
+        ConfigError: if colours are to depend on reflected directions and not on the viewing direction.
     """
+    if config.directional == "reflected" and not config.view_dependence:
+        raise ConfigError("--directional reflected depends on the viewing direction; leave out --view-dependence False")
     seconds = math.inf if config.max_seconds is None else config.max_seconds
     suited = plan(seconds, scene.image_size, relative_speed(config.machine))
     suits = "that suits the time" if seconds < math.inf else "there is time for it"
@@ -210,6 +218,7 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
         direction_levels=4 if config.view_dependence else 0,
         unbounded=contracted_box(config, scene) is not None,
         opening=config.open_levels_until,
+        reflection=reflection_of(config, config.hidden_width),
     )
 
 
@@ -224,9 +233,9 @@ def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
 
 
 class InstantNGP(RayModel[InstantNGPConfig], plain=True):
-    """A model that learns from colours only, if there are no known distances and no proposals."""
+    """A model that learns from colours only, if there are no known distances, no proposals and no reflections."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES)
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES, PREDICTED_NORMALS)
     steps_repeat = True
 
 

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from nerfloom import (
+    ConfigError,
     Decision,
     Field,
     Method,
@@ -26,19 +27,21 @@ from nerfloom import (
     Samples,
     Scene,
 )
-from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.config import AUTO, AppearanceConfig, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
+from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
-from nerfloom.losses.normals import NormalPenalty
+from nerfloom.losses.normals import PREDICTED_NORMALS, NormalPenalty
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, RefinedModel, decide_capture
+from nerfloom.rendering.choice import volume_renderer
 from nerfloom.rendering.outputs import NORMALS
-from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to, volume_renderer
+from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
 from nerfloom.samplers.choice import batch_choice, make_sampler
 
 APPEARANCE_SIZE = 16
@@ -55,6 +58,7 @@ class NerfactoConfig(
     CaptureConfig,
     FewImagesConfig,
     AppearanceConfig,
+    DensityDirectionalConfig,
     max_num_iterations=30_000,
     num_rays_per_batch=2_048,
     learning_rate=1e-2,
@@ -69,17 +73,14 @@ class NerfactoConfig(
 
     RANGES: ClassVar[dict[str, Range]] = {
         "appearance_embedding_dim": (0, 2**10),
-        "orientation_loss_mult": AT_LEAST_0,
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
     appearance_embedding_dim: Auto[int] = AUTO
     """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     predict_normals: bool = False
-    """Whether to predict normals, which are smoother than those of the density's gradient."""
-    orientation_loss_mult: float = 0.1
-    """Weight of the penalty on predicted normals that face away from the camera, relative to that on their difference
-    from the density's normals."""
+    """Whether to predict normals, which are smoother than those of the density's gradient. --directional reflected
+    always does."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""
 
@@ -133,6 +134,7 @@ class Nerfacto(RefinedModel[NerfactoConfig], plain=True):
         IfPredicted("normals"),
         IfPredicted("orientation", "orientation_loss_mult"),
         *FEW_IMAGES,
+        PREDICTED_NORMALS,
     )
     steps_repeat = True
 
@@ -147,7 +149,12 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
 
     Returns:
         Settings without open ones, and a record of each setting that was filled in.
+
+    Raises:
+        ConfigError: if normals are to be predicted twice.
     """
+    if config.predict_normals and config.directional == "reflected":
+        raise ConfigError("--directional reflected predicts normals already; leave out --predict-normals")
     varies = scene.appearance_varies
     size = APPEARANCE_SIZE if varies else 0
     appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
@@ -175,6 +182,7 @@ def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
         unbounded=config.contraction,
         appearance=appearance,
         opening=opening,
+        reflection=reflection_of(config, config.hidden_width, more=size),
     )
 
 

@@ -10,31 +10,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from nerfloom import Decision, Method, RayModel, Renderer, Sampler, Scene
-from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom import Decision, Field, Method, RayModel, Sampler, Scene
+from nerfloom.base.config import AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.integrated import IntegratedEncoding
-from nerfloom.fields.base import MLP
-from nerfloom.fields.reflective import (
-    Reflection,
-    ReflectiveField,
-    ReflectiveGrid,
-    ReflectiveNetworks,
-    SkippingNetwork,
-)
+from nerfloom.fields.directional import PredictedNormalsConfig, Reflection
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.reflective import ReflectiveNetworks, SkippingNetwork
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.encodings.integrated_directional import MAX_BANDS
-from nerfloom.losses.normals import NormalPenalty
+from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
-from nerfloom.rendering.reflections import ReflectionRenderer
-from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
 
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**12}
 """Samples per training step with an occupancy grid."""
-DEPTH, DIRECTIONAL_SKIP = 8, 4
+DEPTH, DIRECTIONAL_SKIP = 8, 5
 """Hidden layers of each of the paper's networks, and of the directional one before its input is repeated."""
 
 
@@ -42,8 +35,11 @@ DEPTH, DIRECTIONAL_SKIP = 8, 4
 class RefNeRFConfig(
     HashGridConfig,
     HierarchicalConfig,
+    PredictedNormalsConfig,
     max_num_iterations=250_000,
     num_rays_per_batch=4_096,
+    rays_per_pixel=4,
+    train_rays_per_pixel_from=0.75,
     learning_rate=AUTO,
     lr_schedule="hold-exponential",
     lr_final=0.02,
@@ -63,8 +59,6 @@ class RefNeRFConfig(
         "bottleneck_width": (1, 2**12),
         "direction_bands": (1, MAX_BANDS),
         "position_frequencies": (1, MAX_FREQUENCIES),
-        "normal_loss_mult": AT_LEAST_0,
-        "orientation_loss_mult": AT_LEAST_0,
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
@@ -87,8 +81,7 @@ class RefNeRFConfig(
     normal_loss_mult: Auto[float] = AUTO
     """Weight of the difference between predicted normals and those of the density. auto: 0.003 on a hash grid, 0.0003
     for the paper's networks."""
-    orientation_loss_mult: float = 0.1
-    """Weight of the penalty on predicted normals that face away from the camera."""
+    directional = "reflected"  # no flag
 
 
 class RefNeRF(RayModel[RefNeRFConfig], plain=True):
@@ -99,8 +92,7 @@ class RefNeRF(RayModel[RefNeRFConfig], plain=True):
         CoarseColorError(0.1),
         SamplerLoss(),
         *KNOWN_DISTANCES,
-        NormalPenalty("normals", "normal_loss_mult"),
-        NormalPenalty("orientation", "orientation_loss_mult"),
+        PREDICTED_NORMALS,
     )
 
 
@@ -128,22 +120,22 @@ def decide(config: RefNeRFConfig, scene: Scene) -> tuple[RefNeRFConfig, list[Dec
     return config, made + samples + (cells if on_grid else [])
 
 
-def make_field(config: RefNeRFConfig, scene: Scene) -> ReflectiveField:
+def make_field(config: RefNeRFConfig, scene: Scene) -> Field:
     """Return a field on a hash grid, or the paper's networks."""
     width, bottleneck, bands = config.hidden_width, config.bottleneck_width, config.direction_bands
-    inputs, unbounded = Reflection.num_inputs(bottleneck, bands), contracted_box(config, scene) is not None
+    unbounded = contracted_box(config, scene) is not None
     if config.encoding == "hash-grid":
-        reflection = Reflection(MLP(inputs, width, width, 3, bias=False, activation="sigmoid"), bands)
-        grid = HashGrid.of(config, config.open_levels_until)
-        return ReflectiveGrid(scene.box, grid, reflection, width, bottleneck, unbounded)
+        grid, reflection = HashGrid.of(config, config.open_levels_until), Reflection.small(width, bottleneck, bands)
+        return EncodedField(scene.box, grid, width, unbounded=unbounded, reflection=reflection)
     encoding = IntegratedEncoding(
         scene.box,
         config.position_frequencies,
         deviation=half_edge(scene.box) / scene.image_size,
         contracted=unbounded,
     )
+    inputs = Reflection.num_inputs(bottleneck, bands)
     directional = SkippingNetwork(inputs, width, DEPTH, DIRECTIONAL_SKIP, 3, "sigmoid")
-    return ReflectiveNetworks(encoding, Reflection(directional, bands), width, DEPTH, bottleneck)
+    return ReflectiveNetworks(encoding, Reflection(directional, bottleneck, bands), width, DEPTH)
 
 
 def sampler(config: RefNeRFConfig, scene: Scene) -> Sampler:
@@ -151,17 +143,11 @@ def sampler(config: RefNeRFConfig, scene: Scene) -> Sampler:
     return make_sampler(config, scene, make_coarse=lambda: None)
 
 
-def renderer(config: RefNeRFConfig, scene: Scene) -> Renderer:
-    """Return a renderer that also shows the parts of the colours."""
-    return ReflectionRenderer(scaled_up_to(config, scene), config.thin_gradients)
-
-
 METHOD = Method(
     RefNeRFConfig(),
     paper="arXiv:2112.03907",
     field=make_field,
     sampler=sampler,
-    renderer=renderer,
     model=RefNeRF,
     decide=decide,
 )

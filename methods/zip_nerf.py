@@ -26,9 +26,11 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, exposed
+from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
 from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler
@@ -43,6 +45,7 @@ class ZipNeRFConfig(
     HashGridConfig,
     CaptureConfig,
     AppearanceConfig,
+    DensityDirectionalConfig,
     max_num_iterations=25_000,
     num_rays_per_batch=2_048,
     learning_rate=1e-2,
@@ -104,7 +107,7 @@ class ZipNeRFConfig(
 class ZipNeRF(RefinedModel[ZipNeRFConfig]):
     """A model with exposures per image, refined poses and the distortion loss."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, Distortion())
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, Distortion(), PREDICTED_NORMALS)
     steps_repeat = True
 
     def __init__(self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
@@ -135,7 +138,8 @@ def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Dec
 def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
     """Return a field of one multisampled hash grid and two small networks, by `config` and `scene`."""
     grid = MultisampledHashGrid.of(config, config.hash_decay_mult)
-    return MultisampledField(scene.box, grid, config.hidden_width, unbounded=config.contraction)
+    reflection = reflection_of(config, config.hidden_width)
+    return MultisampledField(scene.box, grid, config.hidden_width, unbounded=config.contraction, reflection=reflection)
 
 
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:

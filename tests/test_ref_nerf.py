@@ -14,9 +14,13 @@ from nerfloom.data.sources import Request
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.procedural.shiny import write_shiny
 from nerfloom.evaluation.evaluator import evaluate
-from nerfloom.fields.reflective import NUM_OUTPUTS, Reflection, ReflectiveField, ReflectiveGrid
+from nerfloom.fields.base import Field
+from nerfloom.fields.directional import NUM_PROPERTIES, SHORTEST, HasDensityNormals, HasLight, Reflection
+from nerfloom.fields.encoded import EncodedField
+from nerfloom.fields.reflective import ReflectiveNetworks
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.integrated_directional import directional_encoding
+from nerfloom.losses.normals import drawn, penalties
 from nerfloom.method import Method
 from nerfloom.registry import load_method
 from nerfloom.testing.scenes import ball_in_a_box, ball_under_a_sky
@@ -28,14 +32,15 @@ KINDS = "ref-nerf", "ref-nerf+frequency"
 
 def trainer_of(kind: str, dataset: object = None, **settings: object) -> Trainer:
     """A trainer on images of a ball, without a folder."""
-    method: Method = load_method("ref-nerf")
+    method: Method = load_method(kind.split("+")[0])
     known = {**TINY[kind], "vis": "none", **settings}
     return Trainer(method, dataclasses.replace(method.config, **known), dataset or ball_in_a_box())
 
 
-def field_of(kind: str, dataset: object = None, **settings: object) -> ReflectiveField:
+def field_of(kind: str, dataset: object = None, **settings: object) -> Field:
     field = trainer_of(kind, dataset, **settings).model.field
-    assert isinstance(field, ReflectiveField)
+    assert isinstance(field, HasLight)
+    assert isinstance(field, HasDensityNormals)
     return field
 
 
@@ -55,13 +60,17 @@ class Probe(nn.Module):
 def test_light_by_hand() -> None:
     """Reflected direction, cosine, attenuation by roughness, tint and diffuse light, as the paper's equations."""
     probe = Probe()
-    outputs = torch.zeros(1, NUM_OUTPUTS + 2)
-    outputs[0, 1:4] = torch.tensor([0.0, 0, 2])  # a normal along z, not of length 1
-    outputs[0, 10], outputs[0, 11:] = 0.3, torch.tensor([7.0, 8.0])
+    features = torch.zeros(1, 4 + NUM_PROPERTIES + 2)
+    features[0, 1:4] = torch.tensor([0.0, 0, 2])  # a normal along z, not of length 1
+    features[0, 10], features[0, 11:] = 0.3, torch.tensor([7.0, 8.0])
     direction = normalize(torch.tensor([[1.0, 0, -1]]), dim=-1)
-    light = Reflection(probe, 5)(outputs, direction)
+    part = Reflection(probe, 2, 5)
+    assert part.num_features == features.shape[1]
+    light = part.of_density(features, direction)
     roughness = torch.log1p(torch.exp(torch.tensor([0.3 - 1])))
-    encoded, cosine, bottleneck = probe.given
+    encoded, cosine, constant, bottleneck = probe.given
+    assert sum(each.shape[1] for each in probe.given) == Reflection.num_inputs(2, 5)
+    assert constant.tolist() == [[1.0]]
     torch.testing.assert_close(encoded, directional_encoding(normalize(torch.tensor([[1.0, 0, 1]]), dim=-1), roughness))
     torch.testing.assert_close(cosine, torch.tensor([[2**-0.5]]))
     assert bottleneck.tolist() == [[7.0, 8.0]]
@@ -74,12 +83,28 @@ def test_light_by_hand() -> None:
 
 def test_a_normal_of_length_0_reflects_nothing() -> None:
     probe, direction = Probe(), torch.tensor([[0.0, 0, 1]])
-    outputs = torch.zeros(1, NUM_OUTPUTS, requires_grad=True)
-    light = Reflection(probe, 2)(outputs, direction)
-    light.rgb.sum().backward()
-    assert bool(torch.isfinite(probe.given[0]).all())
-    assert outputs.grad is not None
-    assert bool(outputs.grad.isfinite().all())
+    features = torch.zeros(1, 4 + NUM_PROPERTIES, requires_grad=True)
+    light = Reflection(probe, 0, 2).of_density(features, direction)
+    torch.testing.assert_close(probe.given[0], directional_encoding(direction, light.roughness, 2))
+    (light.rgb.sum() + probe.given[0].sum()).backward()
+    assert features.grad is not None
+    assert bool(features.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("length", [1e-9, 1e-4, 1.0, 1e4])
+def test_gradients_of_normals_are_bounded(length: float) -> None:
+    """Features of a hash grid start near 0; with exact normalisation the gradient would be one over their size."""
+    torch.manual_seed(0)
+    probe, directions = Probe(), normalize(torch.randn(200, 3), dim=-1)
+    features = torch.zeros(200, 4 + NUM_PROPERTIES)
+    features[:, 1:4] = length * normalize(torch.randn(200, 3), dim=-1)
+    features.requires_grad_()
+    light = Reflection(probe, 0, 2).of_density(features, directions)
+    assert bool((light.normals.norm(dim=-1) < 1 + 1e-5).all())
+    weights = torch.randn(200, 8)
+    (probe.given[0] * weights).sum().backward()
+    assert features.grad is not None
+    assert float(features.grad[:, 1:4].norm(dim=-1).max()) < 100 / max(length, SHORTEST)
 
 
 @pytest.mark.parametrize("unbounded", [False, True])
@@ -95,8 +120,9 @@ def test_normals_point_down_the_density(kind: str, unbounded: bool) -> None:
         "sampler": "proposal" if unbounded else "auto",
     }
     field = field_of(kind, scene, **more).double().train()
-    if isinstance(field, ReflectiveGrid):
+    if isinstance(field, EncodedField):
         nn.init.normal_(field.encoding.table)
+    assert isinstance(field, HasDensityNormals)
     where, step = (3.0 if unbounded else 1.0) * places().double(), 1e-6
     columns = []
     for axis in torch.eye(3, dtype=torch.float64):
@@ -104,7 +130,8 @@ def test_normals_point_down_the_density(kind: str, unbounded: bool) -> None:
         columns.append(ahead - behind)
     down = -normalize(torch.stack(columns, -1), dim=-1)
     found = field.density_normals(Points(where))
-    agreement = (down * found).sum(-1)
+    assert bool((found.norm(dim=-1) < 1 + 1e-9).all())
+    agreement = (down * normalize(found, dim=-1)).sum(-1)
     print(f"{kind}, {unbounded=}: median {agreement.median():.6f}")
     assert agreement.median() > 0.99  # a few places are beside a cell's face or a unit's switch
     assert agreement.quantile(0.2) > 0.9
@@ -118,12 +145,34 @@ def test_penalties_of_normals_train_the_density(kind: str) -> None:
     model, batch = trainer.model, trainer.source.draw(Request(0, 64))
     model.train()
     model.before_step(0, 0.0)
-    rendered = model.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))
-    rendered.extras["normals_penalty"].sum().backward()
     field = model.field
-    first = field.encoding.table if isinstance(field, ReflectiveGrid) else field.network.before[0].weight
+    if isinstance(field, EncodedField):
+        nn.init.normal_(field.encoding.table)
+    rendered = model.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))
+    penalties(rendered, batch.rays, field)["normals"].backward()
+    assert isinstance(field, (EncodedField, ReflectiveNetworks))
+    first = field.encoding.table if isinstance(field, EncodedField) else field.network.before[0].weight
     assert first.grad is not None
     assert float(first.grad.abs().sum()) > 0
+
+
+def test_sums_over_drawn_samples_are_those_over_all() -> None:
+    """On average; no sample without weight is drawn, and one that outweighs all others is drawn always."""
+    torch.manual_seed(0)
+    weights = torch.rand(1000) ** 8
+    weights[:100], weights[-1] = 0, 30.0
+    values = torch.randn(1000)
+    truth, found, counts = float((weights * values).sum()), [], []
+    for _ in range(400):
+        places, factors = drawn(weights, 1 / 16)
+        found.append(float((weights[places] * factors * values[places]).sum()))
+        counts.append(len(places))
+        assert int(places.min()) >= 100
+        assert int(places.max()) == 999
+    spread = torch.tensor(found).std() / len(found) ** 0.5
+    assert abs(sum(found) / len(found) - truth) < 4 * float(spread)
+    assert sum(counts) / len(counts) < 1000 / 16
+    assert [len(each) for each in drawn(torch.zeros(5), 0.5)] == [0, 0]
 
 
 @pytest.fixture(scope="module")
@@ -135,11 +184,12 @@ def mirror(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "neus"])
 def test_training_on_a_mirror(kind: str, mirror: Path, tmp_path: Path) -> None:
     """The loss falls, pictures have all outputs, and normals are judged against the true ones."""
     train, test = (load_dataset(Blender().parse(mirror, s), s) for s in ("train", "test"))
-    trainer = trainer_of(kind, train, max_num_iterations=120)
+    own = {"directional": "reflected", "start_radius": 0.6} if kind == "neus" else {}
+    trainer = trainer_of(kind, train, max_num_iterations=120, **own)
     before = evaluate(trainer.model, test).results
     for _ in range(120):
         trainer.train_step()

@@ -147,7 +147,7 @@ class TrainConfig:
     # Values of settings that a method lacks, so that shared code need not know the class of its settings. They have no
     # annotations, so they are neither fields nor flags.
     sampler, bounded_sampler, time_slices, robust_factor = "", "occupancy", 1, 2.0
-    background_model = "contraction"
+    background_model, directional = "contraction", "view"
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = robust = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0

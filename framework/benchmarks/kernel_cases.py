@@ -19,6 +19,7 @@ from nerfloom.kernels.adam.adam import sparse_adam
 from nerfloom.kernels.compositing.density import composite, distortion
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.encodings.integrated_directional import directional_encoding
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.kernels.grids.hash_grid import hash_grid
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
@@ -179,9 +180,7 @@ def _at_points() -> Iterator[Family]:
     )  # fmt: skip
     yield "distance_network", with_gradient, "table first second", (usual, hard, none)
     yield from _surfaces(unit)
-    poles = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
-    usual, hard, none = ({"directions": rows} for rows in (unit, poles, unit[:0]))
-    yield "spherical_harmonics", lambda directions: (spherical_harmonics(directions, 4),), "", (usual, hard, none)
+    yield from _harmonics(unit)
     bits = (torch.randn(90, 3) * 256).round() / 256  # few bits, so that x times 2^k is the same angle in both types
     far = torch.tensor([[0.0, 8191, -100.5], [1e-30, 2.0**-20, 4096]])
     usual, hard, none = ({"x": rows} for rows in (bits, far, bits[:0]))
@@ -206,6 +205,22 @@ def _at_points() -> Iterator[Family]:
     hard["mean"], hard["square"] = torch.zeros(5, 2), torch.zeros(5, 2)
     hard["seen"] = torch.tensor([0.0, 0, 3, 1e6, 5e3])
     yield "sparse_adam", updated, "", (adam(300), hard, adam(0))
+
+
+def _harmonics(directions: Tensor) -> Iterator[Family]:
+    """Harmonics, and their means over distributions of directions."""
+    poles = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])
+    places = directions, poles, poles[:0]
+    usual, hard, none = ({"directions": rows} for rows in places)
+    yield "spherical_harmonics", lambda directions: (spherical_harmonics(directions, 4),), "", (usual, hard, none)
+
+    def blurred(directions: Tensor, roughness: Tensor) -> Sequence[Tensor]:
+        return (directional_encoding(directions, roughness),)
+
+    rough = torch.tensor([0.0, 1e-4, 10.0, 1e30])
+    given = zip(places, (torch.rand(len(directions)), rough, rough[:0]), strict=True)
+    usual, hard, none = ({"directions": rows, "roughness": each} for rows, each in given)
+    yield "directional_encoding", blurred, "directions roughness", (usual, hard, none)
 
 
 def _surfaces(directions: Tensor) -> Iterator[Family]:

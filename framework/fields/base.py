@@ -141,6 +141,16 @@ class MLP(nn.Sequential):
         """
         return density_mlp(inputs, *self._parameters_by_layer())
 
+    def first(self, *inputs: Tensor) -> Tensor:
+        """Return the first output (N,) alone, without the activation function of the output.
+
+        Args:
+            inputs: parts (N, D_i) that are concatenated along their features.
+        """
+        weights, biases = self._parameters_by_layer()
+        last = None if biases is None else [*biases[:-1], biases[-1][:1]]
+        return mlp(inputs, [*weights[:-1], weights[-1][:1]], "none", last)[:, 0]
+
     def _parameters_by_layer(self) -> tuple[list[Tensor], list[Tensor] | None]:
         """Return the weights of each layer, and the biases if there are any."""
         layers = [layer for layer in self if isinstance(layer, nn.Linear)]

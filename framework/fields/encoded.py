@@ -10,14 +10,21 @@ from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.base import MLP, Field
+from nerfloom.fields.directional import Light, Reflection
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
+from nerfloom.kernels.math import at_least_float32, normalize_above
 from nerfloom.kernels.traced.colors import GridColor
 from nerfloom.kernels.traced.trace import GridDensity
 
 NUM_FEATURES = 16
 """Number of features that the density network passes to the colour network; the first is the log-density."""
+TAP_DISTANCE = 1 / 512
+"""Distance along each axis from a point to the four positions of `EncodedField.density_normals`, in shortest edges of
+the box."""
+FLAT = 0.1
+"""Difference of the log-density over these positions below which a normal is shorter than 1."""
 
 
 class BoxField(Field):
@@ -128,7 +135,12 @@ class EncodedField(BoxField):
         opening: bands of the viewing direction open one after the other (`OpenLevels`) during this fraction of the
             training budget; 0: all are open.
         ambient: number of further coordinates (`Points.ambient`) that the density network takes.
+        reflection: colours by the reflected direction. The density network then passes predicted normals and the
+            properties of surfaces instead of `num_features`, and direction levels do not apply. None for colours by the
+            viewing direction.
     """
+
+    taps: Tensor
 
     def __init__(
         self,
@@ -141,18 +153,29 @@ class EncodedField(BoxField):
         appearance: Appearance | None = None,
         opening: float = 0.0,
         ambient: int = 0,
+        reflection: Reflection | None = None,
     ) -> None:
         super().__init__(box, encoding, unbounded)
         self.direction_levels, self.num_features = direction_levels, num_features
-        self.density_head = MLP(encoding.num_features + ambient, width, num_features, bias=False)
-        inputs = num_features + direction_levels**2
-        self.direction_opening = OpenLevels(direction_levels, 1, opening) if opening and direction_levels else None
-        self.appearance = appearance
-        inputs += 0 if appearance is None else appearance.size
-        self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
+        if reflection is not None:
+            self.direction_levels, self.num_features = 0, reflection.num_features
+            corners = torch.tensor([[1.0, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]])  # of a tetrahedron
+            self.register_buffer("taps", TAP_DISTANCE * (box[1] - box[0]).min() * corners.to(box), persistent=False)
+        self.density_head = MLP(encoding.num_features + ambient, width, self.num_features, bias=False)
+        levels = self.direction_levels
+        self.direction_opening = OpenLevels(levels, 1, opening) if opening and levels else None
+        self.appearance, self.reflection = appearance, reflection
+        self.color_head: MLP | None = None
+        if reflection is None:
+            inputs = num_features + levels**2 + (0 if appearance is None else appearance.size)
+            self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
+
+    def encoded(self, points: Points) -> Tensor:
+        """Return the features (N, E) of the encoding at N `points`; subclasses may use the points' size."""
+        return self.encode(points.positions, points.times)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        encoded = self.encode(points.positions, points.times)
+        encoded = self.encoded(points)
         if points.ambient is None:
             return self.density_head.density(encoded)
         return self.density_head.density(encoded, points.ambient.to(encoded.dtype))
@@ -164,7 +187,9 @@ class EncodedField(BoxField):
     def grid_color(self) -> GridColor | None:
         """Return the colour for `traced_colors`; None for subclasses, which may override the colour."""
         head, opening = self.color_head, self.direction_opening
-        if type(self) is not EncodedField or self.appearance is not None or type(head) is not MLP:
+        if type(self) is not EncodedField or self.appearance is not None:
+            return None
+        if head is None or type(head) is not MLP:
             return None
         if opening is not None and not opening.complete:
             return None
@@ -175,12 +200,33 @@ class EncodedField(BoxField):
         return GridColor(self.direction_levels, weights)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        if self.color_head is None:
+            return self.light(features, directions, camera_indices).rgb
         inputs = [features]
         if self.direction_levels:
             inputs.append(self._harmonics(directions).to(features.dtype))
         if self.appearance is not None:
             inputs.append(self.appearance(camera_indices, len(features)).to(features.dtype))
         return self.color_head(*inputs).float()
+
+    def light(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Light:
+        """Return the light of points, as `HasLight` does; an appearance changes the reflected light alone.
+
+        `features`, `directions` and `camera_indices` are as there; the field has a `Reflection`.
+        """
+        assert self.reflection is not None
+        vectors = () if self.appearance is None else (self.appearance(camera_indices, len(features)),)
+        return self.reflection.of_density(features, directions, *vectors)
+
+    def density_normals(self, points: Points) -> Tensor:
+        """Return the normals of the density, as `HasDensityNormals` does; the field has a `Reflection`.
+
+        They are differences of the log-density at four positions around a point, similar to Neuralangelo (Li et al.
+        2023, section 3.2). Their gradients need first derivatives only, and the noise of single cells averages out.
+        """
+        around = (points.positions.detach()[:, None] + self.taps).view(-1, 3)
+        logs = at_least_float32(self.density_head.first(self.encoded(Points(around)))).view(-1, len(self.taps), 1)
+        return -normalize_above((logs * self.taps.sign()).sum(1), FLAT)
 
     def _harmonics(self, directions: Tensor) -> Tensor:
         opening, levels = self.direction_opening, self.direction_levels

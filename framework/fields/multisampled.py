@@ -27,8 +27,8 @@ class MultisampledField(EncodedField):
 
     footprint = "frustum"
 
-    def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return self.density_head.density(encode_frustums(self, points))
+    def encoded(self, points: Points) -> Tensor:
+        return encode_frustums(self, points)
 
 
 def encode_frustums(field: BoxField, points: Points) -> Tensor:

@@ -63,12 +63,31 @@ class NormalHead(nn.Module):
         return safe_normalize(self.network(features, encoded.to(features.dtype)).float())
 
 
+def normal_difference(predicted: Tensor, normals: Tensor) -> Tensor:
+    """Return the difference (N,) of predicted normals from those of the density: Ref-NeRF, equation 10.
+
+    Args:
+        predicted: (N, 3) predicted unit normals.
+        normals: (N, 3) unit normals of the density; 0 or short where it is constant, so that the difference counts
+            less.
+    """
+    return normals.square().sum(-1) * (1 - (predicted * normals).sum(-1))
+
+
+def facing_away(predicted: Tensor, directions: Tensor) -> Tensor:
+    """Return the squared cosine (N,) of normals that face away from the camera, else 0: Ref-NeRF, equation 11.
+
+    Args:
+        predicted: (N, 3) predicted unit normals.
+        directions: (N, 3) unit directions of the samples' rays.
+    """
+    return (predicted * directions).sum(-1).clamp(min=0).square()
+
+
 def normal_penalties(
     predicted: Tensor, normals: Tensor, directions: Tensor, weights: Tensor, samples: Samples
 ) -> dict[str, Tensor]:
     """Return the penalties of predicted normals per ray: Ref-NeRF, equations 10 and 11.
-
-    The density is trained by them too if `normals` has a gradient, as in the paper.
 
     Args:
         predicted: (N, 3) predicted unit normals.
@@ -82,7 +101,5 @@ def normal_penalties(
         the weighted squared cosine of predicted normals that face away from the camera.
     """
     weights = weights.detach()
-    is_defined = normals.square().sum(-1)  # 0 where the density's gradient is 0, else 1
-    apart = weights * is_defined * (1 - (predicted * normals).sum(-1))
-    away = weights * (predicted * directions).sum(-1).clamp(min=0).square()
+    apart, away = weights * normal_difference(predicted, normals), weights * facing_away(predicted, directions)
     return {"normals_penalty": ray_sum(apart, samples), "orientation_penalty": ray_sum(away, samples)}

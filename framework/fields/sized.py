@@ -61,5 +61,5 @@ class SizedDensity(SizedGrid, DensityField):
 class SizedField(SizedGrid, EncodedField):
     """A field of density and colour on a hash grid that accounts for the size of points."""
 
-    def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        return self.density_head.density(self.encode_points(points))
+    def encoded(self, points: Points) -> Tensor:
+        return self.encode_points(points)

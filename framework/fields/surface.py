@@ -13,6 +13,7 @@ from nerfloom.base.device import HostValue
 from nerfloom.base.optimised import Optimised
 from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.base import MLP, Field
+from nerfloom.fields.directional import Light, Reflection
 from nerfloom.fields.distance import Distance, Shape
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.frequency import frequency_encoding
@@ -95,6 +96,8 @@ class SurfaceField(Field):
         color_bias: whether its layers have biases.
         direction_frequencies: number of frequencies of the encoded viewing direction; None for spherical harmonics.
         appearance: the images' appearance vectors, an input of the colour network; None without.
+        reflection: colours by the reflected direction; they use the distance's normals, and its features as properties
+            of the surface. None for a colour network of position, normal and viewing direction.
     """
 
     box: Tensor
@@ -109,15 +112,19 @@ class SurfaceField(Field):
         color_bias: bool = False,
         direction_frequencies: int | None = None,
         appearance: Appearance | None = None,
+        reflection: Reflection | None = None,
     ) -> None:
         super().__init__()
         self.register_buffer("box", box.clone(memory_format=torch.contiguous_format))
         self.distance, self.sharpness, self.appearance = distance, sharpness, appearance
         self.size, self.direction_frequencies = distance.size, direction_frequencies
         self.runs_on_kernels = distance.runs_on_kernels
-        directions = DIRECTION_LEVELS**2 if direction_frequencies is None else 3 + 6 * direction_frequencies
-        inputs = PLACED + distance.num_features + directions + (0 if appearance is None else appearance.size)
-        self.color_head = MLP(inputs, *[width] * color_layers, 3, bias=color_bias, activation="sigmoid")
+        self.reflection = reflection
+        self.color_head: MLP | None = None
+        if reflection is None:
+            directions = DIRECTION_LEVELS**2 if direction_frequencies is None else 3 + 6 * direction_frequencies
+            inputs = PLACED + distance.num_features + directions + (0 if appearance is None else appearance.size)
+            self.color_head = MLP(inputs, *[width] * color_layers, 3, bias=color_bias, activation="sigmoid")
         self.cell = 0.0
         """Diagonal of the sampler's cells, scene units: the maximum distance between two positions in a cell."""
         self.progress = 0.0
@@ -150,6 +157,8 @@ class SurfaceField(Field):
         return self.shape(points.positions).distances
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        if self.color_head is None:
+            return self.light(features, directions, camera_indices).rgb
         if self.direction_frequencies is None:
             encoded = spherical_harmonics(directions, DIRECTION_LEVELS)
         else:
@@ -158,6 +167,17 @@ class SurfaceField(Field):
         if self.appearance is not None:
             inputs.append(self.appearance(camera_indices, len(features)))
         return self.color_head(*inputs).float()
+
+    def light(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Light:
+        """Return the light of points, as `HasLight` does; an appearance changes the reflected light alone.
+
+        `features`, `directions` and `camera_indices` are as there; the field has a `Reflection`.
+        """
+        assert self.reflection is not None
+        vectors = () if self.appearance is None else (self.appearance(camera_indices, len(features)),)
+        rows = unit_normals(features)
+        found: Light = self.reflection(rows[:, PLACED:], rows[:, :3], directions, *vectors)
+        return found
 
     @abstractmethod
     def density_at(self, distances: Tensor) -> Tensor:

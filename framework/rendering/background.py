@@ -13,9 +13,10 @@ from nerfloom.data.scene import Scene
 from nerfloom.fields.base import Field
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.geometry.spheres import InvertedRays, distances_behind
+from nerfloom.rendering.choice import volume_renderer
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.renderer import Renderer
-from nerfloom.rendering.volume import VolumeRenderer, volume_renderer
+from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.samplers.background import BackgroundConfig, foreground_sphere
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.hierarchical import HierarchicalSampler

@@ -80,11 +80,6 @@ class VolumeRenderer(Renderer):
         return sample_values(rays, samples, field, factors, thin)
 
 
-def volume_renderer(config: RayConfig, scene: Scene) -> VolumeRenderer:
-    """Return the renderer of most methods, with gradient scaling near cameras and thinning from the settings."""
-    return VolumeRenderer(scaled_up_to(config, scene), config.thin_gradients)
-
-
 def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
     """Return the distance from cameras where the scaling of gradients ends, scene units; None for no scaling."""
     return half_edge(scene.box) if config.gradient_scaling else None

@@ -122,10 +122,10 @@ MUTANTS = {
         Mutant("normals-inward", "density_normals", "-A", "A",
             "normals point into surfaces",
             "fields/test_normals.py::test_a_balls_normals_point_outwards"),
-        Mutant("orientation-penalty-sign", "normal_penalties", "A.clamp(min=0)", "A.clamp(max=0)",
+        Mutant("orientation-penalty-sign", "facing_away", "A.clamp(min=0)", "A.clamp(max=0)",
             "normals that face the camera are punished", "fields/test_normals.py::test_penalties_in_closed_form"),
     ],
-    "nerfloom.fields.reflective": [
+    "nerfloom.fields.directional": [
         Mutant("reflected-through", "Reflection.forward", "A - 2 * B * C", "A + 2 * B * C",
             "directions are reflected at another plane: shiny things show nothing of what is around them",
             "test_ref_nerf.py::test_light_by_hand"),

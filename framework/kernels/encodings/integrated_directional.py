@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native, result_cache
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.triton_backend import later
 
 MAX_BANDS = 5
 """Maximum number of bands; the last has degree 16."""
@@ -37,7 +38,7 @@ def directional_encoding(directions: Tensor, roughness: Tensor, bands: int = MAX
 
     The distribution is that of von Mises and Fisher, and the attenuation that of equation 8. The paper lists the real
     and the imaginary parts of complex harmonics; real harmonics are the same functions, scaled to be orthonormal. The
-    compiled form has first derivatives only.
+    compiled forms have first derivatives only.
 
     Args:
         directions: (N, 3) unit vectors, the mean directions, of any float type.
@@ -147,3 +148,6 @@ class _DirectionalEncoding(torch.autograd.Function):
 
 def _roughness(roughness: Tensor, count: int) -> int:
     return native.pointer(roughness, "roughness", (count,))
+
+
+DIRECTIONAL_ENCODING.implementation(TRITON)(later("encodings.integrated_directional_triton", "directional_encoding"))

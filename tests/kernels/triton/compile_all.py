@@ -20,7 +20,7 @@ from nerfloom.geometry.rays import Samples
 from nerfloom.kernels import triton_launch
 from nerfloom.kernels.adam import adam_triton
 from nerfloom.kernels.compositing import density_triton
-from nerfloom.kernels.encodings import encodings_triton
+from nerfloom.kernels.encodings import encodings_triton, integrated_directional_triton
 from nerfloom.kernels.grids import hash_grid_triton, planes_triton
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.planes_layout import PlanesLayout
@@ -95,6 +95,7 @@ def compile_all() -> None:
     layout = PlanesLayout.build(((5, 6, 7), (8, 9, 10)))
     back(planes_triton.planes(learned(9, 3), learned(layout.num_entries, 6), layout, None))
     encodings_triton.spherical_harmonics(torch.rand(9, 3), 4)
+    back(integrated_directional_triton.directional_encoding(learned(9, 3), learned(9), 5))
     back(encodings_triton.frequency_encoding(learned(9, 3), 4, True))
     back(encodings_triton.contract_to_unit(learned(9, 3), torch.rand(2, 3)))
     back(intervals_triton.interval_weights(learned(5, 9), torch.rand(5, 10)))

@@ -7,6 +7,7 @@ import torch
 
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.encodings.integrated_directional import directional_encoding
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from tests.kernels.triton.compared import compare
 
@@ -24,6 +25,17 @@ def test_harmonics(levels: int, count: int) -> None:
 
 def test_harmonics_leave_gradients_to_the_reference() -> None:
     compare(spherical_harmonics, {"directions": torch.rand(3, 3)}, "directions", expected="reference")
+
+
+@pytest.mark.parametrize(("bands", "count"), [(1, 1), (2, 300), (3, 0), (4, 17), (5, 300)])
+def test_directional_encoding(bands: int, count: int) -> None:
+    """Poles and the equator, and roughness from none to that of a matt surface."""
+    torch.manual_seed(bands)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
+    directions[: min(count, 4)] = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])[: min(count, 4)]
+    roughness = torch.tensor([0.0, 1e-4, 1e-3, 1e-2, 0.1, 1, 10]).repeat(count // 7 + 1)[:count]
+    given = {"directions": directions, "roughness": roughness}
+    compare(lambda directions, roughness: directional_encoding(directions, roughness, bands), given, " ".join(given))
 
 
 @pytest.mark.parametrize("include_input", [True, False])

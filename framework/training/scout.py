@@ -106,8 +106,8 @@ def scout(
     with ProgressBar(f"{name}, to find what moves") as bar:
         for report in training.steps():
             bar.show(report)
-    look = look_at(training.model, dataset, tiles.tiles)
-    out = contradicted(look, tiles.tiles.neighbours())
+    found = compare(training.model, dataset, tiles.tiles)
+    out = contradicted(found, tiles.tiles.neighbours())
     tiles.state.copy_(out)
     say(f"{float(out.float().mean()):.1%} of the images' tiles are contradicted by other images, and left out")
     if out.float().mean() > MOST:
@@ -129,7 +129,7 @@ def budget(config: TrainConfig) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Look:
+class Comparison:
     """Comparison of images with a field: N probed pixels, in T tiles."""
 
     sums: Tensor
@@ -143,7 +143,7 @@ class Look:
 
 
 @torch.no_grad()
-def look_at(model: RendersRays, dataset: Dataset, tiles: Tiles) -> Look:
+def compare(model: RendersRays, dataset: Dataset, tiles: Tiles) -> Comparison:
     """Compare training images with a field, at evenly spaced pixels. Each is rendered in the light of its image.
 
     Args:
@@ -170,7 +170,7 @@ def look_at(model: RendersRays, dataset: Dataset, tiles: Tiles) -> Look:
             sums.index_add_(0, owners[-1], torch.cat([errors, torch.ones_like(errors[:, :1])], -1))
             cells.append(places(batch.rays, shown.median_depth.float(), shown.accumulation > 0.5, model.scene))
         seen_by[torch.cat([*cells[first:], seen_by[:0]]).unique()] += 1
-    return Look(sums, torch.cat(owners), torch.cat(cells), seen_by)
+    return Comparison(sums, torch.cat(owners), torch.cat(cells), seen_by)
 
 
 def places(rays: Rays, depths: Tensor, solid: Tensor, scene: Scene) -> Tensor:
@@ -188,27 +188,27 @@ def places(rays: Rays, depths: Tensor, solid: Tensor, scene: Scene) -> Tensor:
     return torch.where(solid, (x * CELLS + y) * CELLS + z, CELLS**3)
 
 
-def contradicted(look: Look, around: Tensor) -> Tensor:
+def contradicted(found: Comparison, around: Tensor) -> Tensor:
     """Return which tiles (T,) bool the other images contradict.
 
     The error of a tile is the mean signed error around it. Its square is averaged over 3 x 3 tiles and compared with
     what is typical of the places that its probes show.
 
     Args:
-        look: the comparison of images with a field.
+        found: the comparison of images with a field.
         around: (T, 9) the 3 x 3 tiles around each (`Tiles.neighbours`).
     """
-    scores, counts = scores_of(look.sums, around), look.sums[:, 3]
-    values, known = scores[look.owners], look.seen_by[look.cells] >= MIN_IMAGES
-    there, anywhere = (quantiles(values, groups, TYPICAL) for groups in (look.cells, torch.zeros_like(look.cells)))
-    typical = torch.zeros_like(scores).index_add_(0, look.owners, torch.where(known, there, anywhere))
+    scores, counts = scores_of(found.sums, around), found.sums[:, 3]
+    values, known = scores[found.owners], found.seen_by[found.cells] >= MIN_IMAGES
+    there, anywhere = (quantiles(values, groups, TYPICAL) for groups in (found.cells, torch.zeros_like(found.cells)))
+    typical = torch.zeros_like(scores).index_add_(0, found.owners, torch.where(known, there, anywhere))
     return (counts > 0) & (scores > (CLEARLY * typical / counts.clamp(min=1)).clamp(min=LEAST**2))
 
 
 def scores_of(sums: Tensor, around: Tensor) -> Tensor:
     """Return the squared mean signed error (T,) around each tile, a mean over 3 x 3 tiles.
 
-    `sums` and `around` are as in `Look` and `contradicted`.
+    `sums` and `around` are as in `Comparison` and `contradicted`.
     """
     blurred = (sums[around] * sums.new_tensor(NEAR)[:, None]).sum(1)
     squares, counts = (blurred[:, :3] / blurred[:, 3:].clamp(min=1e-6)).square().mean(-1), blurred[:, 3]

@@ -27,10 +27,10 @@ from nerfloom.training.scout import (
     CELLS,
     MAX_STEPS,
     SHARE,
-    Look,
+    Comparison,
     budget,
+    compare,
     contradicted,
-    look_at,
     quantiles,
     scores_of,
     scout,
@@ -52,7 +52,7 @@ def tiles_of(images: int = IMAGES, side: int = 4) -> Tiles:
     return Tiles(dataclasses.replace(cameras, widths=size, heights=size), side)
 
 
-def compared(errors: Tensor) -> Look:
+def compared(errors: Tensor) -> Comparison:
     """A comparison of images that all show the same places side by side.
 
     Args:
@@ -63,7 +63,7 @@ def compared(errors: Tensor) -> Look:
     seen_by = torch.zeros(CELLS**3 + 1, dtype=torch.int64)
     seen_by[: ALONG**2] = IMAGES
     sums = torch.cat([PROBES * means, torch.full_like(means[:, :1], PROBES)], -1)
-    return Look(sums, owners, owners % ALONG**2, seen_by)
+    return Comparison(sums, owners, owners % ALONG**2, seen_by)
 
 
 def crowd(share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -120,7 +120,7 @@ def test_a_place_that_few_images_show_is_judged_as_any_other() -> None:
     fog = (look.owners // ALONG**2 == 3) & (errors[3, ..., 0] > 0).view(-1)[look.owners % ALONG**2]
     seen_by = look.seen_by.clone()
     seen_by[ALONG**2] = 1
-    alone = Look(look.sums, look.owners, torch.where(fog, ALONG**2, look.cells), seen_by)
+    alone = Comparison(look.sums, look.owners, torch.where(fog, ALONG**2, look.cells), seen_by)
     for given in (look, alone):
         out = contradicted(given, tiles_of().neighbours()).view(IMAGES, ALONG, ALONG)
         assert bool(out[3, 5:12, 5:12].all())
@@ -193,7 +193,7 @@ def test_discs_are_found_by_a_field_that_shows_what_is_behind_them() -> None:
     for name, images in (("clean", clean), ("discs", dataset)):
         tiles = LeftOutTiles(images, SCOUTED_ALONG)
         assert tiles.tiles.side == 4
-        out = contradicted(look_at(Exact(images), images, tiles.tiles), tiles.tiles.neighbours())
+        out = contradicted(compare(Exact(images), images, tiles.tiles), tiles.tiles.neighbours())
         tiles.state.copy_(out)
         found[name] = tiles.counting(torch.arange(len(images.pixels))) == 0
         kept = torch.zeros(len(images.pixels), dtype=torch.bool)

@@ -32,7 +32,7 @@ class LeftOutTiles:
 
     @property
     def known(self) -> bool:
-        """Whether something has decided which tiles are left out."""
+        """True if something has decided which tiles are left out."""
         return bool((self.state != UNKNOWN).all())
 
     @property

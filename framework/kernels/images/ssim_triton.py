@@ -171,7 +171,7 @@ class _SSIM(torch.autograd.Function):
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
     """Compute `nerfloom.kernels.images.ssim.photometric_loss`, with the first derivative by the image.
 
-    The arguments are as there.
+    `image`, `target`, `ssim_weight` and `weights` are as there.
     """
     learned = image.requires_grad and torch.is_grad_enabled()
     similarity = _SSIM.apply(image.contiguous(), target.contiguous(), weights, learned)

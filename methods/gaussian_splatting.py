@@ -31,7 +31,7 @@ from nerfloom.splats.drawing import splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.guide import GUIDE, FoundDistances
 from nerfloom.splats.learning import open_degree
-from nerfloom.splats.resolution import enlarged, reduced, reduced_distances
+from nerfloom.splats.resolution import enlarged, reduced, reduced_distances, reduced_weights
 from nerfloom.splats.settings import SplattingConfig, decide_splatting
 from nerfloom.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
 from nerfloom.training.optim import learning_rate_factor
@@ -189,10 +189,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         content = CHANNELS["rgb" if known is None and not self.aligns_normals(self.progress) else "distance"]
         drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
         rgb = self.lit(drawn.image if content == CHANNELS["rgb"] else drawn.image[..., :3], batch.index)
-        kept = None if batch.kept is None else reduced(batch.kept[..., None].float(), octaves)[..., 0] == 1
-        if kept is not None:  # other pixels have no error
-            target = torch.where(kept[..., None], target, rgb.detach())
-        terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight)}
+        weights = None if batch.weights is None else reduced_weights(batch.weights, octaves)
+        terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight, weights)}
         if known is not None:
             known = reduced_distances(known, octaves)
             terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
@@ -200,6 +198,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             terms["opacity"] = weight * self.penalised_opacities(gaussians, batch.view.time).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
             terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
+        kept = None if weights is None else weights == 1
         terms |= self.surface_terms(gaussians, shown, camera, drawn, kept, self.progress)
         return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))
 

@@ -146,9 +146,9 @@ class TrainConfig:
 
     # Values of settings that a method lacks, so that shared code need not know the class of its settings. They have no
     # annotations, so they are neither fields nor flags.
-    sampler, bounded_sampler, time_slices, robust_factor = "", "occupancy", 1, 2.0
+    sampler, bounded_sampler, time_slices, robust, robust_factor = "", "occupancy", 1, "off", 2.0
     background_model, directional = "contraction", "view"
-    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = robust = False
+    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
     depth_loss_mult = free_space_loss_mult = 0.0
 
@@ -188,7 +188,21 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class RayConfig(TrainConfig):
+class RobustConfig(TrainConfig):
+    """Settings of a method whose loss of colours uses the weights of pixels."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"robust_factor": (1, 1e6)}
+    """Allowed ranges."""
+    robust: Literal["off", "errors", "scout"] = "off"
+    """How to leave out regions that other images contradict, such as people who walk through. errors: by errors in
+    training. scout: by a field that is trained first, in a part of the budget; then they are masked out."""
+    robust_factor: float = 2.0
+    """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust
+    errors)."""
+
+
+@dataclass(frozen=True)
+class RayConfig(RobustConfig):
     """Settings of every method that casts rays."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -201,7 +215,6 @@ class RayConfig(TrainConfig):
         "free_space_loss_mult": AT_LEAST_0,
         "rays_shared_by": (0, 100),
         "thin_gradients": (0, 16),
-        "robust_factor": (1, 1e6),
     }
     """Allowed ranges."""
     num_rays_per_batch: int = 4_096
@@ -229,10 +242,6 @@ class RayConfig(TrainConfig):
     expected gradient stays the same. 0: keep all. CPU only."""
     gradient_scaling: bool = False
     """Scale gradients near cameras down by squared distance, up to half of the box's edge, against floaters."""
-    robust: bool = False
-    """Do not learn from regions that the other images contradict, such as people who walk through."""
-    robust_factor: float = 2.0
-    """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust)."""
     eval_num_rays_per_chunk: int = 8_192
     """Rays rendered at once in evaluation. Affects memory and speed, not the result."""
 

@@ -28,7 +28,8 @@ from nerfloom.data.pixels.batch import (
     training_background,
     view_colors,
 )
-from nerfloom.data.pixels.contradicted import STEPS_PER_LOOK, ContradictedTiles
+from nerfloom.data.pixels.contradicted import STEPS_PER_LOOK, ContradictedTiles, ContradictedViews
+from nerfloom.data.pixels.left_out import LeftOutTiles
 from nerfloom.data.pixels.stream import PixelStream
 from nerfloom.data.sparse_depth import SparseDepth
 
@@ -53,6 +54,8 @@ KEYPOINTS = 1 / 8
 """Fraction of a batch's pixels drawn from those with a sparse depth."""
 POINTS_UNTIL = 0.5
 """Fraction of the budget during which they are drawn; afterwards colours alone determine the surfaces."""
+SCOUTED_ALONG = 24
+"""Number of tiles along an image's longer side with `--robust scout`, whose errors are those of a finished field."""
 
 
 class BatchSource(ABC):
@@ -66,7 +69,7 @@ class BatchSource(ABC):
     """The images to draw from."""
     varies: str | None = "batches are made on the host"
     """Why drawing a batch differs from step to step (`StepKind`); None if it does not."""
-    contradicted: ContradictedTiles | None = None
+    contradicted: LeftOutTiles | None = None
     """Tiles that do not count, with `--robust`."""
 
     @abstractmethod
@@ -88,10 +91,12 @@ class BatchSource(ABC):
 
     def state(self) -> Tensor | None:
         """Return the learnt state for a checkpoint; None if the source learns nothing."""
-        return None
+        return None if self.contradicted is None else self.contradicted.state
 
-    def restore(self, state: Tensor | None) -> None:  # noqa: B027, likewise
+    def restore(self, state: Tensor | None) -> None:
         """Restore the learnt `state` from a checkpoint; None if the checkpoint has none."""
+        if self.contradicted is not None and state is not None:
+            self.contradicted.state.copy_(state)
 
 
 class PixelSource(BatchSource):
@@ -115,7 +120,7 @@ class PixelSource(BatchSource):
         keypoints: float = 0.0,
         clear: Tensor | None = None,
         num_images: int | None = None,
-        contradicted: ContradictedTiles | None = None,
+        contradicted: LeftOutTiles | None = None,
     ) -> None:
         self.clear, self.num_images, self.contradicted = clear, num_images, contradicted
         self.dataset, self.background, self.seed = dataset, background, seed
@@ -157,13 +162,6 @@ class PixelSource(BatchSource):
             if request.step % STEPS_PER_LOOK == 0:
                 self.contradicted.decide(request.progress)
 
-    def state(self) -> Tensor | None:
-        return None if self.contradicted is None else self.contradicted.state
-
-    def restore(self, state: Tensor | None) -> None:
-        if self.contradicted is not None and state is not None:
-            self.contradicted.state.copy_(state)
-
 
 class ViewSource(BatchSource):
     """Draws whole images, one per step, in a new random order for each pass.
@@ -174,10 +172,13 @@ class ViewSource(BatchSource):
         dataset: the images.
         background: background of transparent pixels; "random" is one colour for the whole image.
         seed: the seed of the run.
+        contradicted: tiles that do not count; None if all do.
     """
 
-    def __init__(self, dataset: Dataset, background: Background, seed: int) -> None:
-        self.dataset, self.background, self.seed = dataset, background, seed
+    def __init__(
+        self, dataset: Dataset, background: Background, seed: int, contradicted: LeftOutTiles | None = None
+    ) -> None:
+        self.dataset, self.background, self.seed, self.contradicted = dataset, background, seed, contradicted
         self._order: tuple[int, list[int]] | None = None
         self._views: dict[int, View] = {}
         """Views of images drawn so far; sizes and lenses are read from the device once."""
@@ -191,12 +192,27 @@ class ViewSource(BatchSource):
         rgb, alpha = view_colors(dataset.image(index), behind)
         if index not in self._views:
             self._views[index] = View.of(dataset.cameras, index, dataset.times)
-        view = self._views[index]
-        kept = None
-        if dataset.kept is not None:
-            first, last = dataset.cameras.ends[index : index + 2]
-            kept = dataset.kept.mask(first, last).view(rgb.shape[:2])
-        return ViewBatch(index, view, rgb, behind, alpha, kept, self._distances(index))
+        view, weights, distances = self._views[index], self._masked(index), self._distances(index)
+        if self.contradicted is not None:
+            counting = self.contradicted.weights(index, request.progress)
+            weights = counting if weights is None else weights if counting is None else counting * weights
+        if weights is not None and distances is not None:
+            distances = torch.where(weights == 1, distances, 0)  # 0 is unknown
+        return ViewBatch(index, view, rgb, behind, alpha, weights, distances)
+
+    def learn(self, request: Request, batch: ViewBatch, rgb: Tensor) -> None:
+        if self.contradicted is not None and batch.index is not None:
+            errors, masked = rgb - batch.rgb, self._masked(batch.index)
+            errors = errors if masked is None else errors * masked[..., None]
+            self.contradicted.learn_view(batch.index, errors, batch.rgb, request.progress)
+
+    def _masked(self, index: int) -> Tensor | None:
+        """Return 1 for the pixels (H, W) of an image that masks keep, and 0 for others; None without masks."""
+        dataset = self.dataset
+        if dataset.kept is None:
+            return None
+        first, last = dataset.cameras.ends[index : index + 2]
+        return dataset.kept.mask(first, last).view(dataset.cameras.sizes[index]).float()
 
     def _distances(self, index: int) -> Tensor | None:
         dataset = self.dataset
@@ -229,12 +245,23 @@ class ViewSource(BatchSource):
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
     """Return the source of training batches of a `kind` (`Model.batches`) from `dataset`, by `config`."""
     background = training_background(config.background, dataset.scene.has_alpha)
+    contradicted = _contradicted(kind, dataset, config)
     if kind == "views":
-        return ViewSource(dataset, background, config.machine.seed)
+        return ViewSource(dataset, background, config.machine.seed, contradicted)
     num_images = config.images_per_batch or None
     keypoints = KEYPOINTS if num_images is None and config.depth_loss_mult and not dataset.scene.has_depth else 0.0
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
-    contradicted = ContradictedTiles(dataset, config.robust_factor) if config.robust else None
     return PixelSource(dataset, background, config.machine.seed, keypoints, clear, num_images, contradicted)
+
+
+def _contradicted(kind: str, dataset: Dataset, config: TrainConfig) -> LeftOutTiles | None:
+    """Return the tiles of `--robust`; None if it is off."""
+    if config.robust == "off":
+        return None
+    if config.robust == "scout":
+        return LeftOutTiles(dataset, SCOUTED_ALONG)
+    if kind == "views":
+        return ContradictedViews(dataset, config.robust_factor)
+    return ContradictedTiles(dataset, config.robust_factor)

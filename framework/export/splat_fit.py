@@ -116,7 +116,8 @@ class FieldPictures(BatchSource):
         else:
             shot = self.shots[int(torch.randint(len(self.shots), ()))]
         behind = torch.rand_like(self.background) if bool(shot.through.any()) else self.background
-        return ViewBatch(0, shot.view, shot.rgb + shot.through * behind, behind, kept=shot.kept)
+        weights = None if shot.kept is None else shot.kept.float()
+        return ViewBatch(0, shot.view, shot.rgb + shot.through * behind, behind, weights=weights)
 
     def drawing_from(self, dataset: Dataset) -> FieldPictures:
         return FieldPictures(dataset, self.shots, self.photographs, self.background)

@@ -1,4 +1,4 @@
-"""Masks of moving things: a short training with `--robust` finds what other images contradict."""
+"""Masks of moving things: a scout finds what other images contradict, as for `--robust scout`."""
 
 from __future__ import annotations
 
@@ -7,36 +7,28 @@ from typing import Any
 
 from PIL import Image
 
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.json_files import read_object, write_json
 from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.pixels.device_placement import on_device
+from nerfloom.data.pixels.left_out import LeftOutTiles
+from nerfloom.data.sources import SCOUTED_ALONG
 from nerfloom.processing.images import save
 from nerfloom.processing.output import FINISHED
 from nerfloom.processing.pyramid import write_pyramid
-from nerfloom.registry import load_dataparser, load_method
-from nerfloom.training.progress import ProgressBar
+from nerfloom.registry import load_dataparser
+from nerfloom.training.scout import scout
 from nerfloom.training.trainer import Trainer
 
-METHOD = "nerfacto"
-"""The method that looks for moving things."""
-SETTINGS: dict[str, Any] = {
-    "max_num_iterations": None,
-    "robust": True,
-    "gradient_scaling": True,
-    "mean_appearance_share": 0.0,
-    "vis": "none",
-}
-"""Its settings. Without scaled gradients, people become fog in front of their camera, which no image contradicts. In a
-step with the mean appearance, all of an image in other light would be wrong in one direction."""
 LONGER_SIDE = 400
 """Minimum longer side of the images that it learns from, pixels. Larger images are reduced by 2, 4 or 8."""
 
 
 def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
-    """Train on a finished data folder for a short time, and add masks that leave out moving things.
+    """Train a scout on a finished data folder, and add masks that leave out moving things.
 
     Masks are black where something moves. They have full size, with reduced copies beside them. transforms.json names
     them, so any tool that reads masks can use them.
@@ -44,7 +36,7 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     Args:
         output: folder with transforms.json and images.
         num_downscales: number of folders of reduced images and masks.
-        settings: further settings of the training.
+        settings: settings of the scout, with its budget.
     """
     content = read_object(output / FINISHED)
     frames = {Path(frame["file_path"]).relative_to("images").as_posix(): frame for frame in content["frames"]}
@@ -53,17 +45,13 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     factor = max(2**level for level in range(min(num_downscales, 3) + 1) if longer >> level >= LONGER_SIDE or not level)
     parser = load_dataparser("nerfstudio")
     parsed = from_plain(parser(), {"eval_mode": "all", "downscale_factor": factor}, "masks").parse(output, "train")
-    method = load_method(METHOD)
-    config = from_plain(method.config, {**SETTINGS, **settings}, "masks")
+    config = TrainConfig()
     dataset, _ = on_device(load_dataset(parsed, "train"), choose_device(config.machine))
-    trainer = Trainer(method, config, dataset)
-    with ProgressBar(f"{METHOD}, to find moving things") as bar:
-        for report in trainer.steps():
-            bar.show(report)
-    tiles, cameras, names, share = trainer.source.contradicted, trainer.train_set.cameras, [], 0.0
-    assert tiles is not None
+    found = LeftOutTiles(dataset, SCOUTED_ALONG)
+    scout(Trainer, dataset, found, config, **{"max_num_iterations": None, **settings})
+    names, share = [], 0.0
     for index, path in enumerate(parsed.image_paths):
-        counting = tiles.counting(cameras.image_pixels(index)).view(cameras.sizes[index][0], -1)
+        counting = 1 - found.tiles.over_image(found.left_out, index)
         name = Path(*path.relative_to(output).parts[1:]).as_posix()
         with Image.open(output / "images" / name) as image:
             size = image.size

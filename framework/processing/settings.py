@@ -88,7 +88,7 @@ class ColmapFlags(ViewFlags):
     undistort: bool = False
     """Write images without lens distortion (camera model PINHOLE), for registered images only."""
     mask_moving: bool = False
-    """Train on the images for a short time with --robust, and write masks that leave out moving things."""
+    """Train a field on the images for a short time, as a scout, and write masks that leave out moving things."""
     mask_seconds: float = 120.0
     """Seconds of this training."""
     device_type: Literal["cpu", "cuda"] = "cpu"

@@ -139,6 +139,16 @@ def reduced_distances(distances: Tensor, octaves: int) -> Tensor:
     return distances
 
 
+def reduced_weights(weights: Tensor, octaves: int) -> Tensor:
+    """Return the weights of the pixels of a reduced image: the least of the pixels that each is the mean of.
+
+    Args:
+        weights: (H, W) weights of the whole image; odd last rows and columns are left out.
+        octaves: number of halvings.
+    """
+    return -torch.nn.functional.max_pool2d(-weights[None], 1 << octaves)[0] if octaves else weights
+
+
 def halved(image: Tensor) -> Tensor:
     """Return an image of half the size; each pixel is the mean of four.
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeVar
 
-from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range, RobustConfig
 from nerfloom.base.decisions import Choice, Decision, fill, is_open
 from nerfloom.base.device import device_kind, relative_speed
 from nerfloom.base.processes import processes
@@ -36,7 +36,13 @@ RESET_WORDS = {
 
 @dataclass(frozen=True)
 class SplattingConfig(
-    AppearanceConfig, max_num_iterations=30_000, learning_rate=5e-3, lr_final=0.1, adam_beta2=0.99, adam_eps=1e-15
+    RobustConfig,
+    AppearanceConfig,
+    max_num_iterations=30_000,
+    learning_rate=5e-3,
+    lr_final=0.1,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
 ):
     """Settings of a method that trains Gaussians."""
 

@@ -75,6 +75,7 @@ class StressedSource(BatchSource):
 
     def __init__(self, source: BatchSource, condition: Condition) -> None:
         self.source, self.condition, self.dataset = source, condition, source.dataset
+        self.contradicted = source.contradicted
 
     def draw(self, request: Request) -> Any:
         if self.condition.rays is not None:

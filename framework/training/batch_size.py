@@ -6,6 +6,8 @@ import math
 
 from nerfloom.base.config import RayConfig
 from nerfloom.base.pace import Pace
+from nerfloom.data.sources import POINTS_UNTIL, Request
+from nerfloom.training.state import State
 
 MIN_BATCH, MAX_BATCH = 64, 2**17
 """Minimum and maximum number of rays per step, if it depends on the number of samples or on time."""
@@ -51,6 +53,21 @@ class BatchSize:
             self._rays_per_second = known + SHARE_OF_LAST * (found - known)
             self._most = math.sqrt(pace.budget * self._rays_per_second / balance)
             self._measured, self._drawn = pace, 0
+
+    def request(self, state: State, samples: int | None, progress: float, points: bool) -> Request:
+        """Return the request for the next batch: at first one ray per pixel, later the rendering's number.
+
+        Args:
+            state: state of the run.
+            samples: wanted number of samples; None for a configured number of rays.
+            progress: fraction of the budget spent, 0 to 1.
+            points: whether the images have sparse depths.
+        """
+        late = progress >= self.config.train_rays_per_pixel_from
+        per_pixel = self.config.rays_per_pixel if late else 1
+        rays = self.rays(samples, state.samples_per_ray)
+        points = points and progress < POINTS_UNTIL
+        return Request(state.step, max(rays // per_pixel, 1), per_pixel, points, progress)
 
     def rays(self, samples: int | None, samples_per_ray: float) -> int:
         """Return the rays of the next step: for a number of `samples`, if not None, by recent `samples_per_ray`."""

@@ -19,6 +19,7 @@ from nerfloom.cameras.upright import sideways_up
 from nerfloom.data.dataset import Dataset, cuts_out
 from nerfloom.data.pixels.batch import training_background
 from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.data.scene import Scene
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.method import Method
 from nerfloom.model import LearnsMotion, Model
@@ -49,9 +50,10 @@ def decided(method: Method, config: Any, dataset: Dataset) -> tuple[Dataset, Tra
         The data set, possibly with a smaller box; the settings; and each decision with its reason.
 
     Raises:
-        ConfigError: if the method cannot draw the images' cameras.
+        ConfigError: if the method cannot draw the images' cameras, or a scout cannot learn what the method learns.
     """
     _check_cameras(method.name, method.model.cameras, dataset)
+    _check_scout(method, config, dataset.scene)
     config, measured = with_speed(config)
     settings, made = method.decided(config, dataset.scene)
     made = measured + made
@@ -92,6 +94,15 @@ def _check_cameras(method: str, drawn: tuple[str, ...] | None, dataset: Dataset)
             f"{method} cannot draw {model} cameras, only {', '.join(drawn)}; convert the images to these first,"
             f" or {instead}"
         )
+
+
+def _check_scout(method: Method, config: TrainConfig, scene: Scene) -> None:
+    if config.robust != "scout":
+        return
+    if scene.num_scenes > 1:
+        raise ConfigError("--robust scout: its field learns one scene, and here are several; use --robust errors")
+    if scene.moving and issubclass(method.model, LearnsMotion):
+        raise ConfigError(f"--robust scout: what moves would be left out, and {method.name} learns it; use errors")
 
 
 def profile_of(

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from nerfloom.base.plain import to_plain
 from nerfloom.base.processes import alone, from_first, processes
 from nerfloom.base.signals import stop_signals
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.sources import POINTS_UNTIL, BatchSource, Request
+from nerfloom.data.sources import BatchSource, Request
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.method import Method
 from nerfloom.model import KeepsPace, StartsFromImages
@@ -39,6 +39,7 @@ from nerfloom.training.outcome import Outcome
 from nerfloom.training.preparation import decided, profile_of, show_images, skip_empty
 from nerfloom.training.progress import ProgressBar, Rate, StepReport, TensorBoard
 from nerfloom.training.run import Run
+from nerfloom.training.scout import budget, scout
 from nerfloom.training.state import State, agree
 from nerfloom.training.step import StepResult, learn, schedule, train_step
 from nerfloom.training.taught import batch_source
@@ -81,8 +82,7 @@ class Trainer:
         start = time.perf_counter()
         train_set, self.config, self.decisions = decided(method, config, train_set)
         self._deciding = time.perf_counter() - start  # counts as training
-        self.train_set, self.eval_set = train_set, eval_set
-        self.device = train_set.device
+        self.train_set, self.eval_set, self.device = train_set, eval_set, train_set.device
         torch.manual_seed(self.config.machine.seed)
         self.model = method.build(self.config, train_set.scene).to(self.device)
         show_images(self.model, train_set, eval_set)
@@ -242,7 +242,7 @@ class Trainer:
         return profile_of(self.method.name, self.config, self.model, self.train_set, self.decisions)
 
     def prepare(self, start: bool = True) -> None:
-        """Mark empty space and initialise the model from the images, once, before the first step.
+        """Find contradicted tiles, mark empty space and initialise the model from the images, before the first step.
 
         This counts as training time.
 
@@ -254,19 +254,28 @@ class Trainer:
         self._prepared = True
         self._join_first()
         begun, fresh = time.perf_counter(), self.state.step == 0
-        self.train_set = skip_empty(self.config, self.model, self.train_set, fresh)
+        tiles, config = self.source.contradicted, self.config
+        if tiles is not None and config.robust == "scout":
+            if not tiles.known:
+                self._by_first(partial(scout, Trainer, self.train_set, tiles, config, **budget(config)))
+            self.train_set = self.train_set.drawing(tiles.counted())
+        self.train_set = skip_empty(config, self.model, self.train_set, fresh)
         self.source = self.source.drawing_from(self.train_set)
         if fresh and start and isinstance(self.model, StartsFromImages):
-            seed_step(self.config.machine.seed, -1)  # independent of earlier draws
-            if processes().first:
-                with alone():
-                    self.model.start(self.train_set)
-            self._join_first()
+            seed_step(config.machine.seed, -1)  # independent of earlier draws
+            self._by_first(partial(self.model.start, self.train_set))
         seconds = time.perf_counter() - begun + self._deciding
         if fresh:
             self.state.seconds += seconds
         if seconds >= MIN_REPORTED_SECONDS:
             say(f"prepared in {seconds:.1f} s, which count as training")
+
+    def _by_first(self, work: Callable[[], None]) -> None:
+        """Do work in the first process, whose state the others then take over."""
+        if processes().first:
+            with alone():
+                work()
+        self._join_first()
 
     def train_step(self) -> StepReport:
         """Draw a batch and take one training step, after `prepare`.
@@ -281,7 +290,11 @@ class Trainer:
     def _train_step(self) -> StepReport:
         state, start = self.state, time.perf_counter()
         if self.config.max_seconds is not None and processes().count == 1:  # several must take equal steps
-            self._keep_pace(Pace(state.step, state.seconds, self.config.max_seconds, self.steps_per_read))
+            pace = Pace(state.step, state.seconds, self.config.max_seconds, self.steps_per_read)
+            if isinstance(self.model, KeepsPace):
+                self.model.keep_pace(pace)
+            if self.batch_size is not None:
+                self.batch_size.keep_pace(pace)
         request = self._request()
         batch, result = self._drawn_and_taken(request)
         self.source.learn(request, batch, result.loss.rgb)
@@ -310,13 +323,6 @@ class Trainer:
             held_out=state.newest_held_out(self.first_step),
         )
 
-    def _keep_pace(self, pace: Pace) -> None:
-        """Adapt sizes to the time of the last steps."""
-        if isinstance(self.model, KeepsPace):
-            self.model.keep_pace(pace)
-        if self.batch_size is not None:
-            self.batch_size.keep_pace(pace)
-
     def _drawn_and_taken(self, request: Request) -> tuple[Any, StepResult]:
         """Return a batch and the result of a step on it. The next step overwrites both."""
         model, source, optimizer = self.model, self.source, self.optimizer
@@ -341,16 +347,11 @@ class Trainer:
         return [*self.model.parameters(), *self.model.buffers(), *self.optimizer.tensors()]
 
     def _request(self) -> Request:
-        """Return the request for the next batch: at first one ray per pixel, later the rendering's number."""
-        state = self.state
+        """Return the request for the next batch."""
         if self.batch_size is None:
-            return Request(state.step, 0, progress=self.progress)
-        config = self.batch_size.config
-        late = self.progress >= config.train_rays_per_pixel_from
-        rays_per_pixel = config.rays_per_pixel if late else 1
-        rays = self.batch_size.rays(self.model.samples_per_step, state.samples_per_ray)
-        points = self.train_set.sparse_depth is not None and self.progress < POINTS_UNTIL
-        return Request(state.step, max(rays // rays_per_pixel, 1), rays_per_pixel, points, self.progress)
+            return Request(self.state.step, 0, progress=self.progress)
+        points = self.train_set.sparse_depth is not None
+        return self.batch_size.request(self.state, self.model.samples_per_step, self.progress, points)
 
     def _count_bad(self, step: int, finite: bool) -> None:
         """Count dropped steps; raise DivergenceError after too many in a row."""

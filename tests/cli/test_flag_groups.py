@@ -80,7 +80,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
         "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
-        *["background options"] * (method in WITH_BACKGROUND), "ray options",
+        *["background options"] * (method in WITH_BACKGROUND), "ray options", "robust options",
         *["appearance options"] * (method in ("nerf-w", "nerfacto", "neus", "volsdf", "zip-nerf")),
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
         "teacher options", "optimisation options", "evaluation and saving options",
@@ -125,6 +125,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
         "nerfacto": ["--num-levels", "--camera-learning-rate", "--appearance-embedding-dim"],
         "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
         "ray": ["--num-rays-per-batch", "--train-rays-per-pixel-from"],
+        "robust": ["--robust", "--robust-factor"],
         "teacher": ["--teacher", "--teacher-share", "--teacher-until"],
         "optimisation": ["--learning-rate", "--lr-schedule", "--adam-eps"],
         "evaluation and saving": ["--steps-per-save", "--max-eval-images", "--target-psnr", "--load-checkpoint"],
@@ -152,7 +153,7 @@ def test_a_method_that_casts_no_rays_has_no_flags_of_rays(monkeypatch: pytest.Mo
         monkeypatch.undo()
         registry.registered.cache_clear()
     assert discs["discs options"] == ["--num-discs"]
-    assert not {"ray options", "sampler options", "appearance options"} & set(discs)
+    assert not {"ray options", "robust options", "sampler options", "appearance options"} & set(discs)
     assert not [flag for flags in discs.values() for flag in flags if "ray" in flag or "sampl" in flag]
     assert cones["cones options"] == ["--num-frequencies", "--num-samples"]
     assert "--num-rays-per-batch" in cones["ray options"]
@@ -239,7 +240,7 @@ def test_what_the_data_decide_is_not_called_none() -> None:
         ),
         ("--num-proposal-samples 32 --rays-per-pixel 9", {"num_proposal_samples": (32,), "rays_per_pixel": 9}),
         ("--lr-schedule cosine --sampler occupancy", {"lr_schedule": "cosine", "sampler": "occupancy"}),
-        ("--mixed-precision True --robust True", {"mixed_precision": True, "robust": True}),
+        ("--mixed-precision True --robust scout", {"mixed_precision": True, "robust": "scout"}),
         ("--contraction False --silhouette-cells False", {"contraction": False, "silhouette_cells": False}),
         ("--contraction auto --num-steps auto --max-seconds None", {"contraction": "auto", "num_steps": "auto"}),
         ("--output-dir a/b --max_seconds 3 --learning-rate=1e-3", {"output_dir": Path("a/b"), "max_seconds": 3.0}),

@@ -287,9 +287,9 @@ def test_the_loss_as_a_part_of_another() -> None:
 @needs_kernels
 @pytest.mark.parametrize("size", [(10, 11, 3), (11, 10, 3), (11, 11, 0)])
 def test_the_kernel_refuses_too_small_images_itself(size: tuple[int, int, int]) -> None:
-    kernel = native.Function("photometric", "ppqqqffppi", "d")
+    kernel = native.Function("photometric", "ppqqqffpppi", "d")
     with pytest.raises(ValueError, match="SSIM needs 11x11 pixels"):
-        kernel(None, None, *size, 1, 1e-4, None, None, 1)
+        kernel(None, None, *size, 1, 1e-4, None, None, None, 1)
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -380,3 +380,83 @@ def test_windows_that_do_not_fit_are_refused() -> None:
         ssim(image, image, torch.ones(20, 30, dtype=torch.bool))
     with pytest.raises(ValueError, match="at least one window that counts"):
         structure(image, image, torch.zeros(10, 20, dtype=torch.bool))
+
+
+# -- With weights -----------------------------------------------------------------------------------------------------
+
+
+def weighted_by_hand(image: Tensor, target: Tensor, weights: Tensor, ssim_weight: float) -> float:
+    """Window by window in float64; a window has the least weight of its pixels."""
+    errors = (image.double() - target.double()).abs() * weights.double()[..., None]
+    dissimilar = []
+    for row in range(image.shape[0] - 10):
+        for column in range(image.shape[1] - 10):
+            window = slice(row, row + 11), slice(column, column + 11)
+            alone = window_by_window(image[window], target[window], torch.ones(11, 11, dtype=torch.bool), True)
+            dissimilar.append(weights[window].min().double() * (1 - alone))
+    return float((1 - ssim_weight) * errors.mean() + ssim_weight * torch.stack(dissimilar).mean())
+
+
+@pytest.mark.medium
+@pytest.mark.parametrize("size", [(11, 30, 3), (37, 26, 1), (23, 19, 4)], ids=str)
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2, 1.0])
+def test_weights_of_pixels_and_of_windows(size: tuple[int, int, int], ssim_weight: float) -> None:
+    torch.manual_seed(0)
+    target, weights = smooth(*size), torch.rand(size[:2])
+    image = noisy(target, 0.2)
+    weights[:, size[1] - 3 :] = 0
+    expected = weighted_by_hand(image, target, weights, ssim_weight)
+    assert photometric_loss(image, target, ssim_weight, weights).item() == pytest.approx(expected, abs=1e-6)
+    exact = photometric_reference(image.double(), target.double(), ssim_weight, weights.double())
+    assert exact.item() == pytest.approx(expected, abs=1e-12)
+
+
+@needs_kernels
+@pytest.mark.parametrize("size", [*SIZES, TALL], ids=str)
+def test_the_weighted_loss_and_its_gradient(size: tuple[int, int, int]) -> None:
+    torch.manual_seed(0)
+    target, weights = smooth(*size), torch.rand(size[:2])
+    image = noisy(target, 0.1)
+    weights[weights < 0.1] = 0
+    weights[: size[0] // 3] = 1
+    value, gradient = value_and_gradient(lambda x, y: photometric_loss(x, y, 0.2, weights), image, target)
+    truth, true_gradient = value_and_gradient(
+        lambda x, y: photometric_reference(x, y, 0.2, weights.double()), image.double(), target.double()
+    )
+    assert value.item() == pytest.approx(truth.item(), abs=5e-7)
+    assert relative_error(gradient, true_gradient) < 1e-4
+
+
+@pytest.mark.parametrize("kind", ["compiled", "reference"])
+def test_pixels_without_a_weight_neither_tell_nor_learn(kind: str) -> None:
+    torch.manual_seed(0)
+    target = smooth(*TALL)
+    image, weights = noisy(target, 0.2), torch.ones(TALL[:2])
+    weights[20:50, 10:25] = 0
+    form = photometric_loss if kind == "compiled" else photometric_reference
+    found = []
+    for other in (0.0, 1.0):
+        target[20:50, 10:25] = other
+        found.append(value_and_gradient(lambda x, y: form(x, y, 0.2, weights), image, target))
+    (value, gradient), (again, same) = found
+    assert torch.equal(value, again)
+    assert torch.equal(gradient, same)
+    assert not bool(gradient[20:50, 10:25].any())
+    assert bool(gradient[weights == 1].any(-1).all())
+
+
+@needs_kernels
+def test_weights_of_one_have_the_bits_of_none(threads: Callable[[int], None]) -> None:
+    torch.manual_seed(0)
+    image, target = torch.rand(TALL), torch.rand(TALL)
+    for count in (1, 3):
+        threads(count)
+        plain = value_and_gradient(lambda x, y: photometric_loss(x, y, 0.2), image, target)
+        weighted = value_and_gradient(lambda x, y: photometric_loss(x, y, 0.2, torch.ones(TALL[:2])), image, target)
+        assert all(torch.equal(one, other) for one, other in zip(plain, weighted, strict=True))
+
+
+def test_weights_that_do_not_fit_are_refused() -> None:
+    image = torch.rand(20, 30, 3)
+    with pytest.raises(ValueError, match=r"\(20, 30, 3\) needs weights of its pixels, not \(30, 20\)"):
+        photometric_loss(image, image, 0.2, torch.ones(30, 20))

@@ -109,7 +109,7 @@ MUTANTS = {
             "test_far_from_the_origin.py::test_points_and_the_cube_of_a_file_are_where_its_cameras_are"),
     ],
     "nerfloom.data.sources": [
-        Mutant("errors-not-restored", "PixelSource.restore", "A.copy_(state)", "A.fill_(1.0)",
+        Mutant("errors-not-restored", "BatchSource.restore", "A.copy_(state)", "A.fill_(1.0)",
             "with --robust a resumed run has other bits",
             "test_sources.py::test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set"),
     ],

@@ -69,6 +69,11 @@ MUTANTS = {
             "held-out photographs get the appearance and the pose of training photographs of the same number",
             "evaluation/test_evaluator.py::test_a_pixel_is_the_mean_over_its_area"),
     ],
+    "nerfloom.training.batch_size": [
+        Mutant("late-rays-from-the-start", "BatchSize.request", "A >= B", "A <= B",
+            "four rays a pixel are trained at the beginning instead of the end",
+            "stress_command/test_conditions.py::test_a_step_has_so_many_rays"),
+    ],
     "nerfloom.training.budget": [
         Mutant("schedule-without-clock", "spent", "state.seconds / config.max_seconds",
             "state.step / config.max_num_iterations",
@@ -146,6 +151,11 @@ MUTANTS = {
             "other programs put the run at another size than its input",
             "truth/test_run.py::test_other_programs_find_the_scene_by_the_transform_beside_it"),
     ],
+    "nerfloom.training.scout": [
+        Mutant("scout-hears-no-others", "contradicted", "CLEARLY * typical", "0 * typical",
+            "what a scout has not learnt yet is left out of every image",
+            "training/test_scout.py::test_what_is_wrong_in_all_images_is_kept"),
+    ],
     "nerfloom.training.splat_files": [
         Mutant("splats-where-they-were", "load_splats",
             "transformed(A, *at.frame.similarity())", "A",
@@ -184,9 +194,6 @@ MUTANTS = {
             "state.account(A, B, seconds * (1 + (self.eval_set is not None)))",
             "a budget of seconds is spent in half of them where there is something to evaluate",
             "truth/test_training.py::test_training_takes_what_its_steps_take"),
-        Mutant("late-rays-from-the-start", "Trainer._request", "A >= B", "A <= B",
-            "four rays a pixel are trained at the beginning instead of the end",
-            "stress_command/test_conditions.py::test_a_step_has_so_many_rays"),
         Mutant("errors-read-late", "Trainer._read_errors", "A - len(unread) + 1", "A",
             "on a GPU the running error of the first steps is off",
             "training/test_operations.py::test_errors_that_are_read_late_make_the_same_mean"),

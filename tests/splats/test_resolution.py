@@ -14,6 +14,7 @@ from nerfloom.splats.resolution import (
     most_octaves,
     octaves_at,
     reduced,
+    reduced_weights,
     share_for,
 )
 
@@ -41,6 +42,14 @@ def test_distances_are_not_mixed_and_no_known_one_is_lost() -> None:
     distances = torch.tensor([[0.0, 3.0, 5.0, 2.0, 9.0], [0.0, 0.0, 0.0, 4.0, 9.0], [0.0, 0.0, 0.0, 0.0, 7.0]])
     assert halved_distances(distances).tolist() == [[3.0, 2.0]]
     assert halved_distances(torch.zeros(4, 4)).tolist() == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_a_mean_of_pixels_has_the_least_of_their_weights() -> None:
+    weights = torch.rand(9, 13, generator=torch.Generator().manual_seed(0))
+    assert reduced_weights(weights, 0) is weights
+    small = reduced_weights(weights, 2)
+    assert small.shape == (2, 3)
+    assert float(small[1, 2]) == float(weights[4:8, 8:12].min())
 
 
 def test_each_size_has_as_much_time_as_all_smaller_ones() -> None:

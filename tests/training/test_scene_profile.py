@@ -143,7 +143,7 @@ def test_a_run_that_begins_with_a_checkpoint_has_one_too(shared_tiny: Path, tmp_
 
 
 def test_robust_training_is_resumed_with_the_same_bits(shared_tiny: Path, tmp_path: Path) -> None:
-    settings = {"max_num_iterations": 12, "robust": True}
+    settings = {"max_num_iterations": 12, "robust": "errors"}
     whole = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "whole", **settings)
     whole.train()
     first = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "first", **settings)

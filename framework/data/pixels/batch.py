@@ -80,8 +80,8 @@ class ViewBatch:
     """(3,) colour behind transparent pixels."""
     alpha: Tensor | None = None
     """(H, W) opacity, if the images have alpha."""
-    kept: Tensor | None = None
-    """(H, W) bool, pixels that count; None for all."""
+    weights: Tensor | None = None
+    """(H, W) factors of the pixels' losses, from 0 for pixels that do not count to 1; None for 1."""
     distances: Tensor | None = None
     """(H, W) distance along each pixel's ray, 0 where unknown: measured, or from a reconstruction's points; None if
     none is known."""

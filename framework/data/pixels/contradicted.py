@@ -7,22 +7,28 @@ pixels. A tile is contradicted if the square of that mean, averaged over 3 x 3 t
 tiles and exceeds a threshold. No fixed share of pixels is left out: where nothing moves, the means of all tiles become
 small.
 
+A method that draws whole images sees all errors of an image at once, but each image rarely. There the errors of the
+last drawing decide, the median is that of the image, and errors count less where the photograph has fine structure,
+which a model that is not sharp yet misses. The weight of contradicted tiles falls from 1 to 0, so that a part of the
+scene that is learnt late is not left out for good.
+
 Finding what moves from errors, and deciding together with neighbours, are ideas of RobustNeRF (Sabour et al. 2023);
-counting all pixels at first is one of SpotLessSplats (Sabour et al. 2024).
+counting all pixels at first, and leaving out more and more, are ideas of SpotLessSplats (Sabour et al. 2024).
 """
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.pixels.tiles import Tiles
+from nerfloom.data.pixels.left_out import LeftOutTiles
 
 TILES_ALONG = 12
-"""Number of tiles along an image's longer side; fewer if their sides would be shorter than `MIN_SIDE`."""
-MIN_SIDE = 4
-"""Minimum side of a tile, pixels."""
+"""Number of tiles along an image's longer side."""
 MEMORY = 32
 """Number of draws in a tile that reduce an error's weight in its mean to 1 / e."""
 MIN_DRAWS = 4
@@ -33,11 +39,16 @@ learnt."""
 LEAST = 0.07
 """Minimum mean error of a contradicted tile; colours are in [0, 1]."""
 STEPS_PER_LOOK = 25
-"""Steps between decisions on which tiles are contradicted."""
+"""Steps between decisions on which tiles are contradicted, if batches are pixels."""
+FADE = 0.1
+"""Fraction of the budget in which the weight of contradicted tiles of whole images falls to 1 / e."""
+UNSHARP = 0.5
+"""Mean error of a tile, in standard deviations of the photograph's colours there, that a model may have because it is
+not sharp yet."""
 
 
-class ContradictedTiles:
-    """Running means of the signed errors in each tile, and the tiles that are contradicted.
+class ContradictedTiles(LeftOutTiles):
+    """Tiles that are contradicted by running means of the signed errors of drawn pixels.
 
     Args:
         dataset: M images.
@@ -45,18 +56,20 @@ class ContradictedTiles:
     """
 
     def __init__(self, dataset: Dataset, factor: float) -> None:
-        self.tiles = Tiles(dataset.cameras, max(round(dataset.scene.image_size / TILES_ALONG), MIN_SIDE))
+        super().__init__(dataset, TILES_ALONG)
         self.around, self.factor = self.tiles.neighbours(), factor
         self.state = torch.zeros(self.tiles.total, 5, device=dataset.device)
         """(T, 5) weighted sums of the signed errors of the three channels; sum of the weights; 1 if contradicted,
         otherwise 0."""
 
-    def learn(self, pixels: Tensor, errors: Tensor) -> None:
-        """Update the means of tiles.
+    @property
+    def left_out(self) -> Tensor:
+        return self.state[:, 4]
 
-        Args:
-            pixels: (R,) pixels, counted over all images.
-            errors: (R, 3) rendered minus true colours; pixels with an error that is not finite are ignored.
+    def learn(self, pixels: Tensor, errors: Tensor) -> None:
+        """Update the means of tiles. Errors that are not finite are ignored.
+
+        `pixels` and `errors` are as in `LeftOutTiles.learn`.
         """
         finite = errors.isfinite().all(-1, keepdim=True)
         drawn = torch.cat([torch.where(finite, errors, 0), finite.to(errors)], -1).to(self.state)
@@ -72,22 +85,60 @@ class ContradictedTiles:
         return (squares[self.around] * known).sum(-1) / known.sum(-1).clamp(min=1e-6), known.sum(-1) >= MIN_DRAWS
 
     def decide(self, progress: float) -> None:
-        """Decide which tiles are contradicted.
-
-        Args:
-            progress: fraction of the budget spent, 0 to 1.
-        """
         if progress < ALL_UNTIL:
             return
         scores, known = self.scores()
         typical = torch.where(known, scores, torch.nan).nanmedian()
         self.state[:, 4] = known & (scores > (self.factor * typical).clamp(min=LEAST**2))
 
-    @property
-    def share(self) -> Tensor:
-        """The share () of the tiles that are contradicted."""
-        return self.state[:, 4].mean()
 
-    def counting(self, pixels: Tensor) -> Tensor:
-        """Return 1 for each of `pixels` (R,) that counts, and 0 for those in contradicted tiles."""
-        return 1 - self.state[self.tiles.of(pixels), 4]
+class ContradictedViews(LeftOutTiles):
+    """Tiles of whole images that are contradicted by the errors of the last drawing.
+
+    Args:
+        dataset: M images.
+        factor: a tile is contradicted if its score is this many times the median of its image.
+    """
+
+    def __init__(self, dataset: Dataset, factor: float) -> None:
+        super().__init__(dataset, TILES_ALONG)
+        self.factor, self.state = factor, torch.zeros_like(self.state)
+
+    def weights(self, index: int, progress: float) -> Tensor | None:
+        """Return the weights (H, W) of the pixels of an image, which fall from 1 to 0 in contradicted tiles.
+
+        `index`, `progress` and None are as in `LeftOutTiles.weights`.
+        """
+        if progress <= ALL_UNTIL:
+            return None
+        lost = 1 - math.exp((ALL_UNTIL - progress) / FADE)
+        return 1 - lost * self.tiles.over_image(self.left_out, index)
+
+    def learn_view(self, index: int, errors: Tensor, colors: Tensor, progress: float) -> None:
+        """Decide which tiles of an image are contradicted. Errors that are not finite count as 0.
+
+        The arguments are as in `LeftOutTiles.learn_view`.
+        """
+        if progress < ALL_UNTIL:
+            return
+        scores = view_scores(errors, colors, self.tiles.side)
+        out = scores > (self.factor * scores.median()).clamp(min=LEAST**2)
+        self.tiles.of_image(self.state, index).copy_(out)
+
+
+def view_scores(errors: Tensor, colors: Tensor, side: int) -> Tensor:
+    """Return the scores (rows, columns) of the tiles of an image, in the unit of squared errors.
+
+    The score of a tile is its squared mean signed error, times e^2 / (e^2 + (u s)^2) with e = `LEAST`, u = `UNSHARP`
+    and the standard deviation s of the photograph's colours in the tile. Scores are averaged over 3 x 3 tiles.
+
+    Args:
+        errors: (H, W, 3) drawn minus true colours; those that are not finite count as 0.
+        colors: (H, W, 3) true colours.
+        side: side of a tile, pixels; tiles at the right and lower borders may be smaller.
+    """
+    maps = torch.cat([torch.nan_to_num(errors, 0.0, 0.0, 0.0), colors, colors.square()], -1).permute(2, 0, 1)[None]
+    error, mean, square = avg_pool2d(maps, side, ceil_mode=True, count_include_pad=False)[0].chunk(3)
+    variance = (square - mean.square()).clamp(min=0).mean(0)
+    scores = error.square().mean(0) * (LEAST**2 / (LEAST**2 + UNSHARP**2 * variance))
+    return avg_pool2d(scores[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]

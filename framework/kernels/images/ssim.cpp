@@ -72,7 +72,7 @@ struct Images {
     const float *image, *target;
     int64_t height, width, channels;
     float c1;  // of the means; if it is infinite, only variances are compared
-    const bool* counted;  // (height - REACH, width - REACH): windows that count; null for all
+    const float *weights, *of_windows;  // of pixels (height, width) and windows (height - REACH, width - REACH), or null
 };
 
 inline int64_t whole_vectors(int64_t floats) { return (floats + LANES - 1) / LANES * LANES; }
@@ -97,13 +97,14 @@ class Band {
           margin(whole_vectors(reach)) {
         // Rows have space for a window's reach on both sides, and for whole vectors.
         const int64_t stride = margin + whole_vectors(row_floats + reach) + LANES;
-        scratch.assign(size_t((7 * KEPT + 4 * ROWS + 2) * stride + LANES), 0.0f);
+        scratch.assign(size_t((7 * KEPT + 4 * ROWS + 3) * stride + LANES), 0.0f);
         float* at = scratch.data();
         while (reinterpret_cast<uintptr_t>(at) % sizeof(Floats)) at++;
         for (Rows& map : moments) map = {at, stride}, at += KEPT * stride;
         for (Rows& map : slopes) map = {at, stride}, at += KEPT * stride;
         for (Rows& map : blurred) map = {at, stride}, at += ROWS * stride;
-        for (float** row : {&sums, &differences}) *row = at, at += stride;
+        for (float** row : {&sums, &differences, &counting}) *row = at, at += stride;
+        for (int64_t i = 0; i < row_floats; i++) counting[i] = 1;
         for (float*& row : inside) {
             row = at, at += stride;
             for (int64_t i = 0; i < windows; i++) row[i] = 1;
@@ -131,7 +132,10 @@ class Band {
             sums[i] = (a[i] - 0.5f) + (b[i] - 0.5f);
             differences[i] = a[i] - b[i];
         }
-        if (row >= REACH && row < rows) error[y] = absolute_sum();
+        if (row >= REACH && row < rows) {
+            weigh(y);
+            error[y] = absolute_sum();
+        }
         float* out[4];
         for (int m = 0; m < 4; m++) out[m] = moments[m][row];
         for (int64_t i = 0; i < windows; i += LANES) {
@@ -143,33 +147,42 @@ class Band {
         }
     }
 
-    // For the differences of a row.
-    double absolute_sum() const {
-        Floats lanes = splat(0);
-        int64_t i = 0;
-        for (; i + LANES <= row_floats; i += LANES) lanes += magnitude(load(differences + i));
-        double total = 0;
-        for (int lane = 0; lane < LANES; lane++) total += lanes[lane];
-        for (; i < row_floats; i++) total += std::abs(differences[i]);
-        return total;
+    // The weights of a row of pixels, for each channel.
+    void weigh(int64_t y) {
+        if (images.weights) repeat(images.weights + y * images.width, row_floats, counting);
     }
 
-    // Which windows of ROWS rows count, for each channel.
+    // The weights of ROWS rows of windows, for each channel.
     void choose(int64_t row) {
         for (int r = 0; r < ROWS; r++) {
             const int64_t y = top + row + r;
             if (y < 0 || y >= images.height - REACH) continue;  // it has no windows
-            const bool* counted = images.counted + y * (images.width - REACH);
-            for (int64_t i = 0; i < windows; i += step, counted++)
-                for (int64_t c = 0; c < step; c++) inside[r][i + c] = *counted ? 1.0f : 0.0f;
+            repeat(images.of_windows + y * (images.width - REACH), windows, inside[r]);
         }
+    }
+
+    // Writes each value once for each channel.
+    void repeat(const float* values, int64_t count, float* out) const {
+        for (int64_t i = 0; i < count; i += step, values++)
+            for (int64_t c = 0; c < step; c++) out[i + c] = *values;
+    }
+
+    // For the differences of a row, with its weights.
+    double absolute_sum() const {
+        Floats lanes = splat(0);
+        int64_t i = 0;
+        for (; i + LANES <= row_floats; i += LANES) lanes += load(counting + i) * magnitude(load(differences + i));
+        double total = 0;
+        for (int lane = 0; lane < LANES; lane++) total += lanes[lane];
+        for (; i < row_floats; i++) total += counting[i] * std::abs(differences[i]);
+        return total;
     }
 
     // The derivatives of ROWS rows of windows, and their dissimilarity.
     void compare(int64_t row, double* dissimilarity) {
         const float* from[4][KEPT];
         for (int m = 0; m < 4; m++) moments[m].pointers(row, from[m]);
-        if (images.counted) choose(row);
+        if (images.of_windows) choose(row);
         Floats total[ROWS] = {};
         for (int64_t i = 0; i < windows; i += LANES) {
             Floats moment[4][ROWS];
@@ -192,10 +205,10 @@ class Band {
                 const Floats by_mean =
                     (1.0f - flatter) * per_light * (darker * (full + difference) - 2.0f * difference) -
                     (sum * by_sum + difference * by_difference);
-                total[r] += counts != 0.0f ? darker + similar * flatter : splat(0);
-                store(slopes[0][row + r] + margin + i, counts != 0.0f ? by_mean : splat(0));
-                store(slopes[1][row + r] + margin + i, counts != 0.0f ? by_sum : splat(0));
-                store(slopes[2][row + r] + margin + i, counts != 0.0f ? by_difference : splat(0));
+                total[r] += counts != 0.0f ? counts * (darker + similar * flatter) : splat(0);
+                store(slopes[0][row + r] + margin + i, counts != 0.0f ? counts * by_mean : splat(0));
+                store(slopes[1][row + r] + margin + i, counts != 0.0f ? counts * by_sum : splat(0));
+                store(slopes[2][row + r] + margin + i, counts != 0.0f ? counts * by_difference : splat(0));
             }
         }
         for (int r = 0; r < ROWS; r++) {
@@ -220,6 +233,7 @@ class Band {
         }
         for (int64_t r = std::max<int64_t>(REACH - row, 0); r < std::min<int64_t>(rows - row, ROWS); r++) {
             const int64_t begin = (top + row + r) * row_floats;
+            weigh(top + row + r);
             const float *a = images.image + begin, *b = images.target + begin;
             const float* map[3];
             for (int m = 0; m < 3; m++) map[m] = blurred[m][r] + margin - reach;
@@ -228,7 +242,7 @@ class Band {
                 const Floats slope = blur_along(map[0] + i, step) + sum * blur_along(map[1] + i, step) +
                                      difference * blur_along(map[2] + i, step);
                 const Floats sign = (difference > 0 ? splat(1) : splat(0)) - (difference < 0 ? splat(1) : splat(0));
-                return measure.of_similarity * slope + measure.of_error * sign;
+                return measure.of_similarity * slope + measure.of_error * (load(counting + i) * sign);
             };
             int64_t i = 0;
             for (; i + LANES <= row_floats; i += LANES)
@@ -247,22 +261,23 @@ class Band {
     Rows slopes[3];             // by the mean, and twice those by the means of both squares, after `margin` zeros
     Rows blurred[3];            // the slopes, blurred down
     float *sums, *differences;  // of a row of both images
-    float* inside[ROWS];        // 1 where a row has a window that counts, otherwise 0
+    float* counting;            // the weights of a row of pixels
+    float* inside[ROWS];        // the weights of rows of windows
 };
 
 }  // namespace
 
-// out: 1 - ssim_weight times the mean absolute error, and ssim_weight times 1 - the mean similarity, of image and
-// target (height, width, channels), with at least 11 pixels along each side. counted (height - 10, width - 10): windows
-// over which the similarity is averaged, at least one; null for all. gradient (height, width, channels): derivative by
-// the image, unless null.
+// out: 1 - ssim_weight times the mean absolute error, and ssim_weight times the mean of 1 - the similarity, of image and
+// target (height, width, channels), with at least 11 pixels along each side. weights (height, width) and of_windows
+// (height - 10, width - 10): factors in these means of pixels and of windows; null for 1. gradient (height, width,
+// channels): derivative by the image, unless null.
 EXPORT int photometric(const float* image, const float* target, int64_t height, int64_t width, int64_t channels,
-                       float ssim_weight, float c1, const bool* counted, float* gradient, int threads, double* out) {
+                       float ssim_weight, float c1, const float* weights, const float* of_windows, float* gradient,
+                       int threads, double* out) {
     return guarded([&] {
         if (std::min(height, width) < TAPS || channels < 1) throw std::invalid_argument("SSIM needs 11x11 pixels");
-        const Images images{image, target, height, width, channels, c1, counted};
-        const int64_t windows = (height - REACH) * (width - REACH);
-        const double count = double(counted ? std::count(counted, counted + windows, true) : windows) * double(channels);
+        const Images images{image, target, height, width, channels, c1, weights, of_windows};
+        const double count = double(height - REACH) * double(width - REACH) * double(channels);
         const double values = double(height) * double(width) * double(channels);
         // Neighbouring bands both read the rows between them, so there are no more bands than useful threads. Results
         // do not depend on the bands: each begins at a multiple of ROWS, and sums are over rows first.

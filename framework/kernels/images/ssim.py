@@ -15,6 +15,9 @@ a pixel q, with E for the blurred squares, is a sum over the windows that contai
 
     sum_p g(q - p) (dS/dm(p) + 2 u(q) dS/dE[u^2](p) + 2 v(q) dS/dE[v^2](p))
 
+Pixels may have weights. The absolute error of a pixel is multiplied by its weight, and 1 - S of a window by the least
+weight of its pixels, so that a pixel of weight 0 has no effect on the loss.
+
 The loss is a single number, and so is its incoming gradient. The derivative is computed together with the value, while
 rows are in the processor's cache, and the backward pass only multiplies it.
 """
@@ -71,10 +74,19 @@ def windows_inside(kept: Tensor) -> Tensor:
     Args:
         kept: (H, W) bool; each side has at least 11 pixels.
     """
-    ignored = (~kept)[None].float()  # a maximum along one axis after the other takes less time than over both
+    return least_in_windows(kept.float()) == 1
+
+
+def least_in_windows(weights: Tensor) -> Tensor:
+    """Return the least weight in each window, (H - 10, W - 10), at the position of its first pixel.
+
+    Args:
+        weights: (H, W) weights of pixels; each side has at least 11 pixels.
+    """
+    least = -weights[None]  # a maximum along one axis after the other takes less time than over both
     for size in ((WINDOW, 1), (1, WINDOW)):
-        ignored = torch.nn.functional.max_pool2d(ignored, size, 1)
-    return ignored[0] == 0
+        least = torch.nn.functional.max_pool2d(least, size, 1)
+    return -least[0]
 
 
 def _check(image: Tensor, target: Tensor) -> None:
@@ -92,7 +104,7 @@ def _check_window(image: Tensor, counted: Tensor | None = None) -> None:
         raise ValueError("SSIM needs at least one window that counts")
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
     """Return the loss of an image: (1 - w) times the mean absolute error, plus w times (1 - SSIM).
 
     Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", equation 7. The compiled form
@@ -102,6 +114,8 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tenso
         image: (H, W, C) values, assumed to be in [0, 1]. Compiled with its first derivative.
         target: (H, W, C) values to compare with. A gradient of the target uses the slow reference.
         ssim_weight: w, between 0 and 1. An image smaller than the window has no SSIM: its loss is the error alone.
+        weights: (H, W) factors of the pixels' errors, without a gradient; a window has the least of its pixels'. Means
+            are over all pixels and windows. None for 1.
 
     Returns:
         A tensor without dimensions.
@@ -110,14 +124,35 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tenso
         ValueError: The shapes differ or are not those of images.
     """
     _check(image, target)
+    if weights is not None and weights.shape != image.shape[:2]:
+        raise ValueError(f"an image {tuple(image.shape)} needs weights of its pixels, not {tuple(weights.shape)}")
     if ssim_weight == 0 or min(image.shape[:2]) < WINDOW:
-        return (image - target).abs().mean()
-    return PHOTOMETRIC((image, target), image, target, ssim_weight)
+        return weighted_error(image, target, weights)
+    return PHOTOMETRIC((image, target, weights), image, target, ssim_weight, weights)
 
 
-def photometric_reference(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Compute `photometric_loss` of `image`, `target` and `ssim_weight` in torch, with derivatives of any order."""
-    return (1 - ssim_weight) * (image - target).abs().mean() + ssim_weight * (1 - ssim_reference(image, target))
+def photometric_reference(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
+    """Compute `photometric_loss` in torch, with derivatives of any order by both images.
+
+    `image`, `target`, `ssim_weight` and `weights` are as there.
+    """
+    by_means, by_variances = _similarities(image, target)
+    dissimilar = 1 - by_means * by_variances
+    if weights is not None:
+        dissimilar = dissimilar * least_in_windows(weights)[..., None]
+    return (1 - ssim_weight) * weighted_error(image, target, weights) + ssim_weight * dissimilar.mean()
+
+
+def weighted_error(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+    """Return the mean of weight times absolute error, a tensor without dimensions.
+
+    Args:
+        image: (H, W, C) values.
+        target: (H, W, C) values to compare with.
+        weights: (H, W) factors of the pixels; None for 1.
+    """
+    errors = (image - target).abs()
+    return errors.mean() if weights is None else (errors * weights[..., None]).mean()
 
 
 def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
@@ -174,18 +209,23 @@ def _blurred(values: Tensor) -> Tensor:
 
 PHOTOMETRIC = Operation("photometric", photometric_reference)
 SIMILARITY = Operation("similarity", similarity_reference)
-_photometric = native.Function("photometric", "ppqqqffppi", "d")
+_photometric = native.Function("photometric", "ppqqqffpppi", "d")
 
 
 class _Photometric(torch.autograd.Function):
     """The compiled sweep over an image; it computes the value and the derivative."""
 
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, learned: bool) -> Tensor:
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None, learned: bool
+    ) -> Tensor:
         derivative = torch.empty_like(image) if learned else None
+        least = None if weights is None else least_in_windows(weights)
         value = _photometric(
             native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-            *image.shape, ssim_weight, C1, None,
+            *image.shape, ssim_weight, C1,
+            None if weights is None else native.pointer(weights, "the weights", image.shape[:2]),
+            None if least is None else native.pointer(least, "the windows' weights", least.shape),
             None if derivative is None else derivative.data_ptr(), native.threads(),
         )  # fmt: skip
         if derivative is not None:
@@ -194,31 +234,33 @@ class _Photometric(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
         (derivative,) = ctx.saved_tensors
         # A term of a loss has a gradient of 1, so the usual step needs no pass over the image.
-        return derivative if float(grad) == 1 else derivative * grad, None, None, None
+        return derivative if float(grad) == 1 else derivative * grad, None, None, None, None
 
 
 @PHOTOMETRIC.implementation(CPP, differentiable=1)
-def _compiled(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def _compiled(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
     learned = image.requires_grad and torch.is_grad_enabled()
-    out: Tensor = _Photometric.apply(image.contiguous(), target.contiguous(), ssim_weight, learned)
+    weights = None if weights is None else weights.contiguous()
+    out: Tensor = _Photometric.apply(image.contiguous(), target.contiguous(), ssim_weight, weights, learned)
     return out
 
 
 @SIMILARITY.implementation(CPP, order=0)
 def _compiled_similarity(image: Tensor, target: Tensor, counted: Tensor | None, of_means: bool) -> Tensor:
     image, target = image.contiguous(), target.contiguous()
-    counted = None if counted is None else counted.contiguous()
+    counts = None if counted is None else counted.to(image).contiguous()
     windows = image.shape[0] - WINDOW + 1, image.shape[1] - WINDOW + 1
     value = _photometric(
         native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-        *image.shape, 1.0, C1 if of_means else math.inf,
-        None if counted is None else native.pointer(counted, "the windows that count", windows, torch.bool),
+        *image.shape, 1.0, C1 if of_means else math.inf, None,
+        None if counts is None else native.pointer(counts, "the windows that count", windows),
         None, native.threads(),
     )  # fmt: skip
-    return image.new_tensor(1 - value)
+    share = 1.0 if counts is None else counts.mean(dtype=torch.float64).item()  # the kernel's mean is over all windows
+    return image.new_tensor(1 - value / share)
 
 
 PHOTOMETRIC.implementation(TRITON, differentiable=1)(later("images.ssim_triton", "photometric_loss"))

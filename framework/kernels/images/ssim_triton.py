@@ -17,7 +17,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nerfloom.kernels.images.ssim import C1, C2, SIGMA, WINDOW
+from nerfloom.kernels.images.ssim import C1, C2, SIGMA, WINDOW, least_in_windows, weighted_error
 from nerfloom.kernels.triton_launch import blocks, launch
 
 BLOCK = 256
@@ -56,8 +56,11 @@ def _rows(image, target, line, maps, count, row, shorter, channels, WINDOW: tl.c
 
 
 @triton.jit
-def _windows(maps, line, sums, slopes, size, count, row, c1, c2, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
-    """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S if requested."""
+def _windows(
+    maps, line, weights, sums, slopes, size, count, row, channels, c1, c2, WINDOW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S if requested. Both
+    are multiplied by the weights of windows, if there are any."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < count
     mean_u = tl.zeros([BLOCK], tl.float32)
@@ -74,15 +77,18 @@ def _windows(maps, line, sums, slopes, size, count, row, c1, c2, WINDOW: tl.cons
     by_mean = ((mean_u + 1) * (mean_u + 1) + mean_v * mean_v) / 2 + c1
     by_spread = (spread_u + spread_v) / 2 + c2
     a, b = mean_v * mean_v / by_mean, spread_v / by_spread
-    tl.store(sums + tl.program_id(0), tl.sum(tl.where(here, a + b - a * b, 0.0), 0))
+    counts = tl.full([BLOCK], 1.0, tl.float32)
+    if weights is not None:
+        counts = tl.load(weights + i // channels, mask=here, other=0.0)
+    tl.store(sums + tl.program_id(0), tl.sum(tl.where(here, counts * (a + b - a * b), 0.0), 0))
     if slopes is not None:
         of_square_u = (1 - a) * b / (2 * by_spread)
         of_square_v = (1 - a) * (b / 2 - 1) / by_spread
         of_mean_u = (1 - b) * a * (mean_u + 1) / by_mean - 2 * mean_u * of_square_u
         of_mean_v = (1 - b) * mean_v * (a - 2) / by_mean - 2 * mean_v * of_square_v
-        tl.store(slopes + i, of_mean_u + of_mean_v, mask=here)
-        tl.store(slopes + count + i, of_square_u, mask=here)
-        tl.store(slopes + 2 * count + i, of_square_v, mask=here)
+        tl.store(slopes + i, counts * (of_mean_u + of_mean_v), mask=here)
+        tl.store(slopes + count + i, counts * of_square_u, mask=here)
+        tl.store(slopes + 2 * count + i, counts * of_square_v, mask=here)
 
 
 @triton.jit
@@ -130,7 +136,7 @@ def _rows_back(
 
 class _SSIM(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, learned: bool) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, weights: Tensor | None, learned: bool) -> Tensor:
         height, width, channels = image.shape
         line, constants = _line(image.device), {"WINDOW": WINDOW, "BLOCK": BLOCK}
         row, shorter, windows = width * channels, (width - WINDOW + 1) * channels, height - WINDOW + 1
@@ -138,7 +144,11 @@ class _SSIM(torch.autograd.Function):
         maps, sums = image.new_empty(4, size), image.new_empty(blocks(count, BLOCK))
         slopes = image.new_empty(3, count) if learned else None
         launch(_rows, (blocks(size, BLOCK),), image, target, line, maps, size, row, shorter, channels, **constants)
-        launch(_windows, (blocks(count, BLOCK),), maps, line, sums, slopes, size, count, shorter, C1, C2, **constants)
+        least = None if weights is None else least_in_windows(weights).contiguous()
+        launch(
+            _windows, (blocks(count, BLOCK),), maps, line, least, sums, slopes, size, count, shorter, channels, C1, C2,
+            **constants,
+        )  # fmt: skip
         if slopes is not None:
             derivative = torch.empty_like(image)
             launch(
@@ -153,16 +163,16 @@ class _SSIM(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
         (derivative,) = ctx.saved_tensors
-        return derivative * grad, None, None
+        return derivative * grad, None, None, None
 
 
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
     """Compute `nerfloom.kernels.images.ssim.photometric_loss`, with the first derivative by the image.
 
-    `image`, `target` and `ssim_weight` are as there.
+    `image`, `target`, `ssim_weight` and `weights` are as there.
     """
     learned = image.requires_grad and torch.is_grad_enabled()
-    similarity = _SSIM.apply(image.contiguous(), target.contiguous(), learned)
-    return (1 - ssim_weight) * (image - target).abs().mean() + ssim_weight * (1 - similarity)
+    similarity = _SSIM.apply(image.contiguous(), target.contiguous(), weights, learned)
+    return (1 - ssim_weight) * weighted_error(image, target, weights) + ssim_weight * (1 - similarity)

@@ -103,7 +103,8 @@ def compile_all() -> None:
     back(intervals_triton.proposal_excess(torch.rand(5, 10), torch.rand(5, 9), torch.rand(5, 8), learned(5, 7)))
     for found_inf in (None, torch.rand(())):
         adam_triton.sparse_adam(*torch.rand(4, 9, 2), torch.rand(9), 0.01, (0.9, 0.99), 1e-15, found_inf)
-    back(ssim_triton.photometric_loss(learned(13, 15, 3), torch.rand(13, 15, 3), 0.2))
+    for weights in (None, torch.rand(13, 15)):
+        back(ssim_triton.photometric_loss(learned(13, 15, 3), torch.rand(13, 15, 3), 0.2, weights))
     gaussians()
     marching()
 

@@ -15,6 +15,8 @@ def test_random_images(shape: tuple[int, ...]) -> None:
     compare(ssim, {"image": torch.rand(shape), "target": torch.rand(shape)}, "image", tolerance=2e-5)
     loss = partial(photometric_loss, ssim_weight=0.2)
     compare(loss, {"image": torch.rand(shape), "target": torch.rand(shape)}, "image", tolerance=2e-5)
+    given = {"image": torch.rand(shape), "target": torch.rand(shape), "weights": torch.rand(shape[:2])}
+    compare(loss, given, "image", tolerance=2e-5)
 
 
 def test_extremes() -> None:

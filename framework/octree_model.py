@@ -37,6 +37,7 @@ class OctreeConfig(
     adam_beta2=0.99,
     depth_loss_mult=0.0,
     samples_per_batch=None,
+    appearance="none",
 ):
     """Settings of learning an octree's leaves."""
 

@@ -20,7 +20,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from nerfloom.base.config import AppearanceConfig, RayConfig, TrainConfig
+from nerfloom.base.config import AppearanceConfig, RayConfig, TrainConfig, VectorConfig
 from nerfloom.cli.flag_help import plain_flags
 from nerfloom.data.parsed_scene import DataParser
 from nerfloom.losses.few_images import FewImagesConfig
@@ -41,7 +41,7 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     "sampler": (SamplingConfig, HierarchicalConfig),
     "background": (BackgroundConfig,),
     "ray": (RayConfig,),
-    "appearance": (AppearanceConfig,),
+    "appearance": (AppearanceConfig, VectorConfig),
     "few images": (FewImagesConfig,),
     "motion": (MotionConfig,),
     "teacher": ("teacher", "teacher_share", "teacher_until"),

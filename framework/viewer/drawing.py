@@ -82,9 +82,10 @@ def _kept(
 
 def _appearance(loaded: Loaded, image: int | None) -> AbstractContextManager[None]:
     appearance = appearance_of(loaded.model)
-    if appearance is None or image is None or not 0 <= image < len(appearance.vectors):
+    if appearance is None or image is None or not 0 <= image < len(appearance.of_images()):
         return nullcontext()
-    return shown_appearance(loaded.model, appearance.vectors[image].detach())
+    # A picture is drawn in pieces, and is not the photograph: the light does not depend on the position.
+    return shown_appearance(loaded.model, appearance.of_any_view(appearance.of_images()[image].detach()))
 
 
 def number_kept(kept: Arrays) -> str | None:

@@ -24,7 +24,7 @@ from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model
 from nerfloom.renderable import RendersRays, parts
-from nerfloom.rendering.light import make_light
+from nerfloom.rendering.light import SQUARED, make_light
 from nerfloom.rendering.outputs import Output, empty
 from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.rendering.renderer import Renderer
@@ -101,7 +101,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             named = found if isinstance(found, dict) else {} if found is None else {term.name: found}
             values |= named if factor == 1 else {name: factor * value for name, value in named.items()}
         if self.light is not None:
-            values["appearance"] = self.light.penalty()
+            values["appearance"] = SQUARED * self.light.penalty()
         return Loss(values, shown.pixels.rgb.detach(), rendered.num_samples)
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:

@@ -18,12 +18,15 @@ from torch import Tensor
 
 from nerfloom.blocks.block import IDENTITY, Affine
 from nerfloom.kernels.splats.project import DC
-from nerfloom.rendering.light import PULL, transformed, without_background
+from nerfloom.rendering.light import transformed, without_background
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians
 
+RIDGE = 1e-3
+"""Weight of the squared distance from the identity, beside the mean squared error of colours in [0, 1]."""
 
-def fitted_color(seen: Tensor, wanted: Tensor, ridge: float = PULL) -> Tensor:
+
+def fitted_color(seen: Tensor, wanted: Tensor, ridge: float = RIDGE) -> Tensor:
     """Return the affine function (3, 4) float64 of colours that makes pixels of one picture those of another.
 
     It minimises the mean of |M x - y|^2, plus `ridge` times |M - I|^2.

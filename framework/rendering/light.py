@@ -30,10 +30,13 @@ grids learn from fewer pixels."""
 STOPS = 3.0
 """Stops per unit of an exposure's parameter. A step of Adam then changes mid grey about as much as in affine
 functions."""
-PULL = 1e-3
-"""Weight of the mean squared distance of parameters from those that change nothing."""
-SMOOTHNESS = 10.0
-"""Weight of the total variation of bilateral grids, as in Wang et al. 2024."""
+PULL = 1e-2
+"""Weight of the mean squared distance of parameters from those that change nothing, beside an absolute error."""
+SMOOTHNESS = 2.0
+"""Weight of the total variation of bilateral grids. In Wang et al. 2024 it is 10, and neighbours are half as far apart,
+so that differences between them are half as large."""
+SQUARED = 0.1
+"""Factor of the penalty beside a squared error of colours, which is smaller than an absolute one."""
 LEAST_OPACITY = 1e-3
 """Opacity below which a colour is not divided by it."""
 
@@ -116,11 +119,11 @@ class Light(Appearance, ABC):
         """
 
     def away(self) -> Tensor:
-        """Return the distance of the parameters of each image (M, D) from those that are expected: zeros here."""
-        return self.of_images()
+        """Return the distance of each image's own parameters (M, D) from those that are expected: zeros here."""
+        return self.vectors
 
     def penalty(self) -> Tensor:
-        """Return the term () of the loss that pulls functions to the identity.
+        """Return the term () of the loss that pulls functions to the identity, beside an absolute error of colours.
 
         Light and the scene's colours can change together without changing any image. So each image's parameters are
         pulled a little, and their mean is pulled to where it changes nothing: it is then neutral.
@@ -176,8 +179,11 @@ class ToneLight(Light):
         return torch.cat([self.vectors, functional.embedding(self.devices, self.curves)], dim=-1)
 
     def away(self) -> Tensor:
-        own = self.of_images()
-        return torch.cat([own[:, :1] - self.start[:, None], own[:, 1:]], dim=-1)
+        return torch.cat([self.vectors[:, :1] - self.start[:, None], self.vectors[:, 1:]], dim=-1)
+
+    def penalty(self) -> Tensor:
+        # A curve is not pulled as a mean: with other exposures, the scene's colours cannot take its place.
+        return super().penalty() + PULL * self.curves.square().sum(-1).mean()
 
     def change(self, seen: Tensor, rows: Tensor, which: Tensor, places: Tensor | None) -> Tensor:
         row, flat = functional.embedding(which, rows), seen.reshape(-1, 4)

@@ -26,7 +26,7 @@ MAX_STOPS = 10.0
 
 @dataclass(frozen=True)
 class Taken:
-    """How a photograph was taken."""
+    """Exposure and device of a photograph."""
 
     stops: float = math.nan
     """Exposure: log2 of exposure time (s) times ISO sensitivity over squared f-number; NaN if unknown."""

@@ -1,4 +1,4 @@
-"""What differs between images of one scene: a row of numbers for each, such as the vectors of NeRF-W."""
+"""Appearance of images of one scene: a row of numbers for each, such as the vectors of NeRF-W."""
 
 from __future__ import annotations
 

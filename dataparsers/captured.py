@@ -15,6 +15,7 @@ from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import Placement, estimate_near, held_out
 from nerfloom.data.dataset import existing_files
+from nerfloom.data.exposure import read_taken
 from nerfloom.data.image_files import image_size
 from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
 from nerfloom.dataparsers.placing import Applied, placement_of
@@ -58,7 +59,11 @@ def captured_scene(
         DataError: if a flag or a camera is invalid, a camera does not fit its image, or a mask is missing.
     """
     _check_flags(flags)
+    originals = images.paths
     images, reduction = _choose_files(images, flags.downscale_factor)
+    if split == "train" and images.taken is None and images.paths != originals:
+        files = [one if one.is_file() else other for one, other in zip(originals, images.paths, strict=True)]
+        images = replace(images, taken=read_taken(files))  # reduced copies often have no EXIF
     images = images[existing_files(images.paths, split)]
     if images.region is not None and images.masks is not None:
         images = images[_with_mask(images, split)]
@@ -95,6 +100,7 @@ def captured_scene(
         poses=flags.poses,
         depth_paths=images.depths,
         object_distances=_object_distances(flags, cameras, box) if shows_object else None,
+        taken=images.taken,
     )
 
 

@@ -17,6 +17,7 @@ from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
+from nerfloom.data.exposure import Taken
 from nerfloom.data.names_on_disk import nearest_on_disk, on_disk, spelled
 from nerfloom.data.ply import read_points
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
@@ -35,6 +36,8 @@ EvalMode = Literal["interval", "fraction", "filename", "all"]
 """Rule for held-out images."""
 STATED_ORIENTATIONS = ("none", "up", "pca")
 """Values of `orientation_override`, nerfstudio's entry, that are known here."""
+EXPOSURE = ("exposure_time", "f_number", "iso")
+"""Entries of a frame, or of the file for all frames, that state its exposure; the time is in seconds."""
 MILLIMETRE = 0.001
 """Default units of the input per unit of a stored depth, as in nerfstudio."""
 
@@ -119,6 +122,18 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
         times=read_times(frames, labels),
         points=_points(file, content, split),
         tracks=_tracks(file, content, placed, poses),
+        taken=_taken(content, placed),
+    )
+
+
+def _taken(content: dict[str, Any], placed: list[tuple[dict[str, Any], str]]) -> tuple[Taken, ...] | None:
+    """Return the exposures that frames state, or the file for all of them; None if no frame has all of `EXPOSURE`."""
+    stated = [{key: frame.get(key, content.get(key)) for key in EXPOSURE} for frame, _ in placed]
+    if not any(None not in values.values() for values in stated):
+        return None
+    return tuple(
+        Taken() if None in values.values() else Taken.of(*(number(values[key], key, label, True) for key in EXPOSURE))
+        for values, (_, label) in zip(stated, placed, strict=True)
     )
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerfloom import DataParser
 from nerfloom.cameras.poses import Center, Orientation
+from nerfloom.data.exposure import Taken
 from nerfloom.data.scene import PoseSource
 from nerfloom.data.tracks import Tracks
 
@@ -92,6 +93,8 @@ class PosedImages:
     """Which images see which sparse points, in the input's frame; None if that is not known."""
     region: StatedRegion | None = None
     """Region of interest; None if the input states none. It places the scene, and holds the object that masks show."""
+    taken: tuple[Taken, ...] | None = None
+    """How each image was taken; None to read it from the images' EXIF."""
 
     def __getitem__(self, index: Tensor) -> PosedImages:
         """Return the images selected by an index tensor."""
@@ -108,4 +111,5 @@ class PosedImages:
             depths=None if self.depths is None else tuple(self.depths[i] for i in chosen),
             times=None if self.times is None else self.times[index],
             tracks=None if self.tracks is None else self.tracks.of_images(index),
+            taken=None if self.taken is None else tuple(self.taken[i] for i in chosen),
         )

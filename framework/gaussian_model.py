@@ -16,6 +16,7 @@ from nerfloom.kernels.splats.blend import Blended
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.losses.depth_normals import normal_error
 from nerfloom.model import Model
+from nerfloom.rendering.light import make_light
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.density_control import DensityControl
 from nerfloom.splats.drawing import ray_directions, smallest_depth
@@ -66,6 +67,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
             self.add_module(name, column)
         self.register_buffer("extent", torch.tensor(scene_size(scene)))
         self.strategy, self.capacity = self.make_strategy(), Capacity()
+        self.light = make_light(config, scene)
         self.near = smallest_depth(scene)
         self._extent = HostValue()
         most = most_octaves(scene.image_pixels or scene.image_size**2)
@@ -82,6 +84,12 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
     @property
     def uses_bfloat16(self) -> bool:
         return False  # there is no network
+
+    def lit(self, rgb: Tensor, transmittance: Tensor, background: Tensor, index: int | None) -> Tensor:
+        if self.light is None:
+            return rgb
+        which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
+        return self.light.lit(rgb, 1 - transmittance, background, which)
 
     # -- the Gaussians ----------------------------------------------------------------------------------------
 

@@ -25,6 +25,8 @@ DEPTH = 0.1
 """Default weight of the depth loss with depth images."""
 SPARSE_DEPTH = 0.001
 """Default weight of the depth loss with points of a reconstruction."""
+LIGHT_REASONS = {True: "light differs between the images", False: "the images are lit alike"}
+"""Reason for or against an appearance of each image, by whether light, exposure or camera differ."""
 SHARED_BY = 2
 """Default of `rays_shared_by` in unbounded scenes, unless it would cut anything off."""
 
@@ -41,6 +43,17 @@ def depth_choice(scene: Scene) -> Choice:
     seen = f"the reconstruction's points are seen in {scene.num_sparse_depths:,} pixels"
     reason = seen if points else DEPTH_REASONS[scene.has_depth]
     return Choice("depth_loss_mult", weight, reason, "depth loss")
+
+
+def appearance_choice(config: TrainConfig, scene: Scene) -> Choice:
+    """Return the kind of appearance that suits the scene: the method's `changing_light` if light differs, else none.
+
+    Args:
+        config: the method's settings.
+        scene: facts about the data.
+    """
+    kind = config.changing_light if scene.appearance_varies else "none"
+    return Choice("appearance", kind, "" if config.changing_light == "none" else LIGHT_REASONS[scene.appearance_varies])
 
 
 @dataclass(frozen=True)
@@ -87,6 +100,7 @@ class Method:
         undecided = left_open(config)
         for rule in (
             depth_choice(scene),
+            appearance_choice(config, scene),
             Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""),
             Choice("samples_per_batch", None, "steps have a number of rays"),
             sampler_choice(config, scene.unbounded),

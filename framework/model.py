@@ -18,8 +18,9 @@ from nerfloom.base.pace import Pace
 from nerfloom.base.step_kind import StepKind
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
+from nerfloom.fields.appearance import Appearance
 from nerfloom.kernels.native import torch_on_one_thread
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, parts
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 
@@ -107,6 +108,11 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
     def groups(self) -> list[ParameterGroup]:
         """Return the parameters, grouped by the `Optimised` settings of the modules that hold them."""
         return parameter_groups(self)
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """Appearance of the training images, of whichever part has one; None if all images have the same."""
+        return next(iter(parts(self, Appearance)), None)
 
     @property
     def samples_per_step(self) -> int | None:

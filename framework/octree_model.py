@@ -38,6 +38,7 @@ class OctreeConfig(
     depth_loss_mult=0.0,
     samples_per_batch=None,
     eval_num_rays_per_chunk=RAYS_AT_ONCE,
+    appearance="none",
 ):
     """Settings of learning an octree's leaves."""
 

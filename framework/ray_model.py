@@ -24,6 +24,7 @@ from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.model import Loss, Model
 from nerfloom.renderable import RendersRays, parts
+from nerfloom.rendering.light import SQUARED, make_light
 from nerfloom.rendering.outputs import Output, empty
 from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.rendering.renderer import Renderer
@@ -56,6 +57,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def __init__(self, config: RayConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
         super().__init__(config, scene)
         self.field, self.sampler, self.renderer = field, sampler, renderer
+        self.light = make_light(config, scene)
         starts = config.rays_shared_by and scene.unbounded and not scene.warped and not isinstance(sampler, SkipsCells)
         self.covisible_space = CovisibleSpace(scene.box) if starts else None
 
@@ -68,7 +70,17 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         """
         rays = rays if self.covisible_space is None else self.covisible_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
-        return self.renderer.render(rays, samples, self.field, background)
+        return self._lit(self.renderer.render(rays, samples, self.field, background), rays, background)
+
+    def _lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:
+        """Return rendered values with the colours that the rays' images show (`light`)."""
+        if self.light is None:
+            return rendered
+        rgb = self.light.lit(rendered.rgb, rendered.accumulation, background, rays.camera_indices, rays.places)
+        lit = replace(rendered, rgb=rgb)
+        if rendered.coarse is None:
+            return lit
+        return replace(lit, extras={**lit.extras, "coarse": self._lit(rendered.coarse, rays, background)})
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
         """Return the terms of `losses` on a batch.
@@ -88,11 +100,13 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
             found, factor = term(shown), factors[term]
             named = found if isinstance(found, dict) else {} if found is None else {term.name: found}
             values |= named if factor == 1 else {name: factor * value for name, value in named.items()}
+        if self.light is not None:
+            values["appearance"] = SQUARED * self.light.penalty()
         return Loss(values, shown.pixels.rgb.detach(), rendered.num_samples)
 
     def _traced(self, batch: PixelBatch) -> TracedError | None:
         """Return the mean squared error of a batch's colours if a native call can compute it; else None."""
-        if not self.plain:
+        if not self.plain or self.light is not None:
             return None
         pixels = PixelTargets(batch.background.repeat_interleave(batch.rays_per_pixel, 0), batch.rgb, batch.weights)
         parts = self.sampler, self.field, self.renderer
@@ -118,6 +132,8 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
                 part: slice | Tensor = slice(start, start + chunk)
                 part = part if places is None else places[part]
                 rays = view.camera.pixel_rays(pixels[part], self.scene.near, self.scene.far, times, offsets)
+                if self.light is not None and self.light.placed:
+                    rays = replace(rays, places=view.camera.places(pixels[part], offsets))
                 # The view's camera has index 0, which must not stand for a training camera.
                 rendered = self.shown(replace(rays, camera_indices=None), background).to_pixels(per_pixel, outputs)
                 rgb[part], depth[part], median[part] = rendered.rgb, rendered.depth, rendered.median_depth
@@ -148,7 +164,7 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
         known = None
         if self._renders_plainly and self.covisible_space is None:
             known = traced_rays(rays, background, self.sampler, self.field, self.renderer)
-        return self.render(rays, background) if known is None else known
+        return self.render(rays, background) if known is None else self._lit(known, rays, background)
 
     def _seen(self, view: View) -> Tensor | None:
         """Return the pixels of a view that may show more than the background; None if unknown."""

@@ -101,13 +101,12 @@ def refinement_choice(scene: Scene, marched: bool) -> Choice:
 
 
 def decide_capture(
-    config: CaptureConfigT, scene: Scene, *own: Choice, proposals: tuple[int, ...] = PROPOSAL_SAMPLES
+    config: CaptureConfigT, scene: Scene, proposals: tuple[int, ...] = PROPOSAL_SAMPLES
 ) -> tuple[CaptureConfigT, list[Decision]]:
-    """Decide the settings shared by methods for captures, and a method's own.
+    """Decide the settings shared by methods for captures.
 
     Args:
         config: the method's settings; open ones are filled in.
-        own: the method's own choices.
         proposals: intervals of each proposal without a time limit.
 
     Returns:
@@ -122,7 +121,6 @@ def decide_capture(
         Choice("contraction", contracted, around),
         Choice("distortion_loss_mult", DISTORTION if contracted else 0.0, reason, "distortion loss"),
         Choice("gradient_scaling", contracted, reason, "gradient scaling near cameras"),
-        *own,
         refinement_choice(scene, config.sampler != "proposal"),
     )
     config, samples = decide_samples(config, MARCHED_SAMPLES) if config.contraction else (config, [])

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Points, Rays, Rendered, Samples, Scene
-from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, VectorConfig
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue
 from nerfloom.data.dataset import Dataset
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
+from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.base import DensityFunction, Field
 from nerfloom.fields.directional import NUM_PROPERTIES, DirectionalConfig, reflection_of
 from nerfloom.fields.distance import Distance, GridDistance, NetworkDistance
@@ -52,8 +52,6 @@ from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.inside import inside_foreground
 from nerfloom.samplers.occupancy import OccupancySampler
 
-APPEARANCE_SIZE = 16
-"""Default length of appearance vectors if the appearance varies."""
 SHARPER = 50.0
 """Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
@@ -72,7 +70,7 @@ class SurfaceConfig(
     HashGridConfig,
     BackgroundConfig,
     RefinedConfig,
-    AppearanceConfig,
+    VectorConfig,
     DirectionalConfig,
     max_num_iterations=20_000,
     learning_rate=AUTO,
@@ -90,7 +88,6 @@ class SurfaceConfig(
     samplers: ClassVar[tuple[str, ...]] = ("occupancy",)
     """Samplers that suit the method."""
     RANGES: ClassVar[dict[str, Range]] = {
-        "appearance_embedding_dim": (0, 2**10),
         "hidden_width": (1, 2**14),
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
@@ -108,8 +105,6 @@ class SurfaceConfig(
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    appearance_embedding_dim: Auto[int] = AUTO
-    """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
     the colour, for GPUs."""
@@ -177,10 +172,7 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         error, start, reason = "absolute", 0.5, "a background could explain what has no texture"
     color = Choice("color_loss", error, reason, "error of colours")
     radius = Choice("start_radius", start, reason, "radius of the first ball")
-    varies = scene.appearance_varies
-    size = APPEARANCE_SIZE if varies else 0
-    light = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, own = fill(config, color, radius, light, refinement_choice(scene, marched=False))
+    config, own = fill(config, color, radius, refinement_choice(scene, marched=False))
     return config, made + samples + own
 
 
@@ -208,10 +200,10 @@ def surface_field(
         scene: properties of the whole scene.
         sharpness: class of the learnt inverse width.
     """
-    box, size, appearance = foreground(config, scene).box, config.appearance_embedding_dim, None
-    if size:
-        appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
+    box = foreground(config, scene).box
     distance, large = make_distance(config, box), config.encoding == "frequency"
+    appearance = make_vectors(config, scene)
+    size = 0 if appearance is None else appearance.size
     return kind(
         box,
         distance,
@@ -332,11 +324,6 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
         """The field."""
         assert isinstance(self.field, SurfaceField)
         return self.field
-
-    @property
-    def appearance(self) -> Appearance | None:
-        """Appearance vectors of the training images; None if there are none."""
-        return self.surface.appearance
 
     @torch.no_grad()
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,6 @@ from nerfloom.base.device import HostValue
 from nerfloom.cameras.refinement import POSE_REASONS, PoseRefinement
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.surfaces import found_surfaces
-from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, affine_colors
 from nerfloom.kernels.images.ssim import photometric_loss
 from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.losses.functions import mean_depth_error
@@ -50,7 +49,6 @@ class GaussianSplattingConfig(SplattingConfig):
     """Settings of gaussian-splatting."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "appearance_rate": AT_LEAST_0,
         "camera_learning_rate": AT_LEAST_0,
         "depth_loss_mult": AT_LEAST_0,
         "field_depth_mult": AT_LEAST_0,
@@ -59,10 +57,6 @@ class GaussianSplattingConfig(SplattingConfig):
     """Allowed range of each numeric setting."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; the absolute error has the weight 1 - ssim_weight."""
-    appearance: Auto[bool] = AUTO
-    """Learn a colour transform for each training image. Default: if light or exposure differ."""
-    appearance_rate: float = 1e-3
-    """Learning rate of the colour transforms."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses; auto: SO3xR3 if a device tracked them, else off."""
     camera_learning_rate: float = 1e-3
@@ -85,10 +79,9 @@ def decide(config: GaussianSplattingConfigT, scene: Scene) -> tuple[GaussianSpla
         scene: facts about the data.
     """
     config, made = decide_splatting(config, scene)
-    varies, poses = scene.appearance_varies, "SO3xR3" if scene.poses == "device" else "off"
+    poses = "SO3xR3" if scene.poses == "device" else "off"
     config, more = fill(
         config,
-        Choice("appearance", varies, LIGHT_REASONS[varies], "colour transforms of images"),
         Choice("depth_loss_mult", 0.1 if scene.has_depth else 0.0, DEPTH_REASONS[scene.has_depth], "depth loss"),
         Choice("field_depth_mult", *GUIDE[scene.unbounded], "weight of a field's distances"),
         Choice("camera_optimizer", poses, POSE_REASONS[scene.poses], "pose refinement"),
@@ -128,10 +121,6 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         self.register_buffer("found", torch.tensor(False))
         self._found, self.found_distances = HostValue(), FoundDistances()
         self.progress = 0.0
-        self.appearance: Appearance | None = None
-        if config.appearance:
-            optimised, share = Optimised("appearance", config.appearance_rate), config.mean_appearance_share
-            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share, config.eval_appearance)
         self.poses: PoseRefinement | None = None
         if config.camera_optimizer in ("SO3xR3", "SE3"):
             self.poses = PoseRefinement(scene.num_cameras, config.camera_optimizer, scene.camera_to_worlds)
@@ -187,10 +176,14 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         shown = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         content = CHANNELS["rgb" if known is None and not self.aligns_normals(self.progress) else "distance"]
-        drawn = self.rasteriser.draw(shown, camera, self._behind(batch), content, self.capacity)
-        rgb = self.lit(drawn.image if content == CHANNELS["rgb"] else drawn.image[..., :3], batch.index)
+        behind = self._behind(batch)
+        drawn = self.rasteriser.draw(shown, camera, behind, content, self.capacity)
+        rgb = drawn.image if content == CHANNELS["rgb"] else drawn.image[..., :3]
+        rgb = self.lit(rgb, drawn.transmittance, behind, batch.index)
         weights = None if batch.weights is None else reduced_weights(batch.weights, octaves)
         terms = {"rgb": photometric_loss(rgb, target, config.ssim_weight, weights)}
+        if self.light is not None:
+            terms["appearance"] = self.light.penalty()
         if known is not None:
             known = reduced_distances(known, octaves)
             terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
@@ -230,13 +223,6 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         unbounded scenes the field's distant surfaces are not reliable."""
         on_surfaces = self._found.of(self.found) and not self.scene.unbounded
         return given if given is not None else 0.0 if on_surfaces else otherwise
-
-    def lit(self, rgb: Tensor, index: int | None) -> Tensor:
-        """Return colours (..., 3) in the appearance of a training image, or the current one if `index` is None."""
-        if self.appearance is None:
-            return rgb
-        which = None if index is None else torch.arange(index, index + 1, device=rgb.device)
-        return affine_colors(rgb, self.appearance(which, 1)[0])
 
     def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
         return poses if self.poses is None else self.poses.refined(poses, training)

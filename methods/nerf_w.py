@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from nerfloom import ConfigError, Decision, Method, Picture, Sampler, Scene, View
-from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.config import AT_LEAST_0, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
 from nerfloom.data.dataset import Dataset
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
+from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
@@ -34,8 +34,6 @@ from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
 
-APPEARANCE_SIZE = 48
-"""Default length of appearance vectors if the appearance varies."""
 PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""
 PAPER_RATE = 0.05
@@ -50,7 +48,7 @@ SAMPLES = 2**15
 class NerfWConfig(
     HashGridConfig,
     CaptureConfig,
-    AppearanceConfig,
+    VectorConfig,
     max_num_iterations=30_000,
     num_rays_per_batch=2_048,
     learning_rate=1e-2,
@@ -59,11 +57,11 @@ class NerfWConfig(
     adam_beta2=0.99,
     adam_eps=1e-15,
     eval_num_rays_per_chunk=4_096,
+    appearance_embedding_dim=48,
 ):
     """Settings of nerf-w; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "appearance_embedding_dim": (0, 2**10),
         "transient_embedding_dim": (1, 2**10),
         "transient_resolution": (1, 2**8),
         "least_uncertainty": (1e-4, 1e4),
@@ -72,9 +70,6 @@ class NerfWConfig(
     """Allowed range of each numeric setting."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the paper's networks, of 8 layers of 256 features."""
-    appearance_embedding_dim: Auto[int] = AUTO
-    """Length of each image's appearance vector. auto: 48, as in the paper, if light or exposure differ between images,
-    otherwise 0."""
     transient_embedding_dim: int = 16
     """Length of an image's transient vectors."""
     transient_resolution: int = 1
@@ -115,16 +110,11 @@ class NerfW(RefinedModel[NerfWConfig], plain=True):
     losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
     renderer: TransientRenderer
 
-    @property
-    def appearance(self) -> Appearance | None:
-        """Appearance vectors of the training images; None if there are none."""
-        return self.field.appearance if isinstance(self.field, (EncodedField, NeRFField)) else None
-
     def render_view(self, view: View, background: Tensor) -> Picture:
         if view.image is None:
             return super().render_view(view, background)
         appearance = self.appearance
-        lit = nullcontext() if appearance is None else appearance.shown(appearance.vectors[view.image].detach())
+        lit = nullcontext() if appearance is None else appearance.shown(appearance.of_images()[view.image].detach())
         with lit, self.renderer.head.shown(view.image):
             return super().render_view(view, background)
 
@@ -151,19 +141,14 @@ def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decisio
     if scene.warped and config.transient_resolution > 1:
         raise ConfigError("--transient-resolution: maps do not work in normalised device coordinates; use 1")
     config, scaled = fill(config, Choice("gradient_scaling", True, "things near one camera may be in its image alone"))
-    varies = scene.appearance_varies
-    size = APPEARANCE_SIZE if varies else 0
-    appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, made = decide_capture(config, scene, appearance)
+    config, made = decide_capture(config, scene)
     config, samples = decide_samples(config, SAMPLES)
     return config, scaled + made + samples
 
 
 def make_field(config: NerfWConfig, scene: Scene) -> EncodedField | NeRFField:
-    """Return the static field, with appearance vectors if their length is not 0."""
-    size, appearance = config.appearance_embedding_dim, None
-    if size:
-        appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
+    """Return the static field, with appearance vectors if the settings have them."""
+    appearance = make_vectors(config, scene)
     if config.encoding == "frequency":
         field = NeRFField(PAPER_WIDTH, contracted=scene.box if config.contraction else None, appearance=appearance)
         field.optimised = _optimised(config)

@@ -27,10 +27,10 @@ from nerfloom import (
     Samples,
     Scene,
 )
-from nerfloom.base.config import AUTO, AppearanceConfig, Auto, Range
+from nerfloom.base.config import AUTO, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
-from nerfloom.fields.appearance import LIGHT_REASONS, Appearance
+from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
@@ -44,8 +44,6 @@ from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.volume import VolumeRenderer, scaled_up_to
 from nerfloom.samplers.choice import batch_choice, make_sampler
 
-APPEARANCE_SIZE = 16
-"""Default length of appearance vectors if the appearance varies."""
 MIN_SAMPLES, MIN_SAMPLES_SECONDS = 2**15, 150.0
 """Minimum samples per training step with an occupancy grid over a box, used up to this many seconds on two threads."""
 THIN = 0.5
@@ -57,7 +55,7 @@ class NerfactoConfig(
     HashGridConfig,
     CaptureConfig,
     FewImagesConfig,
-    AppearanceConfig,
+    VectorConfig,
     DensityDirectionalConfig,
     max_num_iterations=30_000,
     num_rays_per_batch=2_048,
@@ -72,12 +70,9 @@ class NerfactoConfig(
     """Settings of nerfacto; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "appearance_embedding_dim": (0, 2**10),
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
-    appearance_embedding_dim: Auto[int] = AUTO
-    """Length of each image's appearance vector. auto: 16 if light or exposure differ between images, otherwise 0."""
     predict_normals: bool = False
     """Whether to predict normals, which are smoother than those of the density's gradient. --directional reflected
     always does."""
@@ -138,11 +133,6 @@ class Nerfacto(RefinedModel[NerfactoConfig], plain=True):
     )
     steps_repeat = True
 
-    @property
-    def appearance(self) -> Appearance | None:
-        """Appearance vectors of the training images; None if there are none."""
-        return self.field.appearance if isinstance(self.field, EncodedField) else None
-
 
 def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
@@ -155,10 +145,7 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
     """
     if config.predict_normals and config.directional == "reflected":
         raise ConfigError("--directional reflected predicts normals already; leave out --predict-normals")
-    varies = scene.appearance_varies
-    size = APPEARANCE_SIZE if varies else 0
-    appearance = Choice("appearance_embedding_dim", size, LIGHT_REASONS[varies], "appearance features")
-    config, made = decide_capture(config, scene, appearance)
+    config, made = decide_capture(config, scene)
     if config.sampler == "occupancy" and not config.contraction:
         config, samples = fill(config, batch_choice(config, MIN_SAMPLES, MARCHED_SAMPLES, MIN_SAMPLES_SECONDS))
         reason = "most samples of an occupancy grid have small gradients"
@@ -171,10 +158,9 @@ def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[D
 
 
 def make_field(config: NerfactoConfig, scene: Scene) -> EncodedField:
-    """Return a field of one hash grid and two small networks, with appearance vectors if their length is not 0."""
-    opening, size, appearance = config.open_levels_until, config.appearance_embedding_dim, None
-    if size:
-        appearance = Appearance(size, scene.num_cameras, None, config.mean_appearance_share, config.eval_appearance)
+    """Return a field of one hash grid and two small networks, with appearance vectors if the settings have them."""
+    opening, appearance = config.open_levels_until, make_vectors(config, scene)
+    size = 0 if appearance is None else appearance.size
     return EncodedField(
         scene.box,
         HashGrid.of(config, opening),

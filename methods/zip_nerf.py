@@ -9,7 +9,7 @@ Further differences from the paper:
 - The colour loss is the mean squared error.
 - The networks do not get the levels' weights.
 - Gradients near cameras are scaled down (Philip and Deschaintre 2023).
-- An image's exposure is an affine transform of its colours.
+- An image's exposure is an affine function of its colours, by default.
 """
 
 from __future__ import annotations
@@ -17,15 +17,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from torch import Tensor
-
-from nerfloom import ConfigError, Decision, Field, Method, Rays, Rendered, Renderer, Sampler, Scene
-from nerfloom.base.config import AT_LEAST_0, AUTO, AppearanceConfig, Auto, Range
-from nerfloom.base.decisions import Choice, is_open
-from nerfloom.base.optimised import Optimised
+from nerfloom import ConfigError, Decision, Method, Sampler, Scene
+from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.base.decisions import is_open
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.encodings.multisampled import MultisampledHashGrid
-from nerfloom.fields.appearance import AFFINE, LIGHT_REASONS, Appearance, exposed
 from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
@@ -44,7 +40,6 @@ SAMPLES_PER_BATCH = 2**14
 class ZipNeRFConfig(
     HashGridConfig,
     CaptureConfig,
-    AppearanceConfig,
     DensityDirectionalConfig,
     max_num_iterations=25_000,
     num_rays_per_batch=2_048,
@@ -65,13 +60,13 @@ class ZipNeRFConfig(
         "power_ladder": (-1e3, 1),
         "interlevel_blurs": (1e-6, 1),
         "hash_decay_mult": AT_LEAST_0,
-        "exposure_learning_rate": AT_LEAST_0,
         "num_proposal_levels": (1, MAX_LEVELS),
         "proposal_resolutions": (1, MAX_RESOLUTION),
         "proposal_log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
+    changing_light = "affine"
     power_ladder: float = -1.5
     """Exponent of the power ladder that spaces distances if space is contracted."""
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
@@ -79,10 +74,6 @@ class ZipNeRFConfig(
     hash_decay_mult: float = 0.0
     """Weight of the mean square of each level's features. The paper has 0.1, and 10 for objects, which suits its 25,000
     steps of 65,536 rays and its loss with a larger gradient; in runs of minutes, 0.1 costs 0.6 to 1.4 dB."""
-    exposure: Auto[bool] = AUTO
-    """Whether each image has an affine transform of colours. auto: if light or exposure differ between images."""
-    exposure_learning_rate: float = 1e-3
-    """Initial learning rate of these transforms."""
     multisampled_proposals: bool = False
     """Whether proposals are also looked up at several points per interval, in grids of one feature per vertex, as in
     the paper; otherwise at one point, with two features. The paper's grids have up to 512 and 2048 cells per axis."""
@@ -104,33 +95,16 @@ class ZipNeRFConfig(
             )
 
 
-class ZipNeRF(RefinedModel[ZipNeRFConfig]):
-    """A model with exposures per image, refined poses and the distortion loss."""
+class ZipNeRF(RefinedModel[ZipNeRFConfig], plain=True):
+    """A model with refined poses and the distortion loss."""
 
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, Distortion(), PREDICTED_NORMALS)
     steps_repeat = True
 
-    def __init__(self, config: ZipNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer) -> None:
-        super().__init__(config, scene, field, sampler, renderer)
-        self.appearance: Appearance | None = None
-        if config.exposure:
-            rate = config.exposure_learning_rate
-            optimised, share = Optimised("exposures", rate), config.mean_appearance_share
-            self.appearance = Appearance(AFFINE, scene.num_cameras, optimised, share, config.eval_appearance)
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        rendered = super().render(rays, background)
-        if self.appearance is None:
-            return rendered
-        vectors = self.appearance(rays.camera_indices, len(rays))
-        return replace(rendered, rgb=exposed(rendered.rgb, rendered.accumulation, background, vectors))
-
 
 def decide(config: ZipNeRFConfig, scene: Scene) -> tuple[ZipNeRFConfig, list[Decision]]:
     """Return `config` with the settings filled in that depend on the `scene`, and a record of each."""
-    varies = scene.appearance_varies
-    exposure = Choice("exposure", varies, LIGHT_REASONS[varies], "affine exposures")
-    config, made = decide_capture(config, scene, exposure, proposals=PAPER_SAMPLES)
+    config, made = decide_capture(config, scene, PAPER_SAMPLES)
     config, samples = decide_samples(config, SAMPLES_PER_BATCH)
     return config, made + samples
 

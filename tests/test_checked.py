@@ -69,6 +69,13 @@ def test_what_is_no_dictionary_is_refused(values: Any) -> None:
         ({"num_cameras": 6}, "number of cameras, 6, does not match"),
         ({"num_cameras": 10**12, "camera_to_worlds": None}, "number of cameras, 1000000000000"),
         ({"camera_to_worlds": POSES[:, :2]}, "number of cameras, 5, does not match"),
+        ({"exposures": torch.zeros(4)}, "exposures do not match"),
+        ({"exposures": torch.zeros(5).long()}, "exposures do not match"),
+        ({"exposures": torch.full((5,), torch.nan)}, "exposures do not match"),
+        ({"exposures": torch.full((5,), 1e6)}, "or are out of range"),
+        ({"devices": torch.zeros(5)}, "devices do not match"),
+        ({"devices": torch.tensor([0, 0, 5, 0, 0])}, "devices do not match"),
+        ({"devices": torch.tensor([0, 0, -1, 0, 0])}, "devices do not match"),
     ],
 )
 def test_scenes_that_cannot_be_are_refused(changes: dict[str, Any], words: str) -> None:

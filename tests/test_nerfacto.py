@@ -26,7 +26,7 @@ def test_a_bounded_scene_with_exact_poses_needs_little(shared_tiny: Path, tmp_pa
     trainer = captured(shared_tiny, tmp_path, {})
     found = chosen(trainer)
     assert found["contraction"] == found["gradient scaling near cameras"] == found["pose refinement"] == "off"
-    assert found["distortion loss"] == found["appearance features"] == "0"
+    assert (found["distortion loss"], found["appearance"]) == ("0", "none")
     model = trainer.model
     assert not model.field.unbounded
     assert model.poses is None
@@ -55,10 +55,11 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
     found = chosen(trainer)
     assert found["contraction"] == found["gradient scaling near cameras"] == "on"
     assert found["pose refinement"] == "SO3xR3"
-    assert found["appearance features"] == "16"
+    assert found["appearance"] == "vector"
     trainer.train()
     model = trainer.model
     assert bool((model.poses.tangents != 0).any())
+    assert model.field.appearance.size == 16
     assert bool((model.field.appearance.vectors != 0).any())
     report = trainer.train_step()
     assert {"rgb", "interlevel", "distortion"} <= report.losses.keys()
@@ -66,12 +67,12 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
 
 def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
     asked = {
-        "contraction": False, "distortion_loss_mult": 0.0, "appearance_embedding_dim": 0, "camera_optimizer": "off",
+        "contraction": False, "distortion_loss_mult": 0.0, "appearance": "none", "camera_optimizer": "off",
         "gradient_scaling": False,
     }  # fmt: skip
     facts = {"unbounded": True, "poses": "device", "appearance_varies": True}
     trainer = captured(shared_tiny, tmp_path, facts, **asked)
-    assert not {"contraction", "distortion loss", "appearance features", "pose refinement"} & chosen(trainer).keys()
+    assert not {"contraction", "distortion loss", "appearance", "pose refinement"} & chosen(trainer).keys()
     assert trainer.model.poses is None
     assert not trainer.model.field.unbounded
 

@@ -328,7 +328,7 @@ def test_the_inverse_width_stays_between_bounds() -> None:
 
 def test_images_that_are_lit_differently_have_appearances(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = said_otherwise("neus", shared_tiny, tmp_path, {"appearance_varies": True}, max_num_iterations=3)
-    assert chosen(trainer)["appearance features"] == "16"
+    assert chosen(trainer)["appearance"] == "vector"
     trainer.train()
     assert bool((trainer.model.appearance.vectors != 0).any())
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
-from nerfloom.fields.appearance import affine_colors, exposed
 from nerfloom.fields.multisampled import MultisampledField
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points
@@ -19,6 +18,7 @@ from nerfloom.kernels.grids.multisampled_grid import multisampled_grid_reference
 from nerfloom.kernels.grids.multisamples import unit_multisamples_reference
 from nerfloom.kernels.result_cache import Waves
 from nerfloom.methods.zip_nerf import METHOD, ZipNeRFConfig
+from nerfloom.rendering.light import AffineLight
 from nerfloom.rendering.volume import VolumeRenderer
 from nerfloom.testing import check_method
 from nerfloom.training.trainer import Trainer
@@ -32,9 +32,8 @@ captured = partial(said_otherwise, "zip-nerf")
 def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = captured(shared_tiny, tmp_path, {})
     found = chosen(trainer)
-    assert found["contraction"] == found["gradient scaling near cameras"] == found["affine exposures"] == "off"
-    assert found["pose refinement"] == "off"
-    assert found["distortion loss"] == "0"
+    assert found["contraction"] == found["gradient scaling near cameras"] == found["pose refinement"] == "off"
+    assert (found["distortion loss"], found["appearance"]) == ("0", "none")
     model = trainer.model
     assert (model.poses, model.appearance) == (None, None)
     assert not model.field.unbounded
@@ -77,8 +76,8 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
     facts = {"unbounded": True, "poses": "device", "appearance_varies": True, "has_alpha": False}
     trainer = captured(shared_tiny, tmp_path, facts, max_num_iterations=4)
     found = chosen(trainer)
-    assert found["contraction"] == found["gradient scaling near cameras"] == found["affine exposures"] == "on"
-    assert found["pose refinement"] == "SO3xR3"
+    assert found["contraction"] == found["gradient scaling near cameras"] == "on"
+    assert (found["pose refinement"], found["appearance"]) == ("SO3xR3", "affine")
     trainer.train()
     model = trainer.model
     assert isinstance(model.renderer, VolumeRenderer)
@@ -87,14 +86,14 @@ def test_a_capture_gets_what_it_needs(shared_tiny: Path, tmp_path: Path) -> None
     assert bool((model.appearance.vectors != 0).any())
     assert (model.sampler.ladder, model.sampler.blurs) == (-1.5, (0.03, 0.003))
     report = trainer.train_step()
-    assert {"rgb", "interlevel", "distortion"} <= report.losses.keys()
+    assert {"rgb", "interlevel", "distortion", "appearance"} <= report.losses.keys()
 
 
 def test_what_is_asked_for_is_done_and_not_called_a_decision(shared_tiny: Path, tmp_path: Path) -> None:
-    asked = {"contraction": False, "hash_decay_mult": 0.0, "exposure": False, "camera_optimizer": "off"}
+    asked = {"contraction": False, "hash_decay_mult": 0.0, "appearance": "none", "camera_optimizer": "off"}
     facts = {"unbounded": True, "poses": "device", "appearance_varies": True}
     trainer = captured(shared_tiny, tmp_path, facts, **asked)
-    assert not {"contraction", "decay of the grids", "affine exposures", "pose refinement"} & chosen(trainer).keys()
+    assert not {"contraction", "decay of the grids", "appearance", "pose refinement"} & chosen(trainer).keys()
     assert not trainer.model.field.unbounded
 
 
@@ -217,22 +216,9 @@ def test_what_a_march_has_evaluated_is_not_evaluated_again(field: MultisampledFi
 # -- exposures ----------------------------------------------------------------------------------------------------
 
 
-def test_exposures_change_each_sample_and_not_the_background() -> None:
-    """Against the transform of each of three samples before they are composited."""
-    torch.manual_seed(0)
-    weights, colors, background = 0.3 * torch.rand(5, 3), torch.rand(5, 3, 3), torch.rand(5, 3)
-    vectors = 0.2 * torch.randn(5, 12)
-    opacity = weights.sum(1)
-    rgb = (weights[..., None] * colors).sum(1) + (1 - opacity)[:, None] * background
-    changed = torch.stack([affine_colors(c, v) for c, v in zip(colors, vectors, strict=True)])
-    truth = (weights[..., None] * changed).sum(1) + (1 - opacity)[:, None] * background
-    torch.testing.assert_close(exposed(rgb, opacity, background, vectors), truth)
-    assert torch.equal(exposed(rgb, opacity, background, torch.zeros(5, 12)), rgb)
-
-
 @pytest.mark.medium
-def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
-    """With each second image darkened, the transforms of the darker ones darken."""
+def test_images_of_other_exposure_get_functions_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
+    """With each second image darkened, the functions of the darker ones darken, and in the mean they change little."""
     still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set
     dark = torch.arange(len(still)) % 2 == 0
     sizes = still.cameras.widths * still.cameras.heights
@@ -240,13 +226,13 @@ def test_images_of_other_exposure_get_transforms_of_their_own(shared_tiny: Path,
     dimmed[:, :3] = (still.pixels[:, :3] * factors[:, None]).round().to(torch.uint8)
     varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (tmp_path / "run").mkdir()
-    settings = {"max_eval_images": 0, "max_num_iterations": 70, "exposure_learning_rate": 1e-2}
+    settings = {"max_eval_images": 0, "max_num_iterations": 70, "appearance_rate": 1e-2}
     trainer = Trainer.of(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied)
     trainer.train()
-    grey = affine_of(trainer.model.appearance.vectors.detach())
-    assert grey[~dark].mean().item() - grey[dark].mean().item() > 0.1
-
-
-def affine_of(vectors: Tensor) -> Tensor:
-    """The brightness that each transform makes of mid grey."""
-    return torch.stack([affine_colors(torch.full((3,), 0.5), vector).mean() for vector in vectors])
+    light = trainer.model.light.eval()
+    assert isinstance(light, AffineLight)
+    grey, opaque = torch.full((len(still), 3), 0.5), torch.ones(len(still))
+    shown = light.lit(grey, opaque, torch.zeros(3), torch.arange(len(still))).detach().mean(-1)
+    apart = shown[~dark].mean().item() - shown[dark].mean().item()
+    assert apart > 0.1
+    assert abs(shown.mean().item() - 0.5) < apart

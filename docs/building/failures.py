@@ -150,8 +150,8 @@ def exposure() -> tuple[Capture, Capture]:
     good, stops = still(), np.random.default_rng(0).uniform(-1, 1, NUM_TRAIN)
     images = [(image * 2.0 ** (0.45 * stop)).clip(0, 1) for image, stop in zip(good.images, stops, strict=True)]
     return (
-        Capture(images, good.poses, settings={"appearance_embedding_dim": 0}),
-        Capture(images, good.poses, settings={"appearance_embedding_dim": 16}),
+        Capture(images, good.poses, settings={"appearance": "none"}),
+        Capture(images, good.poses, settings={"appearance": "vector"}),
     )
 
 

@@ -147,9 +147,10 @@ class TrainConfig:
     # Values of settings that a method lacks, so that shared code need not know the class of its settings. They have no
     # annotations, so they are neither fields nor flags.
     sampler, bounded_sampler, time_slices, robust, robust_factor = "", "occupancy", 1, "off", 2.0
+    appearance = changing_light = "none"
     background_model, directional = "contraction", "view"
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = False
-    rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = 0
+    rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = appearance_embedding_dim = 0
     depth_loss_mult = free_space_loss_mult = 0.0
 
     def __init_subclass__(cls, **defaults: Any) -> None:
@@ -187,6 +188,12 @@ class TrainConfig:
             raise ConfigError("--learning-rate must be more than 0, and --lr-final in (0, 1]")
 
 
+AppearanceKind = Literal["none", "vector", "affine", "tone", "grid"]
+"""How images of one scene differ in light, exposure and white balance."""
+HeldOutAppearance = Literal["mean", "half", "nearest"]
+"""What held-out images are evaluated with."""
+
+
 @dataclass(frozen=True)
 class RobustConfig(TrainConfig):
     """Settings of a method whose loss of colours uses the weights of pixels."""
@@ -202,7 +209,47 @@ class RobustConfig(TrainConfig):
 
 
 @dataclass(frozen=True)
-class RayConfig(RobustConfig):
+class AppearanceConfig(TrainConfig):
+    """Settings of every method that learns colours.
+
+    `changing_light` is the kind of appearance that `auto` chooses if light differs between the images.
+    """
+
+    RANGES: ClassVar[dict[str, Range]] = {"appearance_rate": AT_LEAST_0, "mean_appearance_share": (0, 1)}
+    """Allowed ranges."""
+    appearance: Auto[AppearanceKind] = AUTO
+    """How images differ. none: not at all; vector: by an input of the colour network; affine: by an affine function of
+    colours; tone: by exposure and white balance, through a tone curve of each camera; grid: by affine functions that
+    vary with position and brightness. auto: vector or affine if light or exposure differ and the method has it by
+    default, else none."""
+    appearance_rate: float = 1e-3
+    """Initial learning rate of affine functions, exposures, tone curves and grids."""
+    eval_appearance: HeldOutAppearance = "mean"
+    """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
+    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
+    nearest."""
+    mean_appearance_share: float = 0.25
+    """Probability of training an image with the mean appearance, so that the model learns to render it."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.appearance == "vector" and not self.appearance_embedding_dim:
+            raise ConfigError("--appearance vector: no network of this method takes vectors; take affine, tone or grid")
+
+
+@dataclass(frozen=True)
+class VectorConfig(AppearanceConfig):
+    """Settings of a method whose colour network can take a vector of each image."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"appearance_embedding_dim": (1, 2**10)}
+    """Allowed ranges."""
+    appearance_embedding_dim: int = 16
+    """Length of each image's vector (--appearance vector)."""
+    changing_light = "vector"
+
+
+@dataclass(frozen=True)
+class RayConfig(RobustConfig, AppearanceConfig):
     """Settings of every method that casts rays."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -256,24 +303,6 @@ class SourceViewsConfig(RayConfig):
     """Number of images that a view is rendered from."""
     images_per_batch: int = 4
     """Number of images that a training step draws pixels from; each is rendered from other images of its scene."""
-
-
-HeldOutAppearance = Literal["mean", "half", "nearest"]
-"""What held-out images are evaluated with."""
-
-
-@dataclass(frozen=True)
-class AppearanceConfig(TrainConfig):
-    """Settings of a method that learns an appearance for each image."""
-
-    RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
-    """Allowed ranges."""
-    eval_appearance: HeldOutAppearance = "mean"
-    """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
-    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
-    nearest."""
-    mean_appearance_share: float = 0.25
-    """Probability of training an image with the mean appearance, so that the model learns to render it."""
 
 
 def _check_range(name: str, value: Any, least: float, most: float) -> None:

@@ -26,7 +26,7 @@ SETTINGS = {
     "num-coarse-samples": "--num-coarse-samples",
     "num-importance-samples": "--num-fine-samples",
     "appearance-embed-dim": "--appearance-embedding-dim",
-    "use-appearance-embedding": "--appearance-embedding-dim",
+    "use-appearance-embedding": "--appearance",
     "use-average-appearance-embedding": "--eval-appearance",
     "disable-scene-contraction": "--contraction",
     "use-gradient-scaling": "--gradient-scaling",
@@ -43,7 +43,7 @@ SETTINGS = {
 }
 """Last part of a nerfstudio flag -> the equivalent flag here. Flags of the same name need no entry."""
 TAKEN = (
-    "appearance-embed-dim", "background-color", "base-res", "camera-optimizer.mode", "distortion-loss-mult",
+    "background-color", "base-res", "camera-optimizer.mode", "distortion-loss-mult",
     "downscale-factor", "eval-interval", "eval-mode", "eval-num-rays-per-chunk", "features-per-level",
     "log2-hashmap-size", "max-gs-num", "max-num-iterations", "max-res", "num-coarse-samples", "num-importance-samples",
     "num-levels", "num-nerf-samples-per-ray", "num-proposal-samples-per-ray", "orientation-loss-mult",

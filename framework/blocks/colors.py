@@ -18,6 +18,7 @@ from torch import Tensor
 
 from nerfloom.blocks.block import IDENTITY, Affine
 from nerfloom.kernels.splats.project import DC
+from nerfloom.rendering.light import transformed, without_background
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians
 
@@ -42,17 +43,6 @@ def fitted_color(seen: Tensor, wanted: Tensor, ridge: float = RIDGE) -> Tensor:
     return torch.linalg.solve(moments, products.T).T
 
 
-def without_background(picture: Picture, background: Tensor) -> Tensor:
-    """Return colour times opacity, and opacity, of a picture's pixels, (H, W, 4).
-
-    Args:
-        picture: the picture.
-        background: (3,) the colour that it was rendered over.
-    """
-    behind = (1 - picture.accumulation)[..., None] * background
-    return torch.cat([picture.rgb - behind, picture.accumulation[..., None]], dim=-1)
-
-
 def recolored(picture: Picture, color: Affine, background: Tensor) -> Picture:
     """Return a picture in other colours. The background keeps its own.
 
@@ -62,8 +52,8 @@ def recolored(picture: Picture, color: Affine, background: Tensor) -> Picture:
         background: (3,) the colour that it was rendered over.
     """
     matrix = torch.tensor(color, dtype=picture.rgb.dtype, device=picture.rgb.device)
-    behind = (1 - picture.accumulation)[..., None] * background
-    return replace(picture, rgb=without_background(picture, background) @ matrix.T + behind)
+    seen = without_background(picture.rgb, picture.accumulation, background)
+    return replace(picture, rgb=picture.rgb + transformed(seen, matrix) - seen[..., :3])
 
 
 def recolored_gaussians(gaussians: Gaussians, color: Affine) -> Gaussians:

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.blocks.block import TrainedBlock
-from nerfloom.blocks.colors import fitted_color, matching_order, recolored, without_background
+from nerfloom.blocks.colors import fitted_color, matching_order, recolored
 from nerfloom.blocks.composed import Blocks
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
+from nerfloom.rendering.light import without_background
 
 MAX_VIEWS = 6
 """Maximum number of images by which two blocks are matched."""
@@ -38,7 +39,8 @@ def matched(model: Blocks, cameras: Cameras, times: Tensor | None) -> list[Train
             view, background = _small(View.of(cameras, index, times)), model.background
             wanted = recolored(model.picture_of(reference, view, background), found[reference].color, background)
             seen = model.picture_of(number, view, background)
-            pixels.append([without_background(each, background).reshape(-1, 4) for each in (seen, wanted)])
+            both = [without_background(each.rgb, each.accumulation, background) for each in (seen, wanted)]
+            pixels.append([each.reshape(-1, 4) for each in both])
         seen_pixels, wanted_pixels = (torch.cat(each).cpu() for each in zip(*pixels, strict=True))
         color = fitted_color(seen_pixels, wanted_pixels[:, :3])
         found[number] = replace(found[number], color=tuple(map(tuple, color.tolist())))

@@ -241,12 +241,26 @@ class Cameras:
         `flat`, `near`, `far`, `times` and `subpixels` are as in `pixel_rays`.
         """
         check_indices(flat, self.offsets[-1], "pixels")
+        return self.rays(*self._positions(flat, subpixels), near, far, times)
+
+    def places(self, flat: Tensor, subpixels: Tensor = CENTER) -> Tensor:
+        """Return the positions (P * K, 2) of the rays of pixels in their images, from left and top edge, 0 to 1.
+
+        Args:
+            flat: (P,) int64 numbers of the pixels.
+            subpixels: (K, 2) positions in a pixel, as in `pixel_rays`.
+        """
+        indices, columns, rows = self._positions(flat, subpixels)
+        return torch.stack([(columns + 0.5) / self.widths[indices], (rows + 0.5) / self.heights[indices]], dim=-1)
+
+    def _positions(self, flat: Tensor, subpixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return camera, column and row (P * K,) of the rays of pixels."""
         indices = torch.searchsorted(self.offsets, flat, right=True) - 1
         within, widths = flat - self.offsets[indices], self.widths[indices]
         subpixels = subpixels.to(self.fx)
         columns = ((within % widths)[:, None] + subpixels[:, 0]).reshape(-1)
         rows = ((within // widths)[:, None] + subpixels[:, 1]).reshape(-1)
-        return self.rays(indices.repeat_interleave(len(subpixels)), columns, rows, near, far, times)
+        return indices.repeat_interleave(len(subpixels)), columns, rows
 
     def image_pixels(self, index: int) -> Tensor:
         """Return the numbers (H * W,) of the pixels of image `index`, row by row, consecutive over all images."""

@@ -99,7 +99,7 @@ def _command(arguments: list[str]) -> None:
         say(f"--max-error {bound:.2g}: colours off by at most {worst:.2g} (measured), {faster:.2f} x as fast as exact")
     if flags.eval_appearance in ("half", "nearest") and evaluation.eval_appearance is None:
         asked = flags.eval_appearance
-        say(f"--eval-appearance {asked}: this run has no appearance vectors; whole images were evaluated")
+        say(f"--eval-appearance {asked}: this run has one appearance for all images; whole images were evaluated")
     say(f"LPIPS: {evaluation.lpips_note}")
     if evaluation.masks_note is not None:
         say(f"masks: {evaluation.masks_note}")

@@ -20,7 +20,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from nerfloom.base.config import AppearanceConfig, RayConfig, RobustConfig, TrainConfig
+from nerfloom.base.config import AppearanceConfig, RayConfig, RobustConfig, TrainConfig, VectorConfig
 from nerfloom.cli.flag_help import plain_flags
 from nerfloom.data.parsed_scene import DataParser
 from nerfloom.losses.few_images import FewImagesConfig
@@ -42,7 +42,7 @@ GROUPS: dict[str, tuple[str | type, ...]] = {
     "background": (BackgroundConfig,),
     "ray": (RayConfig,),
     "robust": (RobustConfig,),
-    "appearance": (AppearanceConfig,),
+    "appearance": (AppearanceConfig, VectorConfig),
     "few images": (FewImagesConfig,),
     "motion": (MotionConfig,),
     "teacher": ("teacher", "teacher_share", "teacher_until"),

@@ -22,6 +22,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.coverage import pixels_with_rays
 from nerfloom.data.decoding import Decoded, ImageFiles, decode
 from nerfloom.data.depths import read_depths
+from nerfloom.data.exposure import devices_of, exposures_of, read_taken
 from nerfloom.data.light_spread import APPEARANCE_STOPS, light_spread
 from nerfloom.data.motion_bound import MotionBound
 from nerfloom.data.names_on_disk import nearest_on_disk
@@ -247,6 +248,8 @@ def load_dataset(
     several = parsed.num_scales > 1
     parsed = replace(parsed, cameras=cameras, downscale_factor=1, num_scales=1)
     parsed = parsed if len(decoded.left) == len(sizes) else parsed[decoded.left]
+    if parsed.taken is None and split == "train":
+        parsed = replace(parsed, taken=read_taken(parsed.image_paths))
     dataset = assemble(parsed, decoded, split, masks)
     return replace(dataset, reductions=reductions[decoded.left]) if several else dataset
 
@@ -264,8 +267,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     Raises:
         DataError: if no pixel has a ray, or a depth image is invalid.
     """
-    cameras = parsed.cameras
-    light = None if decoded.pixels.shape[1] == 4 else decoded.light
+    cameras, light = parsed.cameras, None if decoded.pixels.shape[1] == 4 else decoded.light
     parsed, kept, opaque = _with_masks(parsed, None if masks == "off" else decoded.kept, masks)
     names = tuple(path.name for path in parsed.image_paths)
     visible = pixels_with_rays(cameras, names, split)
@@ -293,6 +295,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         num_sparse_depths=0 if sparse is None else len(sparse),
         num_times=0 if parsed.times is None else len(parsed.times.unique()),
         num_scenes=1 if parsed.scene_indices is None else len(parsed.scene_indices.unique()),
+        exposures=exposures_of(parsed.taken),
+        devices=devices_of(parsed.taken, cameras),
     )
     return Dataset(
         pixels=decoded.pixels,

@@ -12,6 +12,7 @@ from torch import Tensor
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
+from nerfloom.data.exposure import Taken
 from nerfloom.data.scene import PoseSource
 from nerfloom.data.tracks import Observations, Sightings
 
@@ -68,6 +69,8 @@ class ParsedScene:
     """(M,) int64 index of the scene in each image; None if there is only one scene."""
     source_images: Tensor | None = None
     """(M,) bool, source images, which a method may render others from; they are not evaluated. None without."""
+    taken: tuple[Taken, ...] | None = None
+    """How each image was taken, its exposure and device; None to read it from the images' EXIF."""
 
     @property
     def placement(self) -> Placement:
@@ -98,6 +101,7 @@ class ParsedScene:
             sightings=None if self.sightings is None else self.sightings.of_images(index),
             scene_indices=None if self.scene_indices is None else self.scene_indices[index],
             source_images=None if self.source_images is None else self.source_images[index],
+            taken=None if self.taken is None else tuple(self.taken[i] for i in chosen),
         )
 
 

@@ -18,6 +18,8 @@ MAX_CAMERAS = 10**7
 """Maximum number of cameras of a scene read from a file."""
 MAX_SIZE = 10**9
 """Maximum side of an image of a scene read from a file, pixels."""
+MAX_EXPOSURE = 100.0
+"""Maximum exposure of an image of a scene read from a file, stops."""
 MAX_COORDINATE = 1e9
 """Maximum coordinate of the box of a scene read from a file, scene units."""
 
@@ -60,6 +62,10 @@ class Scene:
     """Number of distinct times of the training images; 0 if they have none."""
     num_scenes: int = 1
     """Number of scenes in the training images; more than one only for methods that learn from several scenes."""
+    exposures: Tensor | None = None
+    """(num_cameras,) exposure of the training images as their files state it, stops from the mean; None if unknown."""
+    devices: Tensor | None = None
+    """(num_cameras,) int64 index of the device that took each training image; None if one took all."""
 
     @classmethod
     def of(cls, facts: Any) -> Scene:
@@ -78,6 +84,15 @@ class Scene:
             raise ValueError("the scene's box is empty or too large")
         if not 1 <= count <= MAX_CAMERAS or (poses is not None and poses.shape != (count, 3, 4)):
             raise ValueError(f"the scene's number of cameras, {shown(count)}, does not match its poses")
+        for name, kind, low, high in (
+            ("exposures", torch.float32, -MAX_EXPOSURE, MAX_EXPOSURE),
+            ("devices", torch.int64, 0, count - 1),
+        ):
+            values = getattr(scene, name)
+            if values is None:
+                continue
+            if values.shape != (count,) or values.dtype != kind or not bool(((values >= low) & (values <= high)).all()):
+                raise ValueError(f"the scene's {name} do not match its number of cameras, or are out of range")
         if not 0 <= scene.near < scene.far < math.inf or not 1 <= scene.image_size <= MAX_SIZE:
             raise ValueError(
                 f"the scene has near {scene.near}, far {scene.far} and images of {shown(scene.image_size)} pixels; "
@@ -87,5 +102,5 @@ class Scene:
 
     def to(self, device: torch.device | str) -> Scene:
         """Return the scene on `device`."""
-        given = None if self.camera_to_worlds is None else self.camera_to_worlds.to(device)
-        return replace(self, box=self.box.to(device), camera_to_worlds=given)
+        tensors = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **tensors)

@@ -110,6 +110,7 @@ class PixelSource(BatchSource):
         clear: (M,) distances from cameras that images show to be empty; None if they are not used.
         num_images: number of images that the pixels of a step come from; None for all.
         contradicted: tiles that do not count; None if all do.
+        placed: whether rays have their positions in the images (`Rays.places`).
     """
 
     def __init__(
@@ -121,8 +122,9 @@ class PixelSource(BatchSource):
         clear: Tensor | None = None,
         num_images: int | None = None,
         contradicted: LeftOutTiles | None = None,
+        placed: bool = False,
     ) -> None:
-        self.clear, self.num_images, self.contradicted = clear, num_images, contradicted
+        self.clear, self.num_images, self.contradicted, self.placed = clear, num_images, contradicted, placed
         self.dataset, self.background, self.seed = dataset, background, seed
         self.keypoints = keypoints if dataset.sparse_depth is not None else 0.0
         self.stream: PixelStream | None = None
@@ -140,6 +142,9 @@ class PixelSource(BatchSource):
             weights = counting if batch.weights is None else counting * batch.weights
             distances = None if batch.distances is None else counting * batch.distances  # 0 is unknown
             batch = replace(batch, weights=weights, distances=distances)
+        if self.placed:
+            places = self.dataset.cameras.places(batch.pixels, offsets)
+            batch = replace(batch, rays=replace(batch.rays, places=places))
         if self.clear is None or batch.rays.camera_indices is None:
             return batch
         return replace(batch, clear=self.clear[batch.rays.camera_indices[:: batch.rays_per_pixel]])
@@ -253,7 +258,8 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
     clear = None
     if config.free_space_loss_mult > 0 and not dataset.scene.warped:
         clear = clear_distances(dataset.cameras, dataset.sparse_depth, dataset.scene.near, dataset.scene.far)
-    return PixelSource(dataset, background, config.machine.seed, keypoints, clear, num_images, contradicted)
+    placed = config.appearance == "grid"
+    return PixelSource(dataset, background, config.machine.seed, keypoints, clear, num_images, contradicted, placed)
 
 
 def _contradicted(kind: str, dataset: Dataset, config: TrainConfig) -> LeftOutTiles | None:

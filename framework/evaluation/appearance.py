@@ -67,7 +67,7 @@ def held_out_appearance(model: Renderable, dataset: Dataset, index: int, backgro
     else:
         known = replace(model.scene, camera_to_worlds=training_poses(model))
         nearest = nearest_camera(known, dataset.view(index))
-        with appearance.shown(appearance.vectors[nearest].detach()):
+        with appearance.shown(appearance.of_images()[nearest].detach()):
             yield
 
 
@@ -127,6 +127,8 @@ def fit_appearance(
 ) -> Tensor | None:
     """Fit the appearance vector that brings the model's colours closest to given pixels.
 
+    It has nothing that depends on the position in an image: the pixels may be of a part of one.
+
     Args:
         model: the model; its parameters are not changed.
         dataset: the images, with cameras in the frame of the model's scene.
@@ -145,12 +147,11 @@ def fit_appearance(
         start = _closest(model, appearance, dataset, pixels, background)
     vector = start.detach().clone().requires_grad_()
     if len(pixels):
-        with appearance.shown(vector):
-            if isinstance(model, RendersRays):
-                _fit(model, dataset, pixels, vector, background)
-            else:
-                _fit_view(model, dataset, pixels, vector, background)
-    return vector.detach()
+        if isinstance(model, RendersRays):
+            _fit(model, appearance, dataset, pixels, vector, background)
+        else:
+            _fit_view(model, appearance, dataset, pixels, vector, background)
+    return appearance.of_any_view(vector.detach())
 
 
 @torch.no_grad()
@@ -160,16 +161,17 @@ def _closest(model: Renderable, appearance: Appearance, dataset: Dataset, pixels
     The network learns the mean vector separately (`Appearance`), so vectors near the mean say little about the light of
     others, and a descent from there may end at a poor minimum.
     """
-    mean = appearance.vectors.mean(0)
+    own = appearance.of_images()
+    mean = own.mean(0)
     if not len(pixels) or not isinstance(model, RendersRays):
         return mean
-    candidates = torch.cat([mean[None], _some(appearance.vectors, MAX_CANDIDATES)])
+    candidates = torch.cat([mean[None], _some(own, MAX_CANDIDATES)])
     some = _some(pixels, PIXELS)
     batch = gather_batch(dataset, some, background.repeat(len(some), 1))
     rays, errors = replace(batch.rays, camera_indices=None), []
     with model.rendering(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for vector in candidates:
-            with appearance.shown(vector):
+            with appearance.shown(appearance.of_any_view(vector)):
                 errors.append(mean_squared_error(model.render(rays, batch.background).rgb, batch.rgb))
     return candidates[torch.stack(errors).argmin()]
 
@@ -186,19 +188,25 @@ def _left_pixels(dataset: Dataset, index: int) -> Tensor:
     return pixels.reshape(-1) if kept is None else pixels[kept[:, : width // 2]]
 
 
-def _fit(model: RendersRays, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
+def _fit(
+    model: RendersRays, appearance: Appearance, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor
+) -> None:
+    """Fit the vector of a model that casts rays, by some pixels a step."""
     optimizer = torch.optim.Adam([vector], lr=RATE)
     generator = torch.Generator().manual_seed(0)
     with model.rendering(), torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         for _ in range(STEPS):
             chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=generator).to(pixels.device)]
             batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
-            rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
+            with appearance.shown(appearance.of_any_view(vector)):
+                rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
             (vector.grad,) = torch.autograd.grad(mean_squared_error(rendered.rgb, batch.rgb), [vector])
             optimizer.step()
 
 
-def _fit_view(model: Renderable, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor) -> None:
+def _fit_view(
+    model: Renderable, appearance: Appearance, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor
+) -> None:
     """Fit the vector of a model that draws whole images, by pixels of one image."""
     optimizer = torch.optim.Adam([vector], lr=RATE)
     index = int(torch.searchsorted(dataset.cameras.offsets.to(pixels), pixels[0], right=True)) - 1
@@ -207,6 +215,7 @@ def _fit_view(model: Renderable, dataset: Dataset, pixels: Tensor, vector: Tenso
     true = gather_batch(dataset, pixels, background.repeat(len(pixels), 1)).rgb
     with model.rendering(), torch.enable_grad():
         for _ in range(STEPS):
-            shown = model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there]
+            with appearance.shown(appearance.of_any_view(vector)):
+                shown = model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there]
             (vector.grad,) = torch.autograd.grad(mean_squared_error(shown, true), [vector])
             optimizer.step()

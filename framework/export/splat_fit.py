@@ -72,7 +72,7 @@ SETTINGS: dict[str, Any] = {
     "opacity_penalty": 0.0,
     "scale_penalty": 0.0,
     # Pictures of a field have one light and known poses.
-    "appearance": False,
+    "appearance": "none",
     "camera_optimizer": "off",
     "depth_loss_mult": 0.0,
     "field_depth_mult": 0.0,

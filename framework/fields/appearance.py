@@ -1,4 +1,4 @@
-"""Appearance vectors (NeRF-W), for images of a scene that differ in light, exposure or camera."""
+"""Appearance of images of one scene: a row of numbers for each, such as the vectors of NeRF-W."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nerfloom.base.config import HeldOutAppearance
+from nerfloom.base.config import AppearanceConfig, HeldOutAppearance
 from nerfloom.base.optimised import Optimised
-
-AFFINE = 12
-"""Length of an appearance vector that holds an affine transform of colours."""
-LIGHT_REASONS = {True: "light differs between the images", False: "the images are lit alike"}
-"""Reason for or against an appearance vector per image, by whether light, exposure or camera differ."""
+from nerfloom.data.scene import Scene
 
 
 class Appearance(nn.Module):
     """A learnt vector for each image, an input of the colour network: NeRF-W (Martin-Brualla et al. 2021), section 4.1.
+
+    Subclasses may read a vector as parameters of a function of rendered colours (`rendering.light`).
 
     Evaluation uses the mean vector, which belongs to no image. A network that has never seen the mean vector may render
     anything for it, and the error grows with the distance between the vectors. So in a fraction of the training steps
@@ -60,15 +58,28 @@ class Appearance(nn.Module):
         """
         if camera_indices is not None:
             # Not `vectors[camera_indices]`: its gradient depends on the order of the threads' sums.
-            return functional.embedding(camera_indices, self._own_or_mean())
-        return (self.vectors.detach().mean(0) if self._shown is None else self._shown).expand(count, -1)
+            return functional.embedding(camera_indices, self.own_or_mean())
+        return self.current().expand(count, -1)
 
-    def _own_or_mean(self) -> Tensor:
+    def of_images(self) -> Tensor:
+        """Return the vector of each training image (M, D), with a gradient."""
+        return self.vectors
+
+    def own_or_mean(self) -> Tensor:
         """Return the vector of each image in this step (M, D); the mean has no gradient."""
+        own = self.of_images()
         if not self.training or not self.mean_share:
-            return self.vectors
-        has_mean = torch.rand(len(self.vectors), 1, device=self.vectors.device) < self.mean_share
-        return torch.where(has_mean, self.vectors.detach().mean(0), self.vectors)
+            return own
+        has_mean = torch.rand(len(own), 1, device=own.device) < self.mean_share
+        return torch.where(has_mean, own.detach().mean(0), own)
+
+    def current(self) -> Tensor:
+        """Return the vector (D,) of evaluation: the one set by `shown`, or the mean without a gradient."""
+        return self.of_images().detach().mean(0) if self._shown is None else self._shown
+
+    def of_any_view(self, vector: Tensor) -> Tensor:
+        """Return a vector (D,) without what depends on the position in an image; here `vector` itself."""
+        return vector
 
     @contextmanager
     def shown(self, vector: Tensor) -> Iterator[None]:
@@ -80,31 +91,14 @@ class Appearance(nn.Module):
             self._shown = previous
 
 
-def affine_colors(rgb: Tensor, vector: Tensor) -> Tensor:
-    """Return colours as an image with another light or exposure shows them: rgb + A rgb + b, unchanged by zeros.
+def make_vectors(config: AppearanceConfig, scene: Scene) -> Appearance | None:
+    """Return the vectors of the training images, an input of a colour network; None if the settings have none.
 
     Args:
-        rgb: (..., 3) colours.
-        vector: (AFFINE,) rows of the matrix [A, b] (3, 4).
+        config: the method's settings, decided.
+        scene: facts about the data.
     """
-    affine = vector.view(3, 4)
-    return rgb + rgb @ affine[:, :3].T + affine[:, 3]
-
-
-def exposed(rgb: Tensor, opacity: Tensor, background: Tensor, vectors: Tensor) -> Tensor:
-    """Return the colours of rays as their images show them: `affine_colors` of the scene without the background.
-
-    The transform is applied to the composited colour, which equals transforming the colour of each sample.
-
-    Args:
-        rgb: (R, 3) composited colours over the background.
-        opacity: (R,) opacity of the scene.
-        background: (R, 3) or (3,) colour of the background.
-        vectors: (R, AFFINE) rows of the matrix [A, b] (3, 4) of each ray's image.
-
-    Returns:
-        (R, 3) colours.
-    """
-    affine, seen = vectors.view(-1, 3, 4), opacity[:, None]
-    scene = rgb - (1 - seen) * background
-    return rgb + (affine[..., :3] * scene[:, None]).sum(-1) + affine[..., 3] * seen
+    if config.appearance != "vector":
+        return None
+    size, share = config.appearance_embedding_dim, config.mean_appearance_share
+    return Appearance(size, scene.num_cameras, None, share, config.eval_appearance)

@@ -33,6 +33,8 @@ class Rays:
     """(R,) time in [0, 1] of a moving scene."""
     camera_indices: Tensor | None = None
     """(R,) index of the training camera."""
+    places: Tensor | None = None
+    """(R, 2) position in the camera's image from its left and top edge, 0 to 1 (`Cameras.places`)."""
 
     def __post_init__(self) -> None:
         for name, value in (("nears", 0.0), ("fars", torch.inf)):

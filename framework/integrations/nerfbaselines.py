@@ -180,7 +180,7 @@ class NerfloomMethod:
     def get_train_embedding(self, index: int) -> np.ndarray | None:
         """(D,) the appearance of training photograph `index`; None for methods without appearance."""
         appearance = appearance_of(self._model)
-        return None if appearance is None else appearance.vectors[index].detach().cpu().numpy()
+        return None if appearance is None else appearance.of_images()[index].detach().cpu().numpy()
 
     def optimize_embedding(self, dataset: DatasetDict, *, embedding: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Optimise the appearance of an image that is not a training image.

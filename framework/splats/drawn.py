@@ -43,11 +43,13 @@ class DrawsGaussians(Renderable):
     def look(self) -> Look:
         """Return the settings of drawing."""
 
-    def lit(self, rgb: Tensor, index: int | None) -> Tensor:
-        """Return colours (..., 3) with the appearance of an image; unchanged by default.
+    def lit(self, rgb: Tensor, transmittance: Tensor, background: Tensor, index: int | None) -> Tensor:
+        """Return colours (H, W, 3) with the appearance of an image; unchanged by default.
 
         Args:
-            rgb: (..., 3) drawn colours.
+            rgb: (H, W, 3) drawn colours of all pixels.
+            transmittance: (H, W) share of the background's light that arrives.
+            background: (3,) colour behind everything.
             index: number of a training image; None for the current appearance.
         """
         return rgb
@@ -69,12 +71,13 @@ class DrawsGaussians(Renderable):
         """
         camera = self._camera(view)
         picture = draw_view(gaussians, camera, view.stride, background, self.scene.far, self.rasteriser)
-        return replace(picture, rgb=self.lit(picture.rgb, None))
+        return replace(picture, rgb=self.lit(picture.rgb, 1 - picture.accumulation, background, None))
 
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
         if self._prepared is None or self._prepared.time != view.time:
             self._prepared = PreparedGaussians(self.gaussians(view.time), self.rasteriser, view.time)
-        return self.lit(self._prepared.colors(self._camera(view), view.stride, background), None)
+        rgb, transmittance = self._prepared.draw(self._camera(view), view.stride, background)
+        return self.lit(rgb, transmittance, background, None)
 
     def _camera(self, view: View) -> SplatCamera:
         return splat_camera(view.camera, smallest_depth(self.scene), self.look())

@@ -29,16 +29,20 @@ class PreparedGaussians:
         self.pictures = 0
 
     @torch.no_grad()
-    def colors(self, camera: SplatCamera, stride: int, background: Tensor) -> Tensor:
-        """Draw the colours (H, W, 3) of a picture.
+    def draw(self, camera: SplatCamera, stride: int, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw the colours of a picture.
 
         Args:
             camera: the whole image.
             stride: distance between the rows and columns that are kept, pixels.
             background: (3,) colour behind everything.
+
+        Returns:
+            Colours (H, W, 3), and the share (H, W) of the background's light that arrives.
         """
         self.pictures += 1
         if self.pictures == 2:
             self.prepared = self.rasteriser.prepared(self.gaussians)
         project = self.prepared or (lambda camera: self.rasteriser.project(self.gaussians, camera))
-        return every(self.rasteriser.draw(project(camera), camera, background).image, stride)
+        drawn = self.rasteriser.draw(project(camera), camera, background)
+        return every(drawn.image, stride), every(drawn.transmittance, stride)

@@ -65,6 +65,7 @@ class SplattingConfig(
         "reduced_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
+    changing_light = "affine"
     degree: int = 3
     """Highest degree of the spherical harmonics of colours."""
     antialiased: bool = False

@@ -24,7 +24,7 @@ from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.method import Method
 from nerfloom.model import LearnsMotion, Model
 from nerfloom.ray_model import RayModel
-from nerfloom.renderable import HasAppearance, RefinesPoses, RendersFromImages, parts
+from nerfloom.renderable import RefinesPoses, RendersFromImages, parts
 from nerfloom.samplers.base import Carved, SkipsCells
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.folded_poses import angle_between, folded_neighbours, thumbnail
@@ -128,7 +128,7 @@ def profile_of(
         decisions.append(Decision("rays start", where, reason))
     if scene.moving and not isinstance(model, LearnsMotion):
         decisions.append(Decision("times", "ignored", f"{method} learns a still scene: moving objects are blurred"))
-    if scene.appearance_varies and not isinstance(model, HasAppearance):
+    if scene.appearance_varies and config.changing_light == config.appearance == "none":
         decisions.append(Decision("light that differs", "ignored", f"{method} learns one light for all photographs"))
     up = None if scene.poses != "photographs" or scene.num_scenes > 1 else sideways_up(dataset.cameras.camera_to_worlds)
     if up is not None and float(up[2]) > 0.9:

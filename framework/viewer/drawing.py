@@ -82,9 +82,11 @@ def _kept(
 
 def _appearance(loaded: Loaded, image: int | None) -> AbstractContextManager[None]:
     appearance = appearance_of(loaded.model)
-    if appearance is None or image is None or not 0 <= image < len(appearance.vectors):
+    if appearance is None:
         return nullcontext()
-    return shown_appearance(loaded.model, appearance.vectors[image].detach())
+    own = appearance.of_images().detach()
+    vector = own.mean(0) if image is None or not 0 <= image < len(own) else own[image]
+    return shown_appearance(loaded.model, appearance.of_any_view(vector))  # a piece does not know its position
 
 
 def number_kept(kept: Arrays) -> str | None:

@@ -60,10 +60,11 @@ class Panel:
 
     def _add_appearance(self) -> Any:
         appearance = appearance_of(self._queue.loaded.model)
-        if appearance is None or not len(appearance.vectors):
+        count = 0 if appearance is None else len(appearance.of_images())
+        if not count:
             return None
         return self._client.gui.add_slider(
-            "Appearance", -1, len(appearance.vectors) - 1, 1, -1, hint=f"Number of a training image; -1: {MEAN}"
+            "Appearance", -1, count - 1, 1, -1, hint=f"Number of a training image; -1: {MEAN}"
         )
 
     def next_output(self) -> None:

@@ -10,9 +10,9 @@ from nerfloom.blocks.colors import (
     matching_order,
     recolored,
     recolored_gaussians,
-    without_background,
 )
 from nerfloom.kernels.splats.project import DC
+from nerfloom.rendering.light import without_background
 from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import Gaussians
 
@@ -58,7 +58,7 @@ def test_without_pixels_colours_stay() -> None:
 def test_a_picture_changes_and_its_background_does_not() -> None:
     shown, background = picture()
     found = recolored(shown, COLOR, background)
-    before, after = without_background(shown, background), without_background(found, background)
+    before, after = (without_background(each.rgb, each.accumulation, background) for each in (shown, found))
     torch.testing.assert_close(after[..., :3], before @ MATRIX.T.float(), atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(after[..., 3], shown.accumulation)
     torch.testing.assert_close(recolored(shown, IDENTITY, background).rgb, shown.rgb, atol=1e-6, rtol=1e-6)

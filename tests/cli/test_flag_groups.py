@@ -80,8 +80,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
     assert sorted(flag for flags in found.values() for flag in flags) == sorted(known)
     assert list(found) == [
         "options", "everyday options", f"{method} options", *["sampler options"] * (method != "pixel-nerf"),
-        *["background options"] * (method in WITH_BACKGROUND), "ray options", "robust options",
-        *["appearance options"] * (method in ("nerf-w", "nerfacto", "neus", "volsdf", "zip-nerf")),
+        *["background options"] * (method in WITH_BACKGROUND), "ray options", "robust options", "appearance options",
         *["few images options"] * (method in FOR_FEW_IMAGES), *["motion options"] * (method in ("kplanes", "dnerf")),
         "teacher options", "optimisation options", "evaluation and saving options",
         "machine options", "viewer options", "procedural data options",
@@ -122,7 +121,7 @@ def test_the_data_formats_flags_stand_last(name: str) -> None:
 def test_flags_stand_with_what_they_belong_to() -> None:
     found, plain = help_of("nerfacto"), help_of("vanilla-nerf")
     belongs = {
-        "nerfacto": ["--num-levels", "--camera-learning-rate", "--appearance-embedding-dim"],
+        "nerfacto": ["--num-levels", "--camera-learning-rate"],
         "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
         "ray": ["--num-rays-per-batch", "--train-rays-per-pixel-from"],
         "robust": ["--robust", "--robust-factor"],
@@ -133,8 +132,9 @@ def test_flags_stand_with_what_they_belong_to() -> None:
     }
     for title, flags in belongs.items():
         assert set(flags) <= set(found[f"{title} options"])
-    assert found["appearance options"] == ["--eval-appearance", "--mean-appearance-share"]
-    assert "--eval-appearance" not in [flag for flags in plain.values() for flag in flags]
+    light = ["--appearance", "--appearance-rate", "--eval-appearance", "--mean-appearance-share"]
+    assert plain["appearance options"] == light
+    assert found["appearance options"] == [*light, "--appearance-embedding-dim"]
     assert "--num-coarse-samples" in plain["sampler options"]
 
 

@@ -373,7 +373,7 @@ def test_overrides_are_read_from_text() -> None:
         "camera_optimizer": "off",
         "num_proposal_samples": "(24, 12)",
         "predict_normals": "true",
-        "appearance_embedding_dim": "None",
+        "appearance": "None",
     }
     config = from_plain(load_method("nerfacto").config, parse_overrides(text), "text")
     flat = flattened(dataclasses.asdict(config))
@@ -384,7 +384,7 @@ def test_overrides_are_read_from_text() -> None:
         "camera_optimizer": "off",
         "num_proposal_samples": (24, 12),
         "predict_normals": True,
-        "appearance_embedding_dim": "auto",
+        "appearance": "auto",
     }
     with pytest.raises(ConfigError, match=r"unknown key 'leraning_rate'\. Did you mean 'learning_rate'"):
         InstantNGP(train_dataset=handed(), config_overrides={"leraning_rate": "1"})
@@ -464,7 +464,7 @@ def test_pictures_are_of_the_camera_s_size_over_the_data_s_background() -> None:
 @pytest.mark.medium
 def test_appearances_are_told_optimised_and_shown(tmp_path: Path) -> None:
     data = handed(3)
-    method = start(Nerfacto, data, appearance_embedding_dim=4)
+    method = start(Nerfacto, data, appearance="vector", appearance_embedding_dim=4)
     for step in range(3):
         method.train_iteration(step)
     method.save(str(tmp_path))

@@ -47,7 +47,7 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 MOVING = dataclasses.replace(SCENE, moving=True, num_times=8)
 FEW: dict[str, Any] = {"start": "random", "num_gaussians": 600, "start_gaussians": 400, "steps_per_move": 20}
-PLAIN: dict[str, Any] = {"opacity_penalty": 0.0, "scale_penalty": 0.0, "noise": 0.0, "appearance": False}
+PLAIN: dict[str, Any] = {"opacity_penalty": 0.0, "scale_penalty": 0.0, "noise": 0.0, "appearance": "none"}
 """Settings with which the loss is that of colours alone."""
 TIMES = [index / 7 for index in range(8)]
 BLACK = torch.zeros(3)

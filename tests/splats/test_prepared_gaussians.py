@@ -31,8 +31,8 @@ def test_every_picture_is_the_first() -> None:
     truth = draw_colors(cloud(), seen, 1, background)
     redrawn = PreparedGaussians(cloud(), RASTERISER)
     for _ in range(3):
-        torch.testing.assert_close(redrawn.colors(seen, 1, background), truth, atol=1e-6, rtol=0)
-    torch.testing.assert_close(redrawn.colors(seen, 4, background), truth[2::4, 2::4], atol=1e-6, rtol=0)
+        torch.testing.assert_close(redrawn.draw(seen, 1, background)[0], truth, atol=1e-6, rtol=0)
+    torch.testing.assert_close(redrawn.draw(seen, 4, background)[0], truth[2::4, 2::4], atol=1e-6, rtol=0)
 
 
 def test_pictures_by_depth() -> None:
@@ -49,7 +49,7 @@ def test_pictures_by_depth() -> None:
     for look, color in ((OURS, 0), (ELSEWHERE, 1)):
         seen = splat_camera(camera(), 0.1, look)
         redrawn, background = PreparedGaussians(pair, RASTERISER), torch.zeros(3)
-        pictures = [redrawn.colors(seen, 1, background) for _ in range(3)]
+        pictures = [redrawn.draw(seen, 1, background)[0] for _ in range(3)]
         pictures.append(draw_view(pair, seen, 1, background, 9.0).rgb)
         for picture in pictures:
             assert int(picture[16, 20].argmax()) == color, look
@@ -68,7 +68,7 @@ def test_what_no_picture_shows_is_not_packed() -> None:
     seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
     nothing = PreparedGaussians(given[:40], RASTERISER)
     for _ in range(3):
-        torch.testing.assert_close(nothing.colors(seen, 1, background), background.expand(33, 33, 3))
+        torch.testing.assert_close(nothing.draw(seen, 1, background)[0], background.expand(33, 33, 3))
 
 
 def test_one_far_away_does_not_matter() -> None:
@@ -76,7 +76,7 @@ def test_one_far_away_does_not_matter() -> None:
     given.means[7] = 1e9
     seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
     redrawn = PreparedGaussians(given, RASTERISER)
-    first, _, third = (redrawn.colors(seen, 1, background) for _ in range(3))
+    first, _, third = (redrawn.draw(seen, 1, background)[0] for _ in range(3))
     torch.testing.assert_close(first, third, atol=1e-6, rtol=0)
 
 

@@ -14,7 +14,7 @@ from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.evaluation.appearance import appearance_of, fit_appearance
 from nerfloom.kernels.math import cross_matrix
 from nerfloom.kernels.splats.project import Record, project_reference
-from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
+from nerfloom.methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig
 from nerfloom.splats.drawing import splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.datasets import load_split
@@ -27,7 +27,7 @@ from tests.training.helpers import tiny_run
 
 def model_of(gaussians: Gaussians, cameras: Cameras, **settings: object) -> GaussianSplatting:
     scene = dataclasses.replace(SCENE, num_cameras=len(cameras), camera_to_worlds=cameras.camera_to_worlds)
-    config, _ = decide(GaussianSplattingConfig(num_gaussians=10, degree=0, **settings), scene)  # type: ignore[arg-type]
+    config, _ = METHOD.decided(GaussianSplattingConfig(num_gaussians=10, degree=0, **settings), scene)  # type: ignore[arg-type]
     model = GaussianSplatting(config, scene)
     model.set_gaussians(gaussians)
     return model
@@ -45,21 +45,24 @@ def scattered(count: int = 60) -> Gaussians:
 
 
 @pytest.mark.parametrize(
-    ("given", "varies", "expected"), [("auto", True, True), ("auto", False, False), (False, True, False)]
+    ("given", "varies", "expected"),
+    [("auto", True, "affine"), ("auto", False, "none"), ("none", True, "none"), ("grid", False, "grid")],
 )
-def test_colours_are_transformed_where_light_differs(given: bool | str, varies: bool, expected: bool) -> None:
+def test_colours_are_transformed_where_light_differs(given: str, varies: bool, expected: str) -> None:
     scene = dataclasses.replace(SCENE, appearance_varies=varies)
-    config, _ = decide(GaussianSplattingConfig(appearance=given), scene)  # type: ignore[arg-type]
-    assert config.appearance is expected
-    assert (appearance_of(GaussianSplatting(config, scene)) is not None) is expected
+    config, _ = METHOD.decided(GaussianSplattingConfig(appearance=given), scene)  # type: ignore[arg-type]
+    assert config.appearance == expected
+    assert (appearance_of(GaussianSplatting(config, scene)) is None) is (expected == "none")
 
 
 def test_a_transform_is_learnt_by_the_image_it_is_of() -> None:
     one = camera()
     model = model_of(ball(), Cameras(**{**vars(one), "camera_to_worlds": one.camera_to_worlds.expand(3, 3, 4)}),
-                     appearance=True, mean_appearance_share=0.0)  # fmt: skip
+                     appearance="affine", mean_appearance_share=0.0)  # fmt: skip
     batch = ViewBatch(1, View(one), torch.rand(33, 33, 3), torch.zeros(3))
-    model.loss(batch, 0).total.backward()
+    loss = model.loss(batch, 0)
+    assert float(loss.terms["appearance"].detach()) == 0
+    loss.total.backward()
     assert model.appearance is not None
     gradient = model.appearance.vectors.grad
     assert gradient is not None
@@ -68,24 +71,27 @@ def test_a_transform_is_learnt_by_the_image_it_is_of() -> None:
 
 
 def test_pictures_show_the_appearance_that_is_set() -> None:
-    """Half as bright, and shifted: by the formula."""
-    one = camera()
-    model = model_of(ball(), one, appearance=True)
+    """Half as bright, and shifted, where there is something: by the formula. The background keeps its colour."""
+    one, behind = camera(), torch.tensor([0.2, 0.9, 0.4])
+    model = model_of(ball(), one, appearance="affine")
     assert model.appearance is not None
-    plain = model.render_view(View(one), torch.zeros(3)).rgb
-    assert not plain.requires_grad  # a file is written of it
-    assert not model.render_rgb(View(one), torch.zeros(3)).requires_grad
+    plain = model.render_view(View(one), behind)
+    assert not plain.rgb.requires_grad  # a file is written of it
+    assert not model.render_rgb(View(one), behind).requires_grad
     vector = torch.zeros(3, 4)
     vector[:, :3] = -0.5 * torch.eye(3)
     vector[:, 3] = torch.tensor([0.1, 0.0, -0.2])
     with model.appearance.shown(vector.flatten()):
-        shown = model.render_view(View(one), torch.zeros(3)).rgb
-    torch.testing.assert_close(shown, 0.5 * plain + vector[:, 3])
+        shown, quick = model.render_view(View(one), behind).rgb, model.render_rgb(View(one), behind)
+    opacity = plain.accumulation[..., None]
+    surface = plain.rgb - (1 - opacity) * behind
+    torch.testing.assert_close(shown, 0.5 * surface + opacity * vector[:, 3] + (1 - opacity) * behind)
+    torch.testing.assert_close(quick, shown, atol=1e-5, rtol=0)
 
 
 @pytest.mark.medium
 def test_the_appearance_of_a_held_out_image_is_found_by_its_half(shared_tiny: Path, tmp_path: Path) -> None:
-    run = tiny_run("gaussian-splatting", shared_tiny, tmp_path / "run", appearance=True)
+    run = tiny_run("gaussian-splatting", shared_tiny, tmp_path / "run", appearance="affine")
     trainer = Trainer.of(run, load_split(run, "train"))
     for _ in range(20):
         trainer.train_step()
@@ -99,7 +105,7 @@ def test_the_appearance_of_a_held_out_image_is_found_by_its_half(shared_tiny: Pa
     assert appearance is not None
     view, true = darker.view(1), darker.image(1).float() / 255
     errors = []
-    for vector in (appearance.vectors.detach().mean(0), found):
+    for vector in (appearance.of_images().detach().mean(0), found):
         with appearance.shown(vector), torch.no_grad():
             picture = trainer.model.render_view(view, background).rgb
         errors.append(float((picture - true[..., :3] * true[..., 3:]).square().mean()))
@@ -247,7 +253,7 @@ def test_known_depths_pull_gaussians_there() -> None:
 def test_the_background_of_a_capture_cannot_be_learnt() -> None:
     """Each step has another, so that what is left transparent is wrong in the next."""
     captured = dataclasses.replace(SCENE, has_alpha=False)
-    config, _ = decide(GaussianSplattingConfig(num_gaussians=10, degree=0), captured)
+    config, _ = METHOD.decided(GaussianSplattingConfig(num_gaussians=10, degree=0), captured)
     model = GaussianSplatting(config, captured)
     batch = ViewBatch(0, View(camera()), torch.zeros(33, 33, 3), torch.zeros(3))
     corners = [model.loss(batch, 0).rgb[0, 0] for _ in range(3)]

@@ -63,7 +63,7 @@ def test_a_picture_is_the_same_when_gaussians_are_prepared() -> None:
     seen, background = splat_camera(panorama_camera(), 0.1), torch.rand(3)
     truth, redrawn = draw_colors(cloud, seen, 1, background), PreparedGaussians(cloud, RASTERISER)
     for _ in range(3):
-        torch.testing.assert_close(redrawn.colors(seen, 1, background), truth, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(redrawn.draw(seen, 1, background)[0], truth, rtol=1e-4, atol=1e-4)
 
 
 def test_growth_counts_both_sides_of_the_seam() -> None:

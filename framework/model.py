@@ -19,6 +19,7 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.table_memory import IN_MEMORY, Tables
 from nerfloom.renderable import Renderable
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
@@ -53,6 +54,9 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     resizes: ClassVar[bool] = False
     """Whether `after_step` may change the rows of parameters."""
+
+    tables: Tables = IN_MEMORY
+    """Place of the optimiser's state of sparse parameters, and of the parameters that `after_step` changes."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()

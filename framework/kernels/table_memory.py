@@ -1,4 +1,4 @@
-"""Memory for large tables with random access."""
+"""Memory for large tables with random access, and the place of tables that an optimiser updates."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerfloom.base.device import machine_memory
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.optimised import RowChange
 
 HUGE_PAGE = 2**21
 """Size of a huge page in bytes."""
@@ -65,3 +66,51 @@ def table(*shape: int, like: Tensor | None = None) -> Tensor:
         last = (out.data_ptr() + size) // HUGE_PAGE * HUGE_PAGE
         advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _MADV_HUGEPAGE)  # a hint: failing is harmless
     return out.zero_()
+
+
+class Tables:
+    """The place of tables and of their optimiser's state: memory. `mapped_tables.MappedTables` keeps them in files."""
+
+    def zeros(self, *shape: int, like: Tensor) -> Tensor:
+        """Return a new table of zeros.
+
+        Args:
+            shape: its shape.
+            like: tensor that determines device and type.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        return table(*shape, like=like)
+
+    def kept(self, values: Tensor) -> Tensor:
+        """Return a table with given `values` (E, ...), possibly `values` itself.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        return values
+
+    def changed(self, values: Tensor, change: RowChange, fresh: Tensor | None) -> Tensor:
+        """Return a table after a change of its rows.
+
+        Args:
+            values: (E, ...) the table, of the parameter or of its state.
+            change: the kept rows, the number of new ones, and their order.
+            fresh: (A, ...) values of the new rows; None for zeros.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        rows = values.index_select(0, change.kept)
+        if added := 0 if change.fresh is None else len(change.fresh):
+            new = rows.new_zeros(added, *rows.shape[1:]) if fresh is None else fresh.to(rows)
+            rows = torch.cat([rows, new])
+        return rows if change.order is None else rows.index_select(0, change.order)
+
+    def release(self) -> None:
+        """Give memory back to the system where a table is also in a file; no table changes."""
+
+
+IN_MEMORY = Tables()
+"""The default place of tables."""

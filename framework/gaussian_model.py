@@ -305,6 +305,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         self._last_change = step
         if self.rows_in_view is not None:
             self.rows_in_view.forget()
+        self.tables.release()  # all Gaussians are read now
         gaussians = self.at_rest()
         if values := self.strategy.reset(gaussians, step):
             none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, which resets Adam's state

@@ -156,8 +156,11 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
 
     @property
     def share_seen(self) -> float:
-        """Share of all Gaussians that `seen_gaussians` returned last. It is a factor of means over Gaussians in a loss,
-        so that the gradient of a Gaussian does not depend on the number of others in view."""
+        """Share of all Gaussians that `seen_gaussians` returned last.
+
+        It is a factor of means over Gaussians in a loss. So the gradient of a Gaussian does not depend on the number of
+        others in view.
+        """
         return 1.0 if self.seen is None else len(self.seen.index) / max(self.seen.count, 1)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
@@ -227,7 +230,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         """Project Gaussians to a training image and show them to the strategy.
 
         Args:
-            gaussians: the result of `seen_gaussians`, or all N Gaussians, in their order.
+            gaussians: the result of `seen_gaussians`, in its order; without a memory limit, all N Gaussians.
             camera: of the image.
             degree: highest degree of the harmonics that count.
         """

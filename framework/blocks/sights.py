@@ -1,4 +1,4 @@
-"""What the training images of a block see of it, as labels for its visibility network."""
+"""Labels for the visibility network of a block: the points that its training images see, and from where."""
 
 from __future__ import annotations
 

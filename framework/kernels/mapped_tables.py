@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.optimised import RowChange
-from nerfloom.kernels.table_memory import Tables
+from nerfloom.kernels.table_memory import Tables, page_out
 
 PIECE = 2**16
 """Number of rows that are copied before memory is released."""
@@ -56,9 +56,14 @@ class MappedTables(Tables):
         return torch.frombuffer(mapped, dtype=like.dtype).view(shape)
 
     def kept(self, values: Tensor) -> Tensor:
-        out = self.zeros(*values.shape, like=values)
+        return self.copied(values, values)
+
+    def copied(self, values: Tensor, like: Tensor) -> Tensor:
+        out = self.zeros(*values.shape, like=like)
         for first in range(0, len(values), PIECE):
-            out[first : first + PIECE] = values[first : first + PIECE]
+            piece = values[first : first + PIECE]
+            out[first : first + PIECE] = piece
+            page_out(piece)
             self.release()
         return out
 

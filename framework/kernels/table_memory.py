@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+import mmap
 import sys
 from typing import Any
 
@@ -17,7 +18,7 @@ from nerfloom.base.optimised import RowChange
 
 HUGE_PAGE = 2**21
 """Size of a huge page in bytes."""
-_MADV_HUGEPAGE = 14
+_MADV_HUGEPAGE, _MADV_PAGEOUT = 14, 21
 
 
 @functools.cache
@@ -68,6 +69,16 @@ def table(*shape: int, like: Tensor | None = None) -> Tensor:
     return out.zero_()
 
 
+def page_out(values: Tensor) -> None:
+    """Let the system take back the memory of `values` if it is also in a file. The values stay as they are."""
+    advise, size = _madvise(), values.numel() * values.element_size()
+    if advise is not None and values.device.type == "cpu" and values.is_contiguous():
+        first = -(-values.data_ptr() // mmap.PAGESIZE) * mmap.PAGESIZE
+        last = (values.data_ptr() + size) // mmap.PAGESIZE * mmap.PAGESIZE
+        if last > first:
+            advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _MADV_PAGEOUT)  # a hint: failing is harmless
+
+
 class Tables:
     """The place of tables and of their optimiser's state: memory. `mapped_tables.MappedTables` keeps them in files."""
 
@@ -90,6 +101,18 @@ class Tables:
             ConfigError: if there is not enough space.
         """
         return values
+
+    def copied(self, values: Tensor, like: Tensor) -> Tensor:
+        """Return a new table with given values.
+
+        Args:
+            values: (E, ...) the values, possibly in a mapped checkpoint.
+            like: tensor that determines device and type.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        return self.zeros(*values.shape, like=like).copy_(values)
 
     def changed(self, values: Tensor, change: RowChange, fresh: Tensor | None) -> Tensor:
         """Return a table after a change of its rows.

@@ -70,9 +70,10 @@ class Column(nn.Module):
         return rows / extent if self.in_extents else rows
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
-        saved = state_dict.get(prefix + "values")
+        saved = state_dict.get(name := prefix + "values")
         if saved is not None and saved.ndim == 2 and saved.shape[1] == self.values.shape[1]:
-            self.values.data = self.tables.zeros(*saved.shape, like=self.values)
+            self.values.data = self.tables.copied(saved, self.values)
+            state_dict = {**state_dict, name: self.values.detach()}
         super()._load_from_state_dict(state_dict, prefix, *rest)
         self.tables.release()
 

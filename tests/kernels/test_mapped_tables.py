@@ -29,6 +29,7 @@ def test_a_change_is_that_of_a_table_in_memory(
     change = RowChange(torch.nn.Parameter(values.clone()), KEPT, fresh if added else None, order)
     mapped = tables.kept(values)
     assert torch.equal(mapped, values)
+    assert torch.equal(tables.copied(values.double(), values), IN_MEMORY.copied(values.double(), values))
     for new in (fresh, None):
         found, expected = tables.changed(mapped, change, new), IN_MEMORY.changed(values, change, new)
         assert found.dtype == expected.dtype
@@ -46,7 +47,9 @@ def test_released_rows_keep_their_values_and_files_have_no_names(tmp_path: Path)
     assert torch.equal(table, torch.arange(20_000.0).view(5000, 4))
     table[17] = -1.0
     tables.release()
-    assert float(table.sum()) == float(torch.arange(20_000.0).sum() - torch.arange(68.0, 72.0).sum() - 4)
+    expected = torch.arange(20_000.0).view(5000, 4)
+    expected[17] = -1.0
+    assert torch.equal(table, expected)
     assert list((tmp_path / "cache").iterdir()) == []
     assert len(tables._maps) == 1
     del table

@@ -11,6 +11,7 @@ from typing import Any
 from benchmarks.flags import (
     AblationFlags,
     CacheFlags,
+    CityFlags,
     ContentionFlags,
     CurvesFlags,
     MeshFlags,
@@ -46,9 +47,10 @@ usage: python -m benchmarks WHAT [flags]
   pose-refinement  effect of refining camera poses, on the embedded scene with disturbed training poses
   meshes           distance of exported meshes from the exact surface or from sparse points; their time and memory
   viewer           times of the viewer's first picture, of pictures of a moving camera, and of the finished picture
+  city             sizes, messages and times of a city in blocks on paper, by formulas and from measured results
 
 python -m benchmarks WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or
-to --output-dir or --output; poses prints them.
+to --output-dir or --output; poses and city print them.
 """
 
 
@@ -239,6 +241,12 @@ def _viewer(flags: ViewerBenchFlags) -> None:
     write_results(flags.output_dir / "viewer.json", content)
 
 
+def _city(flags: CityFlags) -> None:
+    from benchmarks.city import constants, markdown, measured
+
+    print(markdown(flags, constants(), measured(flags.results)))
+
+
 KINDS: dict[str, tuple[type, Any]] = {
     "quadrature": (QuadratureFlags, _quadrature),
     "curves": (CurvesFlags, _curves),
@@ -253,6 +261,7 @@ KINDS: dict[str, tuple[type, Any]] = {
     "pose-refinement": (PoseRefinementFlags, _pose_refinement),
     "meshes": (MeshFlags, _meshes),
     "viewer": (ViewerBenchFlags, _viewer),
+    "city": (CityFlags, _city),
 }
 
 

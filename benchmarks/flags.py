@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from benchmarks.city import City
 from nerfloom.cli.bench_results import PICTURES, RESULTS
 from nerfloom.cli.job_flags import JobFlags
 
@@ -227,3 +228,11 @@ class ProcessesFlags:
     """The times to reach these PSNRs of validation views are reported, dB."""
     output_dir: Path = RESULTS
     """Folder of processes-DATA.json."""
+
+
+@dataclass(frozen=True)
+class CityFlags(City):
+    """Print sizes, messages and times of a city in blocks, by formulas and from measured results."""
+
+    results: Path = RESULTS
+    """Folder of the results: methods-procedural.json, and city.json if there is one."""

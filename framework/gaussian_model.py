@@ -8,30 +8,38 @@ from typing import ClassVar, Generic, Literal
 import torch
 from torch import Tensor
 
-from nerfloom.base.device import HostValue
+from nerfloom.base.device import HostValue, device_kind
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.optimised import RowChange
 from nerfloom.base.pace import Pace
+from nerfloom.base.processes import processes
+from nerfloom.base.user_cache import cache_folder
+from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
+from nerfloom.kernels.dispatch import CPP
+from nerfloom.kernels.mapped_tables import MappedTables
 from nerfloom.kernels.splats.blend import Blended
 from nerfloom.kernels.splats.project import SplatCamera
+from nerfloom.levels.on_image import tangents
+from nerfloom.levels.rows_in_view import RowsInView
 from nerfloom.losses.depth_normals import normal_error
 from nerfloom.model import Model
 from nerfloom.rendering.light import make_light
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.density_control import DensityControl
-from nerfloom.splats.drawing import ray_directions, smallest_depth
+from nerfloom.splats.drawing import draw_colors, ray_directions, smallest_depth
 from nerfloom.splats.drawn import DrawsGaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
-from nerfloom.splats.mcmc import Mcmc, shaken
+from nerfloom.splats.mcmc import Mcmc, faint, noise
 from nerfloom.splats.normals import with_normals
-from nerfloom.splats.rasteriser import Projected
+from nerfloom.splats.rasteriser import Projected, along_curve
 from nerfloom.splats.relocation import Relocation
 from nerfloom.splats.resolution import ImageSizes, most_octaves
 from nerfloom.splats.settings import SplattingConfig, SplattingConfigT
 from nerfloom.splats.start import from_points, scene_size
-from nerfloom.splats.strategy import Strategy
+from nerfloom.splats.strategy import Rows, Strategy
 from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, usual_columns
 
 MAX_NEW_GAUSSIANS = 1_000
@@ -63,8 +71,18 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         super().__init__(config, scene)
         self.position_rate = config.rate_factor * config.position_rate
         self.columns = self.declared_columns()
+        self.rows_in_view: RowsInView | None = None
+        """The Gaussians that images may show, with a memory limit; None without."""
+        self.seen: Rows | None = None
+        """The Gaussians of the last training image, with a memory limit; None for all."""
+        if config.memory_limit is not None:
+            check_limit(config, scene)
+            self.tables = MappedTables(config.cache_dir or cache_folder())
+            self.rows_in_view = RowsInView(self.tables, 1e6 * config.memory_limit)
         for name, column in self.columns.items():
             self.add_module(name, column)
+            if self.rows_in_view is not None:
+                column.keep_in(self.tables)
         self.register_buffer("extent", torch.tensor(scene_size(scene)))
         self.strategy, self.capacity = self.make_strategy(), Capacity()
         self.light = make_light(config, scene)
@@ -114,9 +132,13 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         """
         return gaussians
 
-    def at_rest(self) -> Gaussians:
-        """Return the Gaussians of the columns, with gradient."""
-        return as_gaussians(self.columns, self.extent)
+    def at_rest(self, rows: Tensor | None = None) -> Gaussians:
+        """Return the Gaussians of the columns, with gradient.
+
+        Args:
+            rows: (K,) int64 the Gaussians to return, each at most once; None for all.
+        """
+        return as_gaussians(self.columns, self.extent, rows)
 
     def learnt_gaussians(self, time: float | None = None) -> Gaussians:
         """Return the Gaussians at a time, with gradient.
@@ -125,6 +147,29 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
             time: in [0, 1]; None for a still scene.
         """
         return self.at_time(self.at_rest(), time)
+
+    def seen_gaussians(self, view: View, camera: SplatCamera) -> Gaussians:
+        """Return the Gaussians that a training image may show, at its time and with gradient: all without a limit.
+
+        With `--memory-limit` these are the Gaussians of the chunks that the image may show. A step leaves the rows of
+        others alone.
+
+        Args:
+            view: the training image.
+            camera: its camera, as it is drawn.
+        """
+        rows = self._rows_of(view, camera, learns=True)
+        self.seen = None if rows is None else Rows(rows, len(self.columns["means"].values))
+        return self.at_time(self.at_rest(rows), view.time)
+
+    @property
+    def share_seen(self) -> float:
+        """Share of all Gaussians that `seen_gaussians` returned last.
+
+        It is a factor of means over Gaussians in a loss. So the gradient of a Gaussian does not depend on the number of
+        others in view.
+        """
+        return 1.0 if self.seen is None else len(self.seen.index) / max(self.seen.count, 1)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
         return self.learnt_gaussians(time).map(Tensor.detach)
@@ -138,9 +183,35 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         Args:
             gaussians: the new ones at rest, with harmonics of the settings' degree. A column that they lack is 0.
         """
+        if self.rows_in_view is not None:
+            self.rows_in_view.forget()
+            gaussians = gaussians[along_curve(gaussians.means)] if len(gaussians) else gaussians
         for name, rows in as_rows(self.columns, gaussians, self.extent).items():
-            self.columns[name].values.data = rows.contiguous()
+            self.columns[name].set(rows.contiguous())
         self._prepared = None
+
+    # -- pictures ---------------------------------------------------------------------------------------------
+
+    def gaussians_in(self, view: View) -> Gaussians:
+        if self.rows_in_view is None:
+            return super().gaussians_in(view)
+        with torch.no_grad():
+            return self.at_time(self.at_rest(self._rows_of(view, self._camera(view), learns=False)), view.time)
+
+    def render_rgb(self, view: View, background: Tensor) -> Tensor:
+        if self.rows_in_view is None:
+            return super().render_rgb(view, background)
+        gaussians, camera = self.gaussians_in(view), self._camera(view)
+        return self.lit(draw_colors(gaussians, camera, view.stride, background, self.rasteriser), None)
+
+    def _rows_of(self, view: View, camera: SplatCamera, learns: bool) -> Tensor | None:
+        """Return the rows of the Gaussians that a view may show, with a memory limit; None for all."""
+        if self.rows_in_view is None:
+            return None
+        with torch.no_grad():
+            reduced = view.camera.sizes[0][0] / camera.height
+            directions = tangents(view.camera, camera.blur * reduced**2)
+        return self.rows_in_view.of(self.columns, self.extent, camera, directions, learns)
 
     # -- training ---------------------------------------------------------------------------------------------
 
@@ -167,12 +238,12 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         """Project Gaussians to a training image and show them to the strategy.
 
         Args:
-            gaussians: all N Gaussians, in their order.
+            gaussians: the result of `seen_gaussians`, in its order; without a memory limit, all N Gaussians.
             camera: of the image.
             degree: highest degree of the harmonics that count.
         """
         shown = self.rasteriser.project(gaussians, camera, degree)
-        self.strategy.watch(shown.records, camera)
+        self.strategy.watch(shown.records, camera, self.seen)
         return shown
 
     def aligns_normals(self, progress: float) -> bool:
@@ -206,7 +277,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         if config.flatness_penalty > 0 and len(gaussians):
             # As in PGSR (Chen et al. 2024). One of several equal scales gets the gradient, so round Gaussians flatten.
             smallest = gaussians.log_scales.min(-1).values.exp()
-            terms["flatness"] = config.flatness_penalty / self.extent * smallest.mean()
+            terms["flatness"] = self.share_seen * config.flatness_penalty / self.extent * smallest.mean()
         if self.aligns_normals(progress):
             black, colored = torch.zeros(3, device=self.device), with_normals(shown, gaussians, camera)
             normals = self.rasteriser.draw(colored, camera, black, capacity=self.capacity).image
@@ -222,12 +293,18 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
     def shake(self, size: float | Tensor) -> None:
         """Add noise to the centres of Gaussians that are nearly transparent (3DGS-MCMC, equation 7).
 
+        With a memory limit, only those that the last training image may show get noise.
+
         Args:
             size: the noise of a transparent Gaussian, in its standard deviations squared per extent of the scene;
                 possibly () on the device.
         """
-        which, by = shaken(self.at_rest(), size * self._extent.of(self.extent))
-        self.columns["means"].values.data[which] += by / self.extent
+        logits = self.columns["logits"].values.detach()[:, 0]
+        which = faint(logits if self.seen is None else logits[self.seen.index])
+        if self.seen is not None and which is not None:
+            which = self.seen.index[which]
+        by = noise(self.at_rest(which), size * self._extent.of(self.extent))
+        self.columns["means"].values.data[slice(None) if which is None else which] += by / self.extent
 
     def changes_rows(self, step: int, progress: float) -> bool:
         if self._last_change is None:  # a run that goes on has the same steps as one that was not stopped
@@ -237,13 +314,44 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
     @torch.no_grad()
     def after_step(self, step: int, progress: float) -> Sequence[RowChange]:
         self._last_change = step
+        if self.rows_in_view is not None:
+            self.rows_in_view.forget()
+        self.tables.release()  # all Gaussians are read now
         gaussians = self.at_rest()
         if values := self.strategy.reset(gaussians, step):
             none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, which resets Adam's state
             columns = {name: self.columns[name] for name in values}
             return [RowChange(c.values, none, c.rows(values[name], self.extent)) for name, c in columns.items()]
         change = self.strategy.grow(gaussians, self.config.num_gaussians, self._extent.of(self.extent))
-        return () if change is None else row_changes(self.columns, *change, self.extent)
+        if change is None:
+            return ()
+        order = None
+        if self.rows_in_view is not None and len(change.kept) + len(change.fresh):
+            order = along_curve(torch.cat([gaussians.means[change.kept], change.fresh.means]))
+        return row_changes(self.columns, *change, self.extent, order)
 
     def read_counts(self) -> None:
         self.capacity.read()
+
+
+def check_limit(config: SplattingConfig, scene: Scene) -> None:
+    """Check that a memory limit can be kept.
+
+    Args:
+        config: the settings, with a limit.
+        scene: facts about the data.
+
+    Raises:
+        ConfigError: if it cannot.
+    """
+    reason = None
+    if device_kind(config.machine) != "cpu":
+        reason = "is for the CPU, not for a GPU; give --machine.device-type cpu"
+    elif not CPP.available():
+        reason = "needs the compiled kernels; install a C++ compiler, and install the package again"
+    elif processes().count > 1:
+        reason = "is for one process; start one"
+    elif scene.moving:
+        reason = "is for scenes that do not move; reduce --num-gaussians"
+    if reason is not None:
+        raise ConfigError(f"--memory-limit {reason}, or leave it out")

@@ -20,6 +20,7 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
 from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.kernels.table_memory import IN_MEMORY, Tables
 from nerfloom.renderable import Renderable, parts
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
@@ -57,6 +58,8 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     ends_at_box: ClassVar[bool] = False
     """Whether it learns only scenes that end at their box; `Method.build` refuses others."""
+    tables: Tables = IN_MEMORY
+    """Place of the optimiser's state of sparse parameters, and of the parameters that `after_step` changes."""
 
     def __init__(self, config: ConfigT, scene: Scene) -> None:
         super().__init__()

@@ -172,7 +172,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         pose = None if poses is None or index is None else poses.pose(index, seen.camera_to_worlds[0])
         octaves = self.sizes.next(self.progress)
         camera, target = splat_camera(seen, self.near, self.look(), pose, 1 << octaves), reduced(batch.rgb, octaves)
-        gaussians = self.learnt_gaussians(batch.view.time)
+        gaussians = self.seen_gaussians(batch.view, camera)
         shown = self.on_image(gaussians, camera, min(open_degree(self.progress), config.degree))
         known, trust = self.found_distances.known(batch, self.progress, config.depth_loss_mult, config.field_depth_mult)
         content = CHANNELS["rgb" if known is None and not self.aligns_normals(self.progress) else "distance"]
@@ -188,9 +188,9 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             known = reduced_distances(known, octaves)
             terms["depth"] = trust * mean_depth_error(drawn.image[..., 3], drawn.transmittance, known)
         if (weight := self._chosen(config.opacity_penalty, OPACITY_PENALTY)) > 0 and len(gaussians):
-            terms["opacity"] = weight * self.penalised_opacities(gaussians, batch.view.time).mean()
+            terms["opacity"] = self.share_seen * weight * self.penalised_opacities(gaussians, batch.view.time).mean()
         if (weight := self._chosen(config.scale_penalty, SCALE_PENALTY)) > 0 and len(gaussians):
-            terms["scale"] = weight / self.extent * gaussians.log_scales.exp().mean()
+            terms["scale"] = self.share_seen * weight / self.extent * gaussians.log_scales.exp().mean()
         kept = None if weights is None else weights == 1
         terms |= self.surface_terms(gaussians, shown, camera, drawn, kept, self.progress)
         return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))

@@ -55,7 +55,7 @@ class ParameterGroup:
 
 @dataclass(frozen=True)
 class RowChange:
-    """A change of a parameter's rows: keeps some, in any order, and appends new ones.
+    """A change of a parameter's rows: keeps some, in any order, and adds new ones.
 
     Kept rows keep their optimiser state; new rows start with a fresh one.
     """
@@ -66,6 +66,8 @@ class RowChange:
     """(K,) int64 indices of the kept rows, in their new order."""
     fresh: Tensor | None = None
     """(A, ...) values of the new rows; None if there are none."""
+    order: Tensor | None = None
+    """(K + A,) int64 order of the kept and then the new rows; None to leave the new rows at the end."""
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from nerfloom.blocks.blend import blended, near_shares, visible_shares
 from nerfloom.blocks.block import TrainedBlock
 from nerfloom.blocks.colors import recolored, recolored_gaussians
 from nerfloom.blocks.merge import merged, of_cell
+from nerfloom.blocks.visibility import Visibility, points_in_view
 from nerfloom.cameras.moved import moved_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
@@ -41,17 +42,27 @@ class Opened(NamedTuple):
     """Placement of the input in the model's scene."""
 
 
+def unknown_visibility(number: int) -> Visibility | None:
+    """Return None: the block `number` has no visibility network."""
+    return None
+
+
 class Blocks(Renderable):
     """Several blocks of a scene in one picture: Block-NeRF (Tancik et al. 2022, arXiv:2202.05263), section 4.3.
 
     Blocks within reach of the camera are rendered, and blended by their inverse distance. Frames are converted in
     float64 by the blocks' placements, so blocks need not share one. Views are in the frame of the data's cameras; each
-    block sees them where its own refined poses lead. What a view shows of a block is estimated by the mean opacity of a
-    small picture of it.
+    block sees them where its own refined poses lead. Blocks that do not show a view are left out, by their visibility
+    networks, or else by the mean opacity of a small picture of each.
     """
 
     def __init__(
-        self, blocks: Sequence[TrainedBlock], opened: Callable[[int], Opened], placement: Placement, scene: Scene
+        self,
+        blocks: Sequence[TrainedBlock],
+        opened: Callable[[int], Opened],
+        placement: Placement,
+        scene: Scene,
+        visibility: Callable[[int], Visibility | None] = unknown_visibility,
     ) -> None:
         """Open the first block, whose device, rays per pixel and background are those of all.
 
@@ -60,8 +71,10 @@ class Blocks(Renderable):
             opened: returns a block by its number, from memory or loaded (`few_in_memory`).
             placement: placement of the input in the composed scene.
             scene: the composed scene.
+            visibility: returns the visibility network of a block by its number; None for a block without.
         """
         self.blocks, self.opened, self.placement, self.scene = tuple(blocks), opened, placement, scene
+        self.visibility = visibility
         first = opened(0).model
         self._device, self._rays_per_pixel, self._background = first.device, first.rays_per_pixel, first.background
         self._centers = torch.tensor([block.center for block in self.blocks], dtype=torch.float64)
@@ -100,12 +113,19 @@ class Blocks(Renderable):
         if len(near) > 1:
             coarse = replace(view, stride=view.stride * max(min(view.height, view.width) // LOOK_SIDE, 1))
             visibilities = torch.zeros_like(shares)
-            for number in near:
-                visibilities[number] = float(self.picture_of(number, coarse, background).accumulation.mean())
+            visibilities[near] = torch.tensor(self._visibilities(near, coarse, background), dtype=shares.dtype)
             shares = visible_shares(torch.where(shares >= MIN_SHARE, shares, 0.0), visibilities)
             near = _worth_drawing(shares)
         total = float(shares[near].sum())
         return {number: float(shares[number]) / total for number in near}
+
+    def _visibilities(self, near: list[int], view: View, background: Tensor) -> list[float]:
+        """Return how much of a view each of some blocks shows: by their networks if all have one, else by pictures."""
+        networks = [network for number in near if (network := self.visibility(number)) is not None]
+        if len(networks) < len(near):
+            return [float(self.picture_of(number, view, background).accumulation.mean()) for number in near]
+        points, directions = points_in_view(view, self.placement, float(self._radii[near].mean()))
+        return [float(network.of(points, directions).mean()) for network in networks]
 
     def picture_of(self, number: int, view: View, background: Tensor) -> Picture:
         """Return the picture of one block in its own colours, with lengths in units of the composed scene.

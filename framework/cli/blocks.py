@@ -182,7 +182,7 @@ def _described(flags: BlocksFlags) -> str:
 
 
 def _compose(flags: BlocksFlags, plan: BlockPlan, parsed: ParsedScene, finished: list[TrainedBlock]) -> Path:
-    """Write blocks.yml, with matched colours, and return its path."""
+    """Write blocks.yml, with matched colours, and missing visibility networks; return its path."""
     from nerfloom.base.console import say
     from nerfloom.blocks.composed import Blocks
     from nerfloom.blocks.files import NAME, BlockList, write_blocks
@@ -192,6 +192,8 @@ def _compose(flags: BlocksFlags, plan: BlockPlan, parsed: ParsedScene, finished:
     low, high = ((float(x), float(y), float(z)) for x, y, z in parsed.box.tolist())
     content, file = BlockList((low, high), parsed.near, parsed.far, tuple(finished)), plan.folder / NAME
     write_blocks(file, content)
+    if len(finished) > 1:
+        _add_visibility(flags, finished)
     if flags.match_colors and len(finished) > 1:
         say("matching the colours of the blocks (--match-colors)")
         model = load_blocks(file, flags.device_type).model
@@ -200,6 +202,18 @@ def _compose(flags: BlocksFlags, plan: BlockPlan, parsed: ParsedScene, finished:
         blocks = matched(model, parsed.cameras.to(model.device), times)
         write_blocks(file, replace(content, blocks=tuple(blocks)))
     return file
+
+
+def _add_visibility(flags: BlocksFlags, finished: list[TrainedBlock]) -> None:
+    """Train the visibility networks of blocks that have none."""
+    from nerfloom.base.console import say
+    from nerfloom.blocks.visibility import NAME, write_visibility
+    from nerfloom.training.block_visibility import learn_visibility
+
+    missing = [block for block in finished if not (block.run / NAME).exists()]
+    for number, block in enumerate(missing, 1):
+        say(f"visibility network {number} of {len(missing)}: {block.run}")
+        write_visibility(block.run / NAME, learn_visibility(block, flags.device_type))
 
 
 if __name__ == "__main__":

@@ -49,8 +49,8 @@ class RunFlags(OpenFlags):
     level_error: float | None = None
     """Of a .levels file: largest standard deviation of a merged Gaussian, pixels; 0: merge none. Default: 1."""
     memory_limit: float | None = None
-    """Of a .levels file: memory for Gaussians, MB (1e6 bytes). Too little makes the level error larger. Default:
-    2000."""
+    """Memory for Gaussians, MB (1e6 bytes). Of a .levels file: too little makes the level error larger. Default: 2000.
+    Of a run with Gaussians: the run's setting."""
     eval_rendering: Literal["volume", "surface"] | None = None
     """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
     the surface. Default: the run's setting."""

@@ -159,8 +159,10 @@ def _finish(run: Run, trainer: Trainer) -> None:
         say(line)
     if (tiles := trainer.source.contradicted) is not None:
         say(f"--robust: {float(tiles.share):.1%} of the images' tiles do not count, as other images contradict them")
+    trainer.model.tables.release()
     if isinstance(trainer.model, HasGaussians):
         say(_count(trainer.model))
+        trainer.model.tables.release()
     write_report(run.folder / "skip_report.json", as_plain(rungs))
     write_summary(run.folder / SUMMARY, trainer, outcome)
     say(f"checkpoint: {outcome.checkpoint}")

@@ -1,10 +1,11 @@
-"""Memory for large tables with random access."""
+"""Memory for large tables with random access, and the place of tables that an optimiser updates."""
 
 from __future__ import annotations
 
 import ctypes
 import functools
 import math
+import mmap
 import sys
 from typing import Any
 
@@ -13,10 +14,11 @@ from torch import Tensor
 
 from nerfloom.base.device import machine_memory
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.optimised import RowChange
 
 HUGE_PAGE = 2**21
 """Size of a huge page in bytes."""
-_MADV_HUGEPAGE = 14
+_MADV_HUGEPAGE, _MADV_PAGEOUT = 14, 21
 
 
 @functools.cache
@@ -65,3 +67,73 @@ def table(*shape: int, like: Tensor | None = None) -> Tensor:
         last = (out.data_ptr() + size) // HUGE_PAGE * HUGE_PAGE
         advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _MADV_HUGEPAGE)  # a hint: failing is harmless
     return out.zero_()
+
+
+def page_out(values: Tensor) -> None:
+    """Let the system take back the memory of `values` if it is also in a file. The values stay as they are."""
+    advise, size = _madvise(), values.numel() * values.element_size()
+    if advise is not None and values.device.type == "cpu" and values.is_contiguous():
+        first = -(-values.data_ptr() // mmap.PAGESIZE) * mmap.PAGESIZE
+        last = (values.data_ptr() + size) // mmap.PAGESIZE * mmap.PAGESIZE
+        if last > first:
+            advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _MADV_PAGEOUT)  # a hint: failing is harmless
+
+
+class Tables:
+    """The place of tables and of their optimiser's state: memory. `mapped_tables.MappedTables` keeps them in files."""
+
+    def zeros(self, *shape: int, like: Tensor) -> Tensor:
+        """Return a new table of zeros.
+
+        Args:
+            shape: its shape.
+            like: tensor that determines device and type.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        return table(*shape, like=like)
+
+    def kept(self, values: Tensor) -> Tensor:
+        """Return a table with given `values` (E, ...), possibly `values` itself.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        return values
+
+    def copied(self, values: Tensor, like: Tensor) -> Tensor:
+        """Return a new table with given values.
+
+        Args:
+            values: (E, ...) the values, possibly in a mapped checkpoint.
+            like: tensor that determines device and type.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        return self.zeros(*values.shape, like=like).copy_(values)
+
+    def changed(self, values: Tensor, change: RowChange, fresh: Tensor | None) -> Tensor:
+        """Return a table after a change of its rows.
+
+        Args:
+            values: (E, ...) the table, of the parameter or of its state.
+            change: the kept rows, the number of new ones, and their order.
+            fresh: (A, ...) values of the new rows; None for zeros.
+
+        Raises:
+            ConfigError: if there is not enough space.
+        """
+        rows = values.index_select(0, change.kept)
+        if added := 0 if change.fresh is None else len(change.fresh):
+            new = rows.new_zeros(added, *rows.shape[1:]) if fresh is None else fresh.to(rows)
+            rows = torch.cat([rows, new])
+        return rows if change.order is None else rows.index_select(0, change.order)
+
+    def release(self) -> None:
+        """Give memory back to the system where a table is also in a file; no table changes."""
+
+
+IN_MEMORY = Tables()
+"""The default place of tables."""

@@ -21,10 +21,11 @@ from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import track, track_bytes
 from nerfloom.base.errors import DataError, FlagError
 from nerfloom.geometry.local_origin import local_origin
-from nerfloom.kernels.splats.project import DEGREES, MIN_ALPHA
+from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.levels.buckets import Buckets, drawable, of_rows
 from nerfloom.levels.files import MAX_NODES, Bits, LevelsWriter, row_size
 from nerfloom.levels.merging import halved
+from nerfloom.levels.on_image import reaches
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.stream import GaussianStream
 
@@ -184,14 +185,7 @@ class _Tree:
         centers = gaussians.means.double()
         low = torch.stack([centers.amin(0), *(node.low for node in below)]).amin(0)
         high = torch.stack([centers.amax(0), *(node.high for node in below)]).amax(0)
-        reach = max(float(reaches(gaussians).max()), *(node.reach for node in below), 0.0)
+        reach = max(float(reaches(gaussians.logits, gaussians.log_scales).max()), *(node.reach for node in below), 0.0)
         error, children = float(errors.max()), [node.number for node in below]
         index = self.writer.add(gaussians, children, low, high, reach, error)
         return _Node(index, gaussians, errors, low, high, reach)
-
-
-def reaches(gaussians: Gaussians) -> Tensor:
-    """Return how far (N,) float64 from their centres N `gaussians` are drawn."""
-    opacities = torch.sigmoid(gaussians.logits.double())
-    sizes = gaussians.log_scales.double().amax(1).exp()
-    return (2 * (opacities / MIN_ALPHA).clamp(min=1).log()).sqrt() * sizes

@@ -107,7 +107,7 @@ class DrawnLevels(Renderable):
         near = scale * smallest_depth(self.scene)
         camera = splat_camera(moved, near, look)
         sizes = sizes_on_image(nodes, camera, near)
-        seen = in_view(nodes, camera, tangents(moved, look.blur))
+        seen = in_view(nodes.boxes, camera, tangents(moved, look.blur))
         return camera, cut_of(nodes, sizes, seen, self.settings.level_error, self.most)
 
     def _shown(self, view: View) -> tuple[SplatCamera, Projected]:

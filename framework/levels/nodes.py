@@ -3,9 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class Boxes(NamedTuple):
+    """Boxes of the centres of M groups of Gaussians, all in one unit of length."""
+
+    low: Tensor
+    """(M, 3) float64 minimum corners."""
+    high: Tensor
+    """(M, 3) float64 maximum corners."""
+    reach: Tensor
+    """(M,) float64 maximum distance from its centre where a Gaussian of the group is drawn."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +39,11 @@ class Nodes:
 
     def __len__(self) -> int:
         return len(self.counts)
+
+    @property
+    def boxes(self) -> Boxes:
+        """The boxes of the nodes, which hold the Gaussians below them, too."""
+        return Boxes(self.low, self.high, self.reach)
 
     @property
     def is_leaf(self) -> Tensor:

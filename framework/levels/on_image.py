@@ -1,4 +1,4 @@
-"""Nodes of a tree of Gaussians as a camera sees them: whether it may show them, and their errors on the image."""
+"""Groups of Gaussians as a camera sees them: whether it may show them, and the errors of merged ones on the image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.kernels.splats.project import MARGIN, MIN_ALPHA, SplatCamera
-from nerfloom.levels.nodes import Nodes
+from nerfloom.levels.nodes import Boxes, Nodes
 
 STRETCH = math.pi / 2
 """Maximum ratio of a Gaussian's linearly approximated extent on an image to its true extent; fisheyes have the
@@ -44,21 +44,33 @@ def tangents(camera: Cameras, blur: float) -> Tensor:
     return torch.stack([low - SPARE * (high - low), high + SPARE * (high - low)])
 
 
-def in_view(nodes: Nodes, camera: SplatCamera, tangents: Tensor) -> Tensor:
-    """Return (M,) bool, whether an image may show a Gaussian of a node or of those below it.
-
-    An image of directions all around may show any node.
+def reaches(logits: Tensor, log_scales: Tensor) -> Tensor:
+    """Return how far (N,) float64 from their centres Gaussians are drawn.
 
     Args:
-        nodes: M nodes.
-        camera: the camera in the frame of the nodes.
+        logits: (N,) opacities before the sigmoid.
+        log_scales: (N, 3) logarithms of the standard deviations.
+    """
+    opacities = torch.sigmoid(logits.double())
+    sizes = log_scales.double().amax(1).exp()
+    return (2 * (opacities / MIN_ALPHA).clamp(min=1).log()).sqrt() * sizes
+
+
+def in_view(boxes: Boxes, camera: SplatCamera, tangents: Tensor) -> Tensor:
+    """Return (M,) bool, whether an image may show a Gaussian of a group.
+
+    An image of directions all around may show any.
+
+    Args:
+        boxes: boxes of M groups.
+        camera: the camera in the frame of the boxes.
         tangents: (2, 2) range of its directions, from `tangents`.
     """
     if camera.all_around:
-        return torch.ones(len(nodes), dtype=torch.bool)
+        return torch.ones(len(boxes.low), dtype=torch.bool)
     pose = camera.pose.cpu().double()
     corner = torch.cartesian_prod(*[torch.tensor([False, True])] * 3)
-    corners = torch.where(corner, nodes.high[:, None], nodes.low[:, None])  # (M, 8, 3)
+    corners = torch.where(corner, boxes.high[:, None], boxes.low[:, None])  # (M, 8, 3)
     x, y, depth = (corners @ pose[:, :3].T + pose[:, 3]).unbind(-1)
     seen = depth.amax(1) > 0
     low, high = tangents
@@ -67,7 +79,7 @@ def in_view(nodes: Nodes, camera: SplatCamera, tangents: Tensor) -> Tensor:
             # Where the linear approximation of the projection is evaluated for Gaussians outside of the image.
             outermost = limit.abs() + MARGIN * (high - low)[axis]
             beyond = (side * (at - limit * depth)).amin(1)
-            seen &= beyond <= STRETCH * (1 + outermost.square()).sqrt() * nodes.reach
+            seen &= beyond <= STRETCH * (1 + outermost.square()).sqrt() * boxes.reach
     return seen
 
 

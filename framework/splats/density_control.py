@@ -16,7 +16,7 @@ from nerfloom.base.processes import add_up
 from nerfloom.kernels.splats.blend import ABSOLUTE_X, ABSOLUTE_Y
 from nerfloom.kernels.splats.project import Record, SplatCamera, rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.strategy import Change, Strategy
+from nerfloom.splats.strategy import Change, Rows, Strategy
 
 GRADIENT = 8e-4
 """Gaussians with a larger mean gradient of the image position are cloned or split; images have a longer side of 2
@@ -45,18 +45,21 @@ class GradientMean(nn.Module):
         self.register_buffer("sums", torch.zeros(0, 2))
         self._watched: tuple[Tensor, list[Tensor]] | None = None  # records, and their gradient after the backward pass
         self._longer_side = 1
+        self._rows: Rows | None = None
 
-    def watch(self, records: Tensor, camera: SplatCamera) -> None:
+    def watch(self, records: Tensor, camera: SplatCamera, rows: Rows | None = None) -> None:
         """Keep the gradient of an image's records; does nothing if they require none.
 
         Args:
-            records: (N, RECORD) Gaussians on the image.
+            records: (N, RECORD) Gaussians on the image; (K, RECORD) with `rows`.
             camera: of the image.
+            rows: the Gaussians that `records` are of; None for all.
         """
         if records.requires_grad:
             gradients: list[Tensor] = []
             records.register_hook(gradients.append)  # `retain_grad` would copy them
             self._watched, self._longer_side = (records.detach(), gradients), max(camera.width, camera.height)
+            self._rows = rows
 
     @torch.no_grad()
     def add(self, finite: bool | Tensor = True) -> None:
@@ -68,14 +71,16 @@ class GradientMean(nn.Module):
         watched, self._watched = self._watched, None
         if watched is None or not watched[1]:
             return
-        records, gradient = watched[0], watched[1][-1]
-        if len(self.sums) != len(records):
-            self.sums = records.new_zeros(len(records), 2)
+        records, gradient, rows = watched[0], watched[1][-1], self._rows
+        index: Tensor | slice = slice(None) if rows is None else rows.index
+        count = len(records) if rows is None else rows.count
+        if len(self.sums) != count:
+            self.sums = records.new_zeros(count, 2)
         sizes, shown = image_gradients(gradient, self._longer_side), records[:, Record.OPACITY] > 0
         if isinstance(finite, Tensor):
             sizes, shown = torch.where(finite, sizes, 0), shown & finite
-        self.sums[:, 0] += sizes
-        self.sums[:, 1] += shown
+        self.sums[index, 0] += sizes
+        self.sums[index, 1] += shown
 
     def take(self, count: int) -> Tensor:
         """Return the means (count,) over the images of all processes, and reset them. Gaussians in no image have 0.
@@ -106,8 +111,8 @@ class DensityControl(Strategy):
         self.steps_per_reset, self.gradients = steps_per_reset, GradientMean()
         self._last_step: int | None = None
 
-    def watch(self, records: Tensor, camera: SplatCamera) -> None:
-        self.gradients.watch(records, camera)
+    def watch(self, records: Tensor, camera: SplatCamera, rows: Rows | None = None) -> None:
+        self.gradients.watch(records, camera, rows)
 
     def after_every_step(self, finite: bool | Tensor) -> None:
         self.gradients.add(finite)

@@ -59,8 +59,16 @@ class DrawsGaussians(Renderable):
         """Return the normals, the shortest axes of Gaussians (`Picture.extras`)."""
         return (NORMALS,)
 
+    def gaussians_in(self, view: View) -> Gaussians:
+        """Return Gaussians that include all that a view shows, without gradient; by default all at its time.
+
+        Args:
+            view: the view.
+        """
+        return self.gaussians(view.time)
+
     def render_view(self, view: View, background: Tensor) -> Picture:
-        return self.render_gaussians(self.gaussians(view.time), view, background)
+        return self.render_gaussians(self.gaussians_in(view), view, background)
 
     def render_gaussians(self, gaussians: Gaussians, view: View, background: Tensor) -> Picture:
         """Render the given Gaussians, such as a part of its own.

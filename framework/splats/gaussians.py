@@ -16,6 +16,8 @@ from nerfloom.splats.look import Look
 
 MAX_DEGREE = max(DEGREES)
 """Highest degree of the spherical harmonics of colours."""
+MAX_TESTED = 2**18
+"""Maximum number of Gaussians that are tested at a time."""
 COLUMNS = ("means", "log_scales", "rotations", "logits", "colors", "harmonics")
 """Names of the columns that all Gaussians have."""
 
@@ -96,8 +98,12 @@ class Gaussians:
 
     def finite(self) -> Tensor:
         """Return (N,) whether all parameters of a Gaussian are finite."""
-        values = (each.unsqueeze(-1).flatten(1) for each in self.columns.values())
-        return torch.stack([each.isfinite().all(1) for each in values]).all(0)
+        found = torch.ones(len(self), dtype=torch.bool, device=self.means.device)
+        for values in self.columns.values():
+            for first in range(0, len(self), MAX_TESTED):  # a test of all harmonics at once would take much memory
+                part = values[first : first + MAX_TESTED].unsqueeze(-1).flatten(1)
+                found[first : first + MAX_TESTED] &= part.isfinite().all(1)
+        return found
 
     def drawable(self) -> Tensor:
         """Return (N,) whether a Gaussian can be drawn: finite, with finite sizes and a rotation that is not zero."""

@@ -102,26 +102,30 @@ def shared(logits: Tensor, log_scales: Tensor, counts: Tensor) -> tuple[Tensor, 
 
 
 @torch.no_grad()
-def shaken(gaussians: Gaussians, size: float | Tensor) -> tuple[Tensor | slice, Tensor]:
-    """Return noise for the centres of nearly transparent Gaussians (the paper's equation 7).
+def faint(logits: Tensor) -> Tensor | None:
+    """Return the indices (K,) of nearly transparent Gaussians, which `noise` is for; None for all.
 
     On a device that runs ahead of Python, all Gaussians get noise, to avoid a synchronisation; it is negligible for
     opaque ones.
 
     Args:
-        gaussians: all N Gaussians.
+        logits: (N,) opacities before the sigmoid.
+    """
+    if devices.runs_ahead(logits.device):
+        return None
+    return (torch.sigmoid(logits) < NOISE_FROM + 6 / NOISE_SHARPNESS).nonzero()[:, 0]
+
+
+@torch.no_grad()
+def noise(gaussians: Gaussians, size: float | Tensor) -> Tensor:
+    """Return shifts (K, 3) of the centres of nearly transparent Gaussians, scene units (the paper's equation 7).
+
+    Args:
+        gaussians: K Gaussians.
         size: the noise of a transparent Gaussian, in its standard deviations squared per scene unit; possibly () on the
             device.
-
-    Returns:
-        Indices (K,) of Gaussians, or a slice, and shifts (K, 3) of their centres, scene units.
     """
-    opacity = torch.sigmoid(gaussians.logits)
-    chosen: Tensor | slice = slice(None)
-    if not devices.runs_ahead(opacity.device):
-        chosen = (opacity < NOISE_FROM + 6 / NOISE_SHARPNESS).nonzero()[:, 0]
-    some = gaussians[chosen]
-    gate = torch.sigmoid(-NOISE_SHARPNESS * (opacity[chosen] - NOISE_FROM))
-    axes = rotation_matrices(some.rotations) * some.log_scales.exp()[:, None]
-    noise = torch.randn(len(gate), 3, device=opacity.device) * (size * gate)[:, None]
-    return chosen, (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[:, :, 0]
+    gate = torch.sigmoid(-NOISE_SHARPNESS * (torch.sigmoid(gaussians.logits) - NOISE_FROM))
+    axes = rotation_matrices(gaussians.rotations) * gaussians.log_scales.exp()[:, None]
+    shifts = torch.randn(len(gate), 3, device=gate.device) * (size * gate)[:, None]
+    return (axes @ (axes.transpose(1, 2) @ shifts[:, :, None]))[:, :, 0]

@@ -144,12 +144,16 @@ def packed(gaussians: Gaussians) -> PackedGaussians | None:
     shown = shown[torch.sigmoid(shown.logits) > MIN_ALPHA]
     if not len(shown):
         return None
-    shown = shown[_along_curve(shown.means)]
+    shown = shown[along_curve(shown.means)]
     return pack_gaussians(*(getattr(shown, name) for name in COLUMNS))
 
 
-def _along_curve(means: Tensor) -> Tensor:
-    """Return the order (N,) of positions (N, 3) along a curve through the box of all but the farthest hundredths."""
+def along_curve(means: Tensor) -> Tensor:
+    """Return the order (N,) of positions along a curve through the box of all but the farthest hundredths.
+
+    Args:
+        means: (N, 3) positions, N at least 1.
+    """
     count = len(means)
     ordered = means.sort(dim=0).values
     low, high = ordered[count // 100], ordered[count - 1 - count // 100]

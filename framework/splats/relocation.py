@@ -15,7 +15,7 @@ from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.splats.density_control import GradientMean
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.mcmc import Mcmc, growth, moved
-from nerfloom.splats.strategy import Change, Strategy
+from nerfloom.splats.strategy import Change, Rows, Strategy
 
 GRADIENT_WEIGHT, OPACITY_WEIGHT = 0.5, 0.5
 """Weights lambda_g and lambda_o of the sampling score."""
@@ -30,8 +30,8 @@ class Relocation(Strategy):
         super().__init__()
         self.gradients = GradientMean()
 
-    def watch(self, records: Tensor, camera: SplatCamera) -> None:
-        self.gradients.watch(records, camera)
+    def watch(self, records: Tensor, camera: SplatCamera, rows: Rows | None = None) -> None:
+        self.gradients.watch(records, camera, rows)
 
     def after_every_step(self, finite: bool | Tensor) -> None:
         self.gradients.add(finite)

@@ -63,6 +63,7 @@ class SplattingConfig(
         "flatness_penalty": AT_LEAST_0,
         "normal_loss_mult": AT_LEAST_0,
         "reduced_until": (0, 1),
+        "memory_limit": AT_LEAST_0,
     }
     """Allowed range of each numeric setting."""
     changing_light = "affine"
@@ -124,6 +125,9 @@ class SplattingConfig(
     normal_loss_mult: float = 0.0
     """Weight of the disagreement between the normals of Gaussians and those of the surface at the drawn distances, as
     in 2DGS. It counts after 7/30 of the budget. Such steps draw a second image, of normals."""
+    memory_limit: float | None = None
+    """Memory for the Gaussians that images show, MB (1e6 bytes). All Gaussians and Adam's state are in files in
+    --cache-dir. On a CPU only. Default: all in memory."""
 
     def look(self) -> Look:
         """Return how Gaussians are drawn."""

@@ -20,6 +20,15 @@ class Change(NamedTuple):
     """New Gaussians, with new optimiser state."""
 
 
+class Rows(NamedTuple):
+    """Some of the Gaussians."""
+
+    index: Tensor
+    """(K,) int64 their indices, ascending."""
+    count: int
+    """Number N of all Gaussians."""
+
+
 class Strategy(nn.Module, ABC):
     """A strategy that adds, removes and moves Gaussians.
 
@@ -29,12 +38,13 @@ class Strategy(nn.Module, ABC):
     changes_per_doubling: ClassVar[float] = 5.0
     """Approximate number of changes that double the number of Gaussians; measured for growth by gradients: 4.5 to 6."""
 
-    def watch(self, records: Tensor, camera: SplatCamera) -> None:
+    def watch(self, records: Tensor, camera: SplatCamera, rows: Rows | None = None) -> None:
         """See a training image before its backward pass, to retain gradients for example; nothing by default.
 
         Args:
-            records: (N, C) Gaussians on the image, with a graph.
+            records: (N, C) Gaussians on the image, with a graph; (K, C) with `rows`.
             camera: camera of the image.
+            rows: the Gaussians that `records` are of, with a memory limit; None for all.
         """
 
     def after_every_step(self, finite: bool | Tensor) -> None:

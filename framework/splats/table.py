@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from nerfloom.base.optimised import Optimised, RowChange
+from nerfloom.kernels.adam.row_gradient import RowGradient, table_rows
+from nerfloom.kernels.table_memory import IN_MEMORY, Tables
 from nerfloom.splats.gaussians import Gaussians
 
 
@@ -28,14 +30,33 @@ class Column(nn.Module):
         self.shape, self.in_extents = shape, in_extents
         self.values = nn.Parameter(torch.zeros(0, math.prod(shape)))
         self.optimised = optimised
+        self.tables = IN_MEMORY
+        self.deferred: RowGradient | None = None
 
-    def read(self, extent: Tensor | float) -> Tensor:
+    @property
+    def table(self) -> nn.Parameter:
+        """The values, (N, width): the table of `deferred`."""
+        return self.values
+
+    def keep_in(self, tables: Tables) -> None:
+        """Keep the values in `tables`, where a step reads and changes only the rows that it uses."""
+        self.tables = tables
+        self.deferred = RowGradient() if self.values.shape[1] else None
+        self.set(self.values.data)
+
+    def set(self, values: Tensor) -> None:
+        """Replace the values by `values` (N, width), contiguous, lengths in extents of the scene if `in_extents`."""
+        self.values.data = self.tables.kept(values)
+
+    def read(self, extent: Tensor | float, rows: Tensor | None = None) -> Tensor:
         """Return the values (N, *shape), lengths in scene units.
 
         Args:
             extent: size of the scene, scene units.
+            rows: (K,) int64 the Gaussians to read, each at most once; None for all N.
         """
-        values = self.values.view(len(self.values), *self.shape)
+        values = self.values if rows is None else table_rows(self.values, rows, self.deferred)
+        values = values.view(len(values), *self.shape)
         return values * extent if self.in_extents else values
 
     def rows(self, values: Tensor, extent: Tensor | float) -> Tensor:
@@ -49,10 +70,12 @@ class Column(nn.Module):
         return rows / extent if self.in_extents else rows
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
-        saved = state_dict.get(prefix + "values")
+        saved = state_dict.get(name := prefix + "values")
         if saved is not None and saved.ndim == 2 and saved.shape[1] == self.values.shape[1]:
-            self.values.data = self.values.new_zeros(saved.shape)
+            self.values.data = self.tables.copied(saved, self.values)
+            state_dict = {**state_dict, name: self.values.detach()}
         super()._load_from_state_dict(state_dict, prefix, *rest)
+        self.tables.release()
 
 
 Columns: TypeAlias = Mapping[str, Column]
@@ -80,14 +103,15 @@ def usual_columns(degree: int, rate: float, position_rate: float) -> dict[str, C
     }
 
 
-def as_gaussians(columns: Columns, extent: Tensor | float = 1.0) -> Gaussians:
+def as_gaussians(columns: Columns, extent: Tensor | float = 1.0, rows: Tensor | None = None) -> Gaussians:
     """Return the Gaussians whose parameters are in columns.
 
     Args:
         columns: N rows of each column, by name.
         extent: size of the scene, scene units.
+        rows: (K,) int64 the Gaussians to return, each at most once; None for all N.
     """
-    return Gaussians.of({name: column.read(extent) for name, column in columns.items()})
+    return Gaussians.of({name: column.read(extent, rows) for name, column in columns.items()})
 
 
 def as_rows(columns: Columns, gaussians: Gaussians, extent: Tensor | float = 1.0) -> dict[str, Tensor]:
@@ -110,13 +134,16 @@ def as_rows(columns: Columns, gaussians: Gaussians, extent: Tensor | float = 1.0
     return {name: column.rows(given.get(name, zeros(column)), extent) for name, column in columns.items()}
 
 
-def row_changes(columns: Columns, kept: Tensor, fresh: Gaussians, extent: Tensor | float = 1.0) -> list[RowChange]:
-    """Return the changes of columns that keep some Gaussians and append others.
+def row_changes(
+    columns: Columns, kept: Tensor, fresh: Gaussians, extent: Tensor | float = 1.0, order: Tensor | None = None
+) -> list[RowChange]:
+    """Return the changes of columns that keep some Gaussians and add others.
 
     Args:
         kept: (K,) int64 indices of the Gaussians that stay.
-        fresh: the new Gaussians.
+        fresh: the A new Gaussians.
         extent: size of the scene, scene units.
+        order: (K + A,) int64 order of the Gaussians that stay and then the new ones; None for this order.
     """
     rows = as_rows(columns, fresh, extent)
-    return [RowChange(column.values, kept, rows[name]) for name, column in columns.items()]
+    return [RowChange(column.values, kept, rows[name], order) for name, column in columns.items()]

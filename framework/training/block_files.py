@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from nerfloom.base.errors import DataError
 from nerfloom.blocks.composed import Blocks, GaussianBlocks, Opened, few_in_memory
 from nerfloom.blocks.files import BlockList, read_blocks
+from nerfloom.blocks.visibility import NAME as VISIBILITY
+from nerfloom.blocks.visibility import Visibility, read_visibility
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.scale import read_scale
 from nerfloom.data.scene import Scene
@@ -17,6 +20,9 @@ from nerfloom.training.data_folder import find_data
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.run import TRANSFORMS, Run, read_run
 from nerfloom.training.trained import load_trained
+
+MAX_NETWORKS = 256
+"""Maximum number of visibility networks in memory, of 26 kB each."""
 
 
 def load_blocks(file: Path, device_type: Any = "auto", data: Path | None = None, **settings: Any) -> Loaded:
@@ -41,12 +47,17 @@ def load_blocks(file: Path, device_type: Any = "auto", data: Path | None = None,
         found = load_trained(run, None, device_type, data, **settings)
         return Opened(found.model, found.input_placement)
 
+    @lru_cache(maxsize=MAX_NETWORKS)
+    def visibility(number: int) -> Visibility | None:
+        network = content.blocks[number].run / VISIBILITY
+        return read_visibility(network) if network.is_file() else None
+
     opened = few_in_memory(load)
     first = opened(0).model
     if first.scene.warped:
         raise DataError(f"{file}: its runs are in normalised device coordinates (--ndc), which blocks cannot share")
     kind = GaussianBlocks if isinstance(first, HasGaussians) else Blocks
-    model = kind(content.blocks, opened, placement, _scene(first.scene, content))
+    model = kind(content.blocks, opened, placement, _scene(first.scene, content), visibility)
     source = _source(read_run(content.blocks[0].run), file, device_type, data)
     return Loaded(model, placement, source.method, file, file, source=source).scaled(read_scale(file))
 

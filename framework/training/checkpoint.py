@@ -7,13 +7,13 @@ tensors.
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import re
 import warnings
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch.torch_version import TorchVersion
@@ -32,12 +32,49 @@ SEAL = b"\nsha256:"
 """Bytes before the hexadecimal hash at the end of the file."""
 PIECE = 2**24
 """Bytes to read and hash at a time."""
+MAPPED_SIZE = 2**30
+"""Minimum size of a file that is mapped into memory on a CPU, instead of being read as a whole."""
 SAFE_TORCH = "2.10"
 """First version of PyTorch whose `weights_only` reader is not known to execute code (CVE-2026-24747)."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
-def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bool, before: int | None = None) -> Path:
+class _Hashed:
+    """A file that torch writes to, and the hash of what is written.
+
+    Torch does not expect errors while it writes. So the first one is kept, and the rest is not written.
+
+    Args:
+        file: the file.
+        written: called after each tensor.
+    """
+
+    def __init__(self, file: BinaryIO, written: Callable[[], None]) -> None:
+        self.file, self.written, self.digest = file, written, hashlib.sha256()
+        self.error: OSError | None = None
+
+    def write(self, content: bytes) -> int:
+        if self.error is None:
+            try:
+                self.file.write(content)
+            except OSError as error:
+                self.error = error
+            self.digest.update(content)
+            self.written()
+        return len(content)
+
+    def flush(self) -> None:
+        """Do nothing; `write_atomically` flushes the file."""
+
+
+def save_checkpoint(
+    folder: Path,
+    step: int,
+    state: dict[str, Any],
+    keep_all: bool,
+    before: int | None = None,
+    written: Callable[[], None] = lambda: None,
+) -> Path:
     """Write a checkpoint; then, unless all are kept, remove all but one checkpoint of earlier steps.
 
     Checkpoints of later steps are damaged, since the run continued from an earlier one. They stay and do not count.
@@ -49,6 +86,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
         keep_all: whether all checkpoints are kept.
         before: step of the earlier checkpoint to keep: the run last wrote it or continued from it. If None or missing,
             the checkpoint of the last step before `step` is kept.
+        written: called after each tensor is written, such as `Tables.release`.
 
     Returns:
         The checkpoint's path.
@@ -59,11 +97,7 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
     path = checkpoint_path(folder, step)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        content = io.BytesIO()  # if torch writes to a full disk, it reports "unexpected pos"
-        torch.save({"format": FORMAT, **state}, content)
-        content.seek(0, os.SEEK_END)
-        content.write(SEAL + hashlib.sha256(content.getbuffer()).hexdigest().encode())
-        write_atomically(path, lambda file: file.write(content.getbuffer()))
+        write_atomically(path, lambda file: _write(file, {"format": FORMAT, **state}, written))
     except (OSError, RuntimeError) as error:
         raise CheckpointError(f"cannot write {path}: {error}; earlier checkpoints are unchanged") from error
     for remnant in folder.glob(".step-*.ckpt.*.tmp"):  # from a process killed while writing
@@ -75,6 +109,15 @@ def save_checkpoint(folder: Path, step: int, state: dict[str, Any], keep_all: bo
         if not keep_all and old != kept:
             old.unlink(missing_ok=True)
     return path
+
+
+def _write(file: BinaryIO, content: dict[str, Any], written: Callable[[], None]) -> None:
+    """Write the content of a checkpoint and its seal, without a copy of the tensors in memory."""
+    hashed: Any = _Hashed(file, written)
+    torch.save(content, hashed)
+    if hashed.error is not None:
+        raise hashed.error
+    file.write(SEAL + hashed.digest.hexdigest().encode())
 
 
 @cache
@@ -116,7 +159,7 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
             raise CheckpointError(f"{path} is damaged: its uncompressed size is larger than the file")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns of foreign pickles, which are refused below
-            state = torch.load(path, map_location=device, weights_only=True)
+            state = torch.load(path, map_location=device, weights_only=True, mmap=_is_mapped(path, device))
     except CheckpointError:
         raise
     except FileNotFoundError as error:
@@ -129,6 +172,11 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     if not sealed:
         raise CheckpointError(f"{path} is damaged: its seal is missing")
     return state
+
+
+def _is_mapped(path: Path, device: torch.device | str) -> bool:
+    """Return whether a file is mapped. Windows could not remove it later."""
+    return os.name == "posix" and torch.device(device).type == "cpu" and path.stat().st_size >= MAPPED_SIZE
 
 
 def _is_sealed(path: Path) -> bool:

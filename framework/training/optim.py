@@ -15,7 +15,7 @@ from nerfloom.kernels.adam.adam import all_finite, dense_adam, sparse_adam
 from nerfloom.kernels.adam.row_gradient import RowGradient
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.planes import PlanesGradient
-from nerfloom.kernels.table_memory import require, table
+from nerfloom.kernels.table_memory import IN_MEMORY, Tables, require
 from nerfloom.model import Model
 from nerfloom.renderable import parts
 
@@ -33,6 +33,7 @@ class Adam:
         groups: parameter groups.
         deferred: gradients by table, for tables whose gradient autograd does not accumulate.
         lr, betas, eps: defaults for groups without their own.
+        tables: place of the state of sparse groups.
     """
 
     def __init__(
@@ -42,13 +43,14 @@ class Adam:
         lr: float,
         betas: tuple[float, float],
         eps: float,
+        tables: Tables = IN_MEMORY,
     ) -> None:
         defaults: dict[str, Any] = {"lr": lr, "betas": betas, "eps": eps, "sparse": False}
         self.param_groups = [defaults | group | {"params": list(group["params"])} for group in groups]
         """Settings of each group, with its parameters as `params`; settings may change between steps."""
         self.state: dict[Tensor, dict[str, Tensor]] = {}
         """Moments and counts of each parameter."""
-        self.deferred = deferred
+        self.deferred, self.tables = deferred, tables
         self._rates: list[StepValue] = []
         device = next((parameter.device for parameter in self.parameters), None)
         self._entries, self._entries_on_device = [0, 0], torch.zeros(2, dtype=torch.int64, device=device)
@@ -59,11 +61,16 @@ class Adam:
     def _begin(self, parameter: Tensor, sparse: bool) -> None:
         state: dict[str, Tensor] = {}
         self.state[parameter] = state
-        state["exp_avg"], state["exp_avg_sq"] = (table(*parameter.shape, like=parameter) for _ in range(2))
+        tables = self._tables(sparse)
+        state["exp_avg"], state["exp_avg_sq"] = (tables.zeros(*parameter.shape, like=parameter) for _ in range(2))
         if sparse:
-            state["seen"] = parameter.new_zeros(len(parameter))
+            state["seen"] = tables.zeros(len(parameter), like=parameter)
         else:
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+
+    def _tables(self, sparse: bool) -> Tables:
+        """Return the place of the state of a group's parameters."""
+        return self.tables if sparse else IN_MEMORY
 
     @property
     def entries(self) -> tuple[int, int]:
@@ -90,7 +97,7 @@ class Adam:
         """Continue with groups and states from `state_dict`, or from a PyTorch optimiser with the same groups.
 
         Args:
-            saved: content of a checkpoint. Its tensors are not copied, and later steps change them.
+            saved: content of a checkpoint. Its tensors in memory are not copied, and later steps change them.
 
         Raises:
             ValueError: if the number of groups, or of parameters in a group, differs.
@@ -99,9 +106,10 @@ class Adam:
         if [len(group["params"]) for group in groups] != [len(group["params"]) for group in own]:
             raise ValueError("its parameter groups differ")
         numbers = [number for group in groups for number in group["params"]]
+        tables = [self._tables(group["sparse"]) for group in own for _ in group["params"]]
         self.state = {
-            parameter: {name: value.to(parameter.device) for name, value in saved["state"][number].items()}
-            for parameter, number in zip(self.parameters, numbers, strict=True)
+            parameter: {name: place.kept(value.to(parameter.device)) for name, value in saved["state"][number].items()}
+            for parameter, number, place in zip(self.parameters, numbers, tables, strict=True)
         }
         self.param_groups = [a | b | {"params": a["params"]} for a, b in zip(own, groups, strict=True)]
 
@@ -183,7 +191,7 @@ class Adam:
         """Replace rows of a parameter and of its state; the state of fresh rows is zero.
 
         Args:
-            change: the parameter, its kept rows, and the rows to append.
+            change: the parameter, its kept rows, the new rows, and their order.
 
         Raises:
             ValueError: if this optimiser does not hold the parameter.
@@ -191,15 +199,13 @@ class Adam:
         parameter = change.parameter
         if parameter not in self.state:
             raise ValueError("change_rows: the optimiser does not hold this parameter")
-        added = 0 if change.fresh is None else len(change.fresh)
-        rows = parameter.index_select(0, change.kept)
-        parameter.data = rows if change.fresh is None else torch.cat([rows, change.fresh.to(rows)])
-        parameter.grad = None
         state = self.state[parameter]
+        tables = self._tables("seen" in state)
+        parameter.data = tables.changed(parameter.data, change, change.fresh)
+        parameter.grad = None
         for name in ("exp_avg", "exp_avg_sq", "seen"):
             if name in state:
-                kept = state[name].index_select(0, change.kept)
-                state[name] = torch.cat([kept, kept.new_zeros(added, *kept.shape[1:])])
+                state[name] = tables.changed(state[name], change, None)
 
     def _step_sparse(self, parameter: Tensor, index: int, found_inf: Tensor | None) -> None:
         group, state, deferred = self.param_groups[index], self.state[parameter], self.deferred.get(parameter)
@@ -246,7 +252,8 @@ def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
     require(3.0 * 4 * model.size(), "the model's parameters and Adam's state")
     groups = [_plain(group, config) for group in model.groups()]
     deferred = {module.table: module.deferred for module in parts(model, DefersGradient) if module.deferred is not None}
-    return Adam(groups, deferred, config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps)
+    betas = (config.adam_beta1, config.adam_beta2)
+    return Adam(groups, deferred, config.learning_rate, betas, config.adam_eps, model.tables)
 
 
 def _plain(group: ParameterGroup, config: TrainConfig) -> dict[str, Any]:

@@ -123,7 +123,7 @@ class Trainer:
         step, keep_all, folder = self.state.step, not self.config.save_only_latest_checkpoint, self.checkpoint_folder
         if folder is None:
             return None
-        path = save_checkpoint(folder, step, self._content(), keep_all, before=self._saved_step)
+        path = save_checkpoint(folder, step, self._content(), keep_all, self._saved_step, self.model.tables.release)
         self._saved_step = step
         return path
 

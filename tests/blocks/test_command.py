@@ -31,6 +31,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "block 000: " in done.stderr
     assert "2 of 2 blocks" in done.stderr
+    assert "visibility network 2 of 2: " in done.stderr
     return folder
 
 
@@ -62,6 +63,17 @@ def test_it_is_opened_like_a_run(town: Path, loaded: Loaded) -> None:
     assert picture.size == (24, 24)
     assert bool(picture.rgb.isfinite().all())
     assert len(loaded.run.parse("train").image_paths) == 18
+
+
+@pytest.mark.slow
+def test_visibility_networks_decide_which_blocks_are_drawn(town: Path, loaded: Loaded) -> None:
+    model = loaded.model
+    assert isinstance(model, Blocks)
+    for number, block in enumerate(read_blocks(town / "blocks.yml").blocks):
+        network = model.visibility(number)
+        assert network is not None
+        assert (network.center, network.radius) == (block.center, block.radius)
+        assert (block.run / "visibility.npz").is_file()
 
 
 @pytest.mark.slow

@@ -182,7 +182,7 @@ def test_files_that_may_not_grow(shared_tiny: Path, tmp_path: Path) -> None:
     assert process.returncode == 1
     assert "Traceback" not in said
     assert said.strip().splitlines()[-1].startswith("error: cannot write ")
-    assert said.count("File too large; earlier checkpoints stand") == 3  # at 8, at 12, and at the end: it went on
+    assert said.count("File too large; earlier checkpoints are unchanged") == 3  # at 8, at 12, and at the end
     assert [path.name for path in (folder / FOLDER).iterdir()] == ["step-000000004.ckpt"]
     assert readable_steps(folder) == [4]
 

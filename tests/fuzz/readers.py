@@ -19,6 +19,7 @@ from nerfloom import DataParser, Dataset
 from nerfloom.base.plain import from_plain, read_yaml
 from nerfloom.blocks.block import TrainedBlock
 from nerfloom.blocks.files import BlockList, read_blocks, write_blocks
+from nerfloom.blocks.visibility import Visibility, read_visibility, write_visibility
 from nerfloom.cameras.camera_path import MAX_FRAMES, CameraPath, Keyframe, read_camera_path, write_camera_path
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale, write_scale
@@ -442,6 +443,15 @@ def read_scene_in_blocks(folder: Path, scratch: Path) -> None:
         require(all(len(row) == 4 and all(map(math.isfinite, row)) for row in block.color), "colours of nothing")
 
 
+def write_network(folder: Path) -> None:
+    write_visibility(folder / "visibility.npz", Visibility((1.0, 2.0, 3.0), 4.0))
+
+
+def read_network(folder: Path, scratch: Path) -> None:
+    found = read_visibility(folder / "visibility.npz").of(torch.randn(20, 3), torch.eye(3)[[0] * 20])
+    require(bool(((found >= 0) & (found <= 1)).all()), "no transmittances")
+
+
 def read_checkpoints(folder: Path, scratch: Path) -> None:
     content = load_newest(folder / "run" / FOLDER)
     require(content is None or "model" in content, "a checkpoint without a model")
@@ -613,6 +623,7 @@ READERS: dict[str, Reader] = {
     "blocks": Reader(
         write_two_blocks, read_scene_in_blocks, ("blocks.yml",), ("version", "box", "run", "center", "cameras", "color")
     ),
+    "visibility": Reader(write_network, read_network, ("visibility.npz",)),
     "checkpoint": Reader(write_run, read_checkpoints, ("run/nerfstudio_models/*.ckpt",)),
     "run": Reader(write_run, restore, ("run/nerfstudio_models/*.ckpt",)),
     "archive": Reader(write_archive, unpack_archive, ("scenes.zip",)),

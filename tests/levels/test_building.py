@@ -12,8 +12,9 @@ import torch
 from nerfloom.base.errors import DataError, FlagError
 from nerfloom.levels import building
 from nerfloom.levels.buckets import bucket_of, splits
-from nerfloom.levels.building import build_levels, reaches
+from nerfloom.levels.building import build_levels
 from nerfloom.levels.files import read_levels, row_size
+from nerfloom.levels.on_image import reaches
 from nerfloom.splats.gaussians import Gaussians, Splats
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.stream import GaussianStream
@@ -49,7 +50,7 @@ def test_boxes_reaches_and_errors_hold_for_all_below(tmp_path: Path) -> None:
         while at >= 0:
             centers = chunk.means.double()
             assert bool(((centers >= nodes.low[at]) & (centers <= nodes.high[at])).all())
-            assert float(reaches(chunk).max()) <= float(nodes.reach[at])
+            assert float(reaches(chunk.logits, chunk.log_scales).max()) <= float(nodes.reach[at])
             at = int(nodes.parents[at])
     assert not nodes.errors[leaves(file)].any()
     inner = ~nodes.is_leaf
@@ -62,7 +63,8 @@ def test_boxes_reaches_and_errors_hold_for_all_below(tmp_path: Path) -> None:
 
 def test_reach_is_where_alpha_is_that_of_a_step() -> None:
     given = cloud(5)
-    alpha = torch.sigmoid(given.logits) * torch.exp(-0.5 * (reaches(given) / given.log_scales.exp().amax(1)).square())
+    away = reaches(given.logits, given.log_scales)
+    alpha = torch.sigmoid(given.logits) * torch.exp(-0.5 * (away / given.log_scales.exp().amax(1)).square())
     torch.testing.assert_close(alpha, torch.full((5,), 1 / 255, dtype=torch.float64), rtol=1e-4, atol=0)
 
 

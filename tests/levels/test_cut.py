@@ -47,7 +47,7 @@ def walk(nodes: Nodes, sizes: torch.Tensor, seen: torch.Tensor, error: float) ->
 def test_the_cut_is_that_of_a_walk_from_the_root(file: LevelsFile, number: int) -> None:
     drawn = splat_camera(CAMERAS[number], 0.01)
     sizes = sizes_on_image(file.nodes, drawn, 0.01)
-    seen = in_view(file.nodes, drawn, tangents(CAMERAS[number], drawn.blur))
+    seen = in_view(file.nodes.boxes, drawn, tangents(CAMERAS[number], drawn.blur))
     for error in (0.0, 0.3, 1.0, 3.0, 30.0, 1e6):
         found = cut_of(file.nodes, sizes, seen, error, ALL)
         assert found.error == error
@@ -81,7 +81,7 @@ def test_less_memory_never_has_a_smaller_error(file: LevelsFile) -> None:
 @pytest.mark.parametrize("number", range(len(CAMERAS)))
 def test_nothing_that_is_drawn_is_left_out(file: LevelsFile, number: int) -> None:
     drawn = splat_camera(CAMERAS[number], 0.01)
-    seen = in_view(file.nodes, drawn, tangents(CAMERAS[number], drawn.blur))
+    seen = in_view(file.nodes.boxes, drawn, tangents(CAMERAS[number], drawn.blur))
     visible = [
         bool((RASTERISER.project(file.read(index), drawn).records[:, Record.CUT] > 0).any())
         for index in range(len(file.nodes))
@@ -95,11 +95,11 @@ def test_nothing_that_is_drawn_is_left_out(file: LevelsFile, number: int) -> Non
 def test_what_is_beside_or_behind_is_left_out(file: LevelsFile) -> None:
     away = camera(3.0, turn=torch.pi)
     drawn = splat_camera(away, 0.01)
-    assert not in_view(file.nodes, drawn, tangents(away, drawn.blur)).any()
+    assert not in_view(file.nodes.boxes, drawn, tangents(away, drawn.blur)).any()
     narrow = camera(30.0, turn=0.3)  # 17 degrees beside, and half of an image are 27
-    assert in_view(file.nodes, splat_camera(narrow, 0.01), tangents(narrow, 0.3)).any()
+    assert in_view(file.nodes.boxes, splat_camera(narrow, 0.01), tangents(narrow, 0.3)).any()
     beside = camera(30.0, turn=0.8)
-    assert not in_view(file.nodes, splat_camera(beside, 0.01), tangents(beside, 0.3)).any()
+    assert not in_view(file.nodes.boxes, splat_camera(beside, 0.01), tangents(beside, 0.3)).any()
 
 
 def test_errors_on_the_image() -> None:

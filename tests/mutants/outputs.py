@@ -40,6 +40,16 @@ MUTANTS = {
             "depths of composed pictures are in the units of whichever block they are from",
             "blocks/test_composed.py::test_two_blocks_of_one_colour_each_are_blended_exactly"),
     ],
+    "nerfloom.blocks.sights": [
+        Mutant("seen-through-walls", "Sights._of_image", "1 - opacities.flatten()[at]", "1.0",
+            "blocks count as visible behind walls",
+            "blocks/test_visibility.py::test_labels_in_closed_form"),
+    ],
+    "nerfloom.levels.rows_in_view": [
+        Mutant("boxes-stand-still", "RowsInView.of", "self._stale |= seen", "pass",
+            "Gaussians that a step has moved into an image are not drawn with a memory limit",
+            "levels/test_rows_in_view.py::test_all_that_is_drawn_is_among_them_before_and_after_a_step"),
+    ],
     "nerfloom.blocks.merge": [
         Mutant("doubled-borders", "of_cell", "part[in_cell(A, B, C)]", "part",
             "what two blocks have learned is drawn twice",

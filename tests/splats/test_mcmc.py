@@ -6,7 +6,7 @@ from torch import Tensor
 
 from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.mcmc import DEAD, MAX_COPIES, moved, shaken, shared
+from nerfloom.splats.mcmc import DEAD, MAX_COPIES, faint, moved, noise, shared
 
 
 def some(count: int, logits: Tensor | None = None) -> Gaussians:
@@ -73,10 +73,14 @@ def test_noise_has_the_gaussians_own_shape_and_ends_with_opacity() -> None:
     torch.manual_seed(2)
     count = 40_000
     one = some(1, torch.tensor([DEAD]).logit())
-    which, by = shaken(one.map(lambda values: values.expand(count, *values.shape[1:])), size=2.0)
+    many = one.map(lambda values: values.expand(count, *values.shape[1:]))
+    which, by = faint(many.logits), noise(many, size=2.0)
+    assert which is not None
     assert len(which) == count
     axes = rotation_matrices(one.rotations)[0] * one.log_scales[0].exp()
     covariance = axes @ axes.T
     expected = covariance @ covariance  # half of it squared, as the gate is 1 / 2 there, times 2.0 squared
     torch.testing.assert_close(by.T @ by / count, expected, atol=0.03 * float(expected.norm()), rtol=0)
-    assert len(shaken(some(5), size=2.0)[0]) == 0
+    opaque = faint(some(5).logits)
+    assert opaque is not None
+    assert len(opaque) == 0

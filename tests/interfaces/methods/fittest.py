@@ -11,7 +11,7 @@ from nerfloom.methods import gaussian_splatting
 from nerfloom.methods.gaussian_splatting import GaussianSplatting
 from nerfloom.splats.density_control import GradientMean
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.strategy import Change, Strategy
+from nerfloom.splats.strategy import Change, Rows, Strategy
 
 DROPPED, COPIED = 20, 5
 """One Gaussian in this many is removed at a change, and one in this many is added."""
@@ -24,8 +24,8 @@ class Fittest(Strategy):
         super().__init__()
         self.gradients = GradientMean()
 
-    def watch(self, records: Tensor, camera: SplatCamera) -> None:
-        self.gradients.watch(records, camera)
+    def watch(self, records: Tensor, camera: SplatCamera, rows: Rows | None = None) -> None:
+        self.gradients.watch(records, camera, rows)
 
     def after_every_step(self, finite: bool | Tensor) -> None:
         self.gradients.add(finite)

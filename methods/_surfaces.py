@@ -23,9 +23,10 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.geometry.floor import find_floor
-from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.kernels.compositing.alpha import composite_alpha
+from nerfloom.kernels.compositing.density import composite
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
-from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.surfaces.samples import unit_normals
 from nerfloom.losses.surfaces import (
     Curvature,
     DistanceBounds,
@@ -231,9 +232,13 @@ class SurfaceRenderer(VolumeRenderer):
         if self.training:  # no term of the objective uses them
             return rendered
         assert samples.features is not None
-        assert rendered.weights is not None
-        normals = safe_normalize(samples.features[:, :3].detach())
-        facing = ray_sum(rendered.weights.detach()[:, None] * normals, samples)
+        # Composited like colours over black, in one compiled call: torch would add them to their rays one by one.
+        normals = unit_normals(samples.features[:, :3].detach())
+        over, stopping = composite_alpha, samples.alpha
+        if stopping is None:
+            over, stopping = composite, samples.sigma
+        assert stopping is not None
+        facing = over(samples, stopping.detach(), normals, normals.new_zeros(3), rays.fars).color
         return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
 
 

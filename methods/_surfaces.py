@@ -24,13 +24,14 @@ from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.geometry.floor import find_floor
 from nerfloom.kernels.compositing.alpha import composite_alpha
-from nerfloom.kernels.compositing.density import composite
+from nerfloom.kernels.compositing.density import Composited, composite
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.surfaces.samples import unit_normals
 from nerfloom.losses.surfaces import (
     Curvature,
     DistanceBounds,
     Eikonal,
+    HiddenSpace,
     Silhouette,
     SurfaceColorError,
     SurfacePoints,
@@ -50,6 +51,7 @@ from nerfloom.samplers.evaluated_again import EvaluatedAgain
 from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.inside import inside_foreground
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.scene.hidden_cells import HiddenCells
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
@@ -96,6 +98,7 @@ class SurfaceConfig(
         "silhouette_loss_mult": AT_LEAST_0,
         "points_loss_mult": AT_LEAST_0,
         "bounds_loss_mult": AT_LEAST_0,
+        "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
         "curvature_from": (0, 1),
         "start_radius": (1e-3, 1),
@@ -130,6 +133,9 @@ class SurfaceConfig(
     """Weight of the distance at points of a reconstruction, where it should be 0."""
     bounds_loss_mult: float = 0.1
     """Weight of distances before such points that are negative, or larger than the distance to the point."""
+    hidden_loss_mult: float = 0.1
+    """Weight of positive distances in space that no training ray reaches, below a floor or inside of things. Only with
+    a background on a sphere, and with an occupancy grid."""
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
@@ -234,12 +240,11 @@ class SurfaceRenderer(VolumeRenderer):
         assert samples.features is not None
         # Composited like colours over black, in one compiled call: torch would add them to their rays one by one.
         normals = unit_normals(samples.features[:, :3].detach())
-        over, stopping = composite_alpha, samples.alpha
-        if stopping is None:
-            over, stopping = composite, samples.sigma
+        over = composite if samples.alpha is None else composite_alpha
+        stopping = samples.sigma if samples.alpha is None else samples.alpha
         assert stopping is not None
-        facing = over(samples, stopping.detach(), normals, normals.new_zeros(3), rays.fars).color
-        return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
+        sums: Composited = over(samples, stopping.detach(), normals, normals.new_zeros(3), rays.fars)
+        return replace(rendered, extras={**rendered.extras, NORMALS.name: sums.color})
 
 
 def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
@@ -271,7 +276,7 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     )
 
 
-class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
+class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
     """A model that learns the distance to a surface, its colour, and the poses if asked for."""
 
     step_scale: Tensor
@@ -282,6 +287,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
         Eikonal(),
         SurfacePoints(),
         DistanceBounds(),
+        HiddenSpace(),
         Curvature(),
         *KNOWN_DISTANCES,
     )
@@ -297,9 +303,20 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
         self.surface.cell = float((edges / config.grid_resolution).norm())
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
+        grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None
+        self.hidden = HiddenCells(grids[0].box, grids[0].resolution) if grids and hides else None
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        rendered = super().render(rays, background)
+        if self.training and self.hidden is not None and rendered.samples is not None:
+            samples = rendered.samples
+            self.hidden.note(samples.positions(rays.detached()), samples.deltas.detach())
+        return rendered
 
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
+        if self.hidden is not None:
+            self.hidden.settle(step)
         self.surface.progress, until = progress, self.config.sharpen_until
         self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
         for sampler in parts(self, OccupancySampler):

@@ -52,6 +52,7 @@ from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.inside import inside_foreground
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.hidden_cells import HiddenCells
+from nerfloom.training.ray_starts import nearest_shown
 
 APPEARANCE_SIZE = 16
 """Default length of appearance vectors if the appearance varies."""
@@ -134,8 +135,8 @@ class SurfaceConfig(
     bounds_loss_mult: float = 0.1
     """Weight of distances before such points that are negative, or larger than the distance to the point."""
     hidden_loss_mult: float = 0.1
-    """Weight of positive distances in space that no training ray reaches, below a floor or inside of things. Only with
-    a background on a sphere, and with an occupancy grid."""
+    """Weight of positive distances where images look but no training ray arrives, below a floor or inside of things.
+    Only with a background on a sphere, and with an occupancy grid."""
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
@@ -304,7 +305,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
         grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None
-        self.hidden = HiddenCells(grids[0].box, grids[0].resolution) if grids and hides else None
+        self.hidden = HiddenCells(grids[0].box) if grids and hides else None
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         rendered = super().render(rays, background)
@@ -327,13 +328,15 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
             sampler.stride = self._step_scale.of(self.step_scale)
 
     def start(self, dataset: Dataset) -> None:
-        """Let the first ball stand on the floor, if a reconstruction's points in the sphere show one.
+        """Find what images show, and let the first ball stand on a floor that a reconstruction's points show.
 
         A floor often has no texture. Nothing then pulls a surface to it, and the background would explain it.
 
         Args:
             dataset: the training images.
         """
+        if self.hidden is not None:
+            self.hidden.show(dataset.cameras, nearest_shown(dataset), max(self.config.rays_shared_by, 1))
         distance = self.surface.distance
         if self.sphere is None or dataset.points is None or not isinstance(distance, GridDistance):
             return

@@ -135,7 +135,8 @@ class HiddenSpace(LossTerm):
     """Positive distances in hidden space (`HiddenCells`), which stays solid: nothing else determines its distances.
 
     Without the term, hollows appear below a floor and inside of things, and meshes have their walls. The term is the
-    mean of max(f, 0) over random positions in the box, 0 outside of hidden space, in halves of the box's shortest edge.
+    mean of max(f, 0) over random positions in the box, in halves of its shortest edge. It is 0 outside of hidden and
+    occupied cells.
     """
 
     def __init__(self) -> None:
@@ -150,8 +151,8 @@ class HiddenSpace(LossTerm):
         hidden, grid = parts(model, HiddenCells)[0], parts(model, OccupancySampler)[0]
         low, high = field.box
         places = torch.lerp(low, high, torch.rand(TRIED, 3, device=low.device))
-        distances = torch.relu(field.shape(places).distances)
-        return torch.where(hidden.at(places, grid.occupied), distances, 0).mean() / field.size
+        behind = hidden.at(places) & grid.occupied.index_select(0, grid.occupancy.cells(places))
+        return torch.where(behind, torch.relu(field.shape(places).distances), 0).mean() / field.size
 
 
 class KnownPoints(NamedTuple):

@@ -22,6 +22,7 @@ from nerfloom.kernels.splats.blend import Blended
 from nerfloom.kernels.splats.project import SplatCamera
 from nerfloom.levels.on_image import tangents
 from nerfloom.levels.rows_in_view import RowsInView
+from nerfloom.losses.depth_distortion import image_distortion
 from nerfloom.losses.depth_normals import normal_error
 from nerfloom.model import Model
 from nerfloom.rendering.light import make_light
@@ -33,6 +34,7 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.learning import steps_per_move
 from nerfloom.splats.look import Look
 from nerfloom.splats.mcmc import Mcmc, faint, noise
+from nerfloom.splats.moments import with_moments
 from nerfloom.splats.normals import with_normals
 from nerfloom.splats.rasteriser import Projected, along_curve
 from nerfloom.splats.relocation import Relocation
@@ -46,6 +48,8 @@ MAX_NEW_GAUSSIANS = 1_000
 """Maximum number of Gaussians in a new model."""
 NORMALS_FROM = 7 / 30
 """Share of the budget after which normals count: 7,000 of 30,000 steps in the code of 2D Gaussian Splatting."""
+DISTORTION_FROM = 1 / 10
+"""Share of the budget after which the distortion counts: 3,000 of 30,000 steps there."""
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
     "mcmc": lambda config: Mcmc(),
@@ -263,7 +267,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         kept: Tensor | None,
         progress: float,
     ) -> dict[str, Tensor]:
-        """Return the terms of a loss that make Gaussians flat and turn them along surfaces, with their weights.
+        """Return the terms of a loss that make Gaussians flat and gather them on surfaces, with their weights.
 
         Args:
             gaussians: N Gaussians, with gradient.
@@ -284,6 +288,11 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
             rays = ray_directions(camera)
             error = normal_error(normals, drawn.image[..., 3], drawn.transmittance, rays, kept)
             terms["normals"] = config.normal_loss_mult * error
+        if config.distortion_loss_mult > 0 and progress >= DISTORTION_FROM:
+            black = torch.zeros(3, device=self.device)
+            spread = self.rasteriser.draw(with_moments(shown, self.extent), camera, black, capacity=self.capacity)
+            error = image_distortion(spread.image[..., :2], spread.transmittance, kept)
+            terms["distortion"] = config.distortion_loss_mult * error
         return terms
 
     def after_every_step(self, step: int, progress: float, finite: bool | Tensor) -> None:

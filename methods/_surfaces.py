@@ -24,13 +24,15 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.surface import Sharpness, SurfaceField
 from nerfloom.geometry.floor import find_floor
-from nerfloom.kernels.compositing.density import ray_sum
+from nerfloom.kernels.compositing.alpha import composite_alpha
+from nerfloom.kernels.compositing.density import Composited, composite
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
-from nerfloom.kernels.math import safe_normalize
+from nerfloom.kernels.surfaces.samples import unit_normals
 from nerfloom.losses.surfaces import (
     Curvature,
     DistanceBounds,
     Eikonal,
+    HiddenSpace,
     Silhouette,
     SurfaceColorError,
     SurfacePoints,
@@ -51,6 +53,8 @@ from nerfloom.samplers.evaluated_again import EvaluatedAgain
 from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.inside import inside_foreground
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.scene.hidden_cells import HiddenCells
+from nerfloom.training.ray_starts import nearest_shown
 
 SHARPER = 50.0
 """Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
@@ -95,6 +99,7 @@ class SurfaceConfig(
         "silhouette_loss_mult": AT_LEAST_0,
         "points_loss_mult": AT_LEAST_0,
         "bounds_loss_mult": AT_LEAST_0,
+        "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
         "curvature_from": (0, 1),
         "start_radius": (1e-3, 1),
@@ -127,6 +132,9 @@ class SurfaceConfig(
     """Weight of the distance at points of a reconstruction, where it should be 0."""
     bounds_loss_mult: float = 0.1
     """Weight of distances before such points that are negative, or larger than the distance to the point."""
+    hidden_loss_mult: float = 0.1
+    """Weight of positive distances where images look but no training ray arrives, below a floor or inside of things.
+    Only with a background on a sphere, and with an occupancy grid."""
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
@@ -227,10 +235,13 @@ class SurfaceRenderer(VolumeRenderer):
         if self.training:  # no term of the objective uses them
             return rendered
         assert samples.features is not None
-        assert rendered.weights is not None
-        normals = safe_normalize(samples.features[:, :3].detach())
-        facing = ray_sum(rendered.weights.detach()[:, None] * normals, samples)
-        return replace(rendered, extras={**rendered.extras, NORMALS.name: facing})
+        # Composited like colours over black, in one compiled call: torch would add them to their rays one by one.
+        normals = unit_normals(samples.features[:, :3].detach())
+        over = composite if samples.alpha is None else composite_alpha
+        stopping = samples.sigma if samples.alpha is None else samples.alpha
+        assert stopping is not None
+        sums: Composited = over(samples, stopping.detach(), normals, normals.new_zeros(3), rays.fars)
+        return replace(rendered, extras={**rendered.extras, NORMALS.name: sums.color})
 
 
 def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
@@ -262,7 +273,7 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
     return background_renderer(config, scene, make_background, shown)
 
 
-class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=True):
+class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
     """A model that learns the distance to a surface, its colour, and the poses if asked for."""
 
     step_scale: Tensor
@@ -273,6 +284,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
         Eikonal(),
         SurfacePoints(),
         DistanceBounds(),
+        HiddenSpace(),
         Curvature(),
         *KNOWN_DISTANCES,
     )
@@ -288,9 +300,20 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
         self.surface.cell = float((edges / config.grid_resolution).norm())
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
+        grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None
+        self.hidden = HiddenCells(grids[0].box) if grids and hides else None
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        rendered = super().render(rays, background)
+        if self.training and self.hidden is not None and rendered.samples is not None:
+            samples = rendered.samples
+            self.hidden.note(samples.positions(rays.detached()), samples.deltas.detach())
+        return rendered
 
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
+        if self.hidden is not None:
+            self.hidden.settle(step)
         self.surface.progress, until = progress, self.config.sharpen_until
         self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
         for sampler in parts(self, OccupancySampler):
@@ -301,13 +324,15 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT], plain=
             sampler.stride = self._step_scale.of(self.step_scale)
 
     def start(self, dataset: Dataset) -> None:
-        """Let the first ball stand on the floor, if a reconstruction's points in the sphere show one.
+        """Find what images show, and let the first ball stand on a floor that a reconstruction's points show.
 
         A floor often has no texture. Nothing then pulls a surface to it, and the background would explain it.
 
         Args:
             dataset: the training images.
         """
+        if self.hidden is not None:
+            self.hidden.show(dataset.cameras, nearest_shown(dataset), max(self.config.rays_shared_by, 1))
         distance = self.surface.distance
         if self.sphere is None or dataset.points is None or not isinstance(distance, GridDistance):
             return

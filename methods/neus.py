@@ -33,7 +33,7 @@ class NeuSConfig(SurfaceConfig):
     """Fraction of the budget after which the annealing of the slope ends (`surface_opacity`)."""
 
 
-class NeuS(SurfaceModel[NeuSConfig], plain=True):
+class NeuS(SurfaceModel[NeuSConfig]):
     """A model with the opacity of NeuS, equation 13."""
 
     def before_step(self, step: int, progress: float) -> None:

@@ -44,7 +44,7 @@ class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Maximum error of the opacity from which samples are drawn (error-bounded)."""
 
 
-class VolSDF(SurfaceModel[VolSDFConfig], plain=True):
+class VolSDF(SurfaceModel[VolSDFConfig]):
     """A model with the density of VolSDF, equation 2."""
 
 

@@ -102,6 +102,44 @@ def test_gradients_are_those_of_the_distance(opened: float) -> None:
         assert error.quantile(0.9) < 1e-4  # a few steps cross a cell's face or switch a unit
 
 
+@pytest.mark.parametrize("opened", [4.0, 2.5])
+def test_distances_alone_are_those_with_gradients(opened: float) -> None:
+    """With all levels of the grid and with some of them open; the papers' network has no form for compiled calls."""
+    field = trainer_of("neus").model.field
+    assert isinstance(field, SurfaceField)
+    grid = grid_of(field)
+    torch.nn.init.normal_(grid.table, std=0.05)
+    assert grid.opening is not None
+    grid.opening.opened.fill_(opened)
+    with torch.no_grad():
+        truth = field.shape(places()).distances
+        torch.testing.assert_close(field.signed_distance(Points(places())), truth, atol=1e-5, rtol=0)
+        known = field.distance.known()
+        assert known is not None
+        torch.testing.assert_close(known.with_gradients(places())[0], truth, atol=1e-5, rtol=0)
+    large = trainer_of("neus", **TINY["neus+frequency"]).model.field
+    assert isinstance(large, SurfaceField)
+    assert large.distance.known() is None
+    with torch.no_grad():
+        torch.testing.assert_close(large.signed_distance(Points(places())), large.shape(places()).distances)
+
+
+def test_pictures_have_the_mean_normals_of_rays() -> None:
+    """Sums of weight times unit normal, of opacities and of densities."""
+    for name in METHODS:
+        trainer = trainer_of(name, start_radius=0.5)
+        model, batch = trainer.model.eval(), draw_batch(trainer.train_set, 64, "white")
+        with torch.no_grad():
+            shown = model.render(batch.rays, batch.background)
+        assert shown.samples is not None
+        assert shown.samples.features is not None
+        assert shown.weights is not None
+        normals = torch.nn.functional.normalize(shown.samples.features[:, :3], dim=-1)
+        truth = torch.zeros(64, 3).index_add(0, shown.samples.ray_indices, shown.weights[:, None] * normals)
+        torch.testing.assert_close(shown.extras["normals"], truth, atol=1e-5, rtol=0)
+        assert float(truth.norm(dim=-1).max()) > 0.5
+
+
 def test_distance_and_features_follow_the_position() -> None:
     """Their gradients by positions that require one, against central differences."""
     method = load_method("neus")

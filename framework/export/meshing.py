@@ -19,6 +19,7 @@ from nerfloom.export.colors import seen_colors, spread_colors
 from nerfloom.export.isosurface import isosurface
 from nerfloom.export.lattice import Lattice
 from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
+from nerfloom.export.seen import seen_part
 from nerfloom.export.texture import Texturing, painted
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.math import safe_normalize
@@ -42,9 +43,13 @@ class Cleaning:
     """Minimum number of faces of a component, relative to the largest component."""
     target_num_faces: int | None = None
     """Number of faces that the mesh is simplified to; None for no simplification."""
+    min_views: int = 0
+    """Minimum number of training cameras that see a face; 0 for any (`default_min_views`)."""
 
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
+        if self.min_views < 0:
+            raise FlagError(f"--min-views is {self.min_views}; it must be at least 0")
         if self.num_components < 0 or not 0 <= self.min_component_share <= 1:
             raise FlagError("--num-components must be at least 0, and --min-component-share from 0 to 1")
         if self.target_num_faces is not None and self.target_num_faces < 4:
@@ -208,7 +213,7 @@ def _finished(
 
     `onto` moves vertices onto the surface and returns their normals; None for normals of the faces.
     """
-    mesh = without_degenerate(Mesh(lattice.positions(found[0]), found[1]))
+    mesh = seen_part(without_degenerate(Mesh(lattice.positions(found[0]), found[1])), cameras, cleaning.min_views)
     eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
     mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
     if not len(mesh.faces):

@@ -14,6 +14,7 @@ from nerfloom.export.lattice import Lattice, lattice_of
 from nerfloom.export.mesh import Mesh, closedness
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.export.meshing import Cleaning, density_mesh, distance_mesh, fused_mesh, in_input
+from nerfloom.export.seen import default_min_views
 from nerfloom.export.settings import MarchingCubesSettings, MeshSettings, TsdfSettings
 from nerfloom.export.texture import Texturing
 from nerfloom.renderable import HasDensity, HasSignedDistance
@@ -26,7 +27,7 @@ def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings
     Raises:
         ConfigError: if a setting is out of range, the method has no density, or there is no surface.
     """
-    lattice, cleaning, texturing = _prepared(settings, loaded, path)
+    lattice, cleaning, texturing = _prepared(settings, loaded, path, default_min_views(loaded.model))
     model, level, start = loaded.model, settings.isosurface_threshold, time.monotonic()
     if isinstance(model, HasSignedDistance):
         if level is not None:
@@ -54,7 +55,7 @@ def export_fused(loaded: Loaded, path: Path, settings: TsdfSettings) -> None:
     Raises:
         ConfigError: if a setting is out of range, or there is no surface.
     """
-    lattice, cleaning, texturing = _prepared(settings, loaded, path)
+    lattice, cleaning, texturing = _prepared(settings, loaded, path, min_views=0)  # no view has fused the rest
     if settings.max_num_views < 1:
         raise FlagError(f"--max-num-views is {settings.max_num_views}; it must be at least 1")
     start = time.monotonic()
@@ -63,10 +64,16 @@ def export_fused(loaded: Loaded, path: Path, settings: TsdfSettings) -> None:
     _write(mesh, loaded.placement, path, start)
 
 
-def _prepared(settings: MeshSettings, loaded: Loaded, path: Path) -> tuple[Lattice, Cleaning, Texturing | None]:
-    """Return the lattice and the settings of cleaning and texture, after checks of settings and installed packages."""
+def _prepared(
+    settings: MeshSettings, loaded: Loaded, path: Path, min_views: int
+) -> tuple[Lattice, Cleaning, Texturing | None]:
+    """Return the lattice and the settings of cleaning and texture, after checks of settings and installed packages.
+
+    `min_views` replaces the setting if it is open.
+    """
     require("export", "a mesh needs")
-    cleaning = Cleaning(settings.num_components, settings.min_component_share, settings.target_num_faces)
+    min_views = min_views if settings.min_views is None else settings.min_views
+    cleaning = Cleaning(settings.num_components, settings.min_component_share, settings.target_num_faces, min_views)
     cleaning.check()
     texturing = None
     if settings.texture_size is not None:

@@ -106,6 +106,9 @@ class MeshSettings:
     """Maximum number of separate pieces to keep, largest first; 0: all."""
     min_component_share: float = 0.001
     """Remove pieces with fewer faces than this fraction of the largest piece's."""
+    min_views: int | None = None
+    """Remove faces that fewer training cameras see; 0: keep all. Default: 1 for a signed distance with a background,
+    which has surfaces below a floor and at the back of walls, otherwise 0."""
     target_num_faces: int | None = None
     """Simplify the mesh to this number of faces. Default: no simplification."""
     texture_size: int | None = None

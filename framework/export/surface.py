@@ -9,6 +9,7 @@ from nerfloom.export.density import default_level
 from nerfloom.export.lattice import lattice_of
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.meshing import Cleaning, density_mesh, distance_mesh, fused_mesh, in_input
+from nerfloom.export.seen import default_min_views
 from nerfloom.renderable import HasDensity, HasSignedDistance, Renderable
 from nerfloom.training.loaded import Loaded
 
@@ -60,7 +61,7 @@ def surface_mesh(
     else:
         cameras = loaded.parsed("train").cameras
         if isinstance(model, HasSignedDistance):
-            mesh = distance_mesh(model, lattice, cameras, Cleaning())
+            mesh = distance_mesh(model, lattice, cameras, Cleaning(min_views=default_min_views(model)))
         else:
             mesh = density_mesh(model, lattice, default_level(model.scene.box), 0.0, cameras, Cleaning())
     return in_input(mesh, loaded.placement)

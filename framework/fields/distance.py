@@ -14,6 +14,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.kernels.argument_checks import is_followed
 from nerfloom.kernels.encodings.frequency import frequency_encoding_reference
+from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP
 from nerfloom.kernels.surfaces.distance import distance_network, following_positions
@@ -25,6 +26,7 @@ from nerfloom.kernels.surfaces.samples import (
     stopped_samples,
     surface_samples,
 )
+from nerfloom.kernels.surfaces.signed_distance import SignedDistance, signed_distances
 from nerfloom.kernels.table_memory import require
 
 ROUNDING = 1e-3
@@ -76,6 +78,19 @@ class Distance(nn.Module, ABC):
         Args:
             positions: (N, 3) scene coordinates.
         """
+
+    def values(self, positions: Tensor) -> Tensor:
+        """Return the signed distances (N,) at positions, without the work for their gradient if none is recorded.
+
+        Args:
+            positions: (N, 3) scene coordinates.
+        """
+        shape: Shape = self(positions)
+        return shape.distances
+
+    def known(self) -> SignedDistance | None:
+        """Return the distance in the form for compiled calls; None if it has no such form."""
+        return None
 
     def samples(
         self, positions: Tensor, sharpness: Tensor, intervals: Intervals | None = None
@@ -145,18 +160,30 @@ class GridDistance(Distance):
                 the first counts as constant.
         """
         unit, grid = torch.addcmul(self.shift, positions, self.scale), self.grid
-        first: Tensor = self.first
-        layout, opening = grid.layout, grid.opening
-        table: Tensor = grid.table
-        if opening is not None and not opening.complete:
-            layout = layout.first(opening.count)
-            open_features = layout.num_levels * table.shape[1]
-            factors = opening.completed(first.new_ones(1, open_features), grid.num_features)
-            table, first = table[: layout.num_entries], (first * factors)[:, :open_features]
+        table, first, layout = self._open()
         if grid.deferred is not None:
             grid.deferred.layout = layout
         found = distance_network(unit.detach(), table, first, self.second, layout, grid.deferred)
         return found + following_positions(unit, table, first, self.second, layout) if is_followed(unit) else found
+
+    def _open(self) -> tuple[Tensor, Tensor, HashGridLayout]:
+        """Return table, weights of the hidden layer and layout of the levels that are open."""
+        table, first, layout, opening = self.grid.table, self.first, self.grid.layout, self.grid.opening
+        if opening is None or opening.complete:
+            return table, first, layout
+        layout = layout.first(opening.count)
+        open_features = layout.num_levels * table.shape[1]
+        factors = opening.completed(first.new_ones(1, open_features), self.grid.num_features)
+        return table[: layout.num_entries], (first * factors)[:, :open_features].contiguous(), layout
+
+    def known(self) -> SignedDistance:
+        table, first, layout = self._open()
+        return SignedDistance(self.shift, table, layout, first, self.second, self.first_shape)
+
+    def values(self, positions: Tensor) -> Tensor:
+        if torch.is_grad_enabled():
+            return super().values(positions)
+        return signed_distances(positions, self.known())
 
     def forward(self, positions: Tensor) -> Shape:
         network = self.network(positions)

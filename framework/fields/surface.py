@@ -20,6 +20,7 @@ from nerfloom.kernels.encodings.frequency import frequency_encoding
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.kernels.surfaces.opacity import laplace_density
 from nerfloom.kernels.surfaces.samples import PLACED, Intervals, unit_normals
+from nerfloom.kernels.surfaces.signed_distance import stepped
 
 DIRECTION_LEVELS = 4
 """Bands of the spherical harmonics of viewing directions."""
@@ -140,7 +141,7 @@ class SurfaceField(Field):
         return shape
 
     def reach(self, safety: float) -> Callable[[Tensor], Tensor]:
-        """Return a function from positions (N, 3) to lengths (N,) that rays may step from there, negative inside.
+        """Return a function from positions (N, 3) to lengths (N,) that rays may step from there (`stepped`).
 
         Args:
             safety: maximum slope of the distance along a step, relative to its slope at the position.
@@ -148,13 +149,13 @@ class SurfaceField(Field):
 
         def bound(positions: Tensor) -> Tensor:
             shape = self.shape(positions)
-            return shape.distances / (safety * shape.gradients.norm(dim=-1).clamp(min=1))
+            return stepped(shape.distances, shape.gradients, safety)
 
         return bound
 
     def signed_distance(self, points: Points) -> Tensor:
         """Return the distances (N,) from `points` to the nearest surface, scene units, negative inside."""
-        return self.shape(points.positions).distances
+        return self.distance.values(points.positions)
 
     def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
         if self.color_head is None:
@@ -193,15 +194,15 @@ class SurfaceField(Field):
         return self.density_at(shape.distances), torch.cat([shape.gradients, placed, shape.features], dim=-1)
 
     def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return a bound of the density (N,) within `cell` of each point, and the network's features.
+        """Return a bound of the density (N,) within `cell` of each point, and no features, (N, 0).
 
         The inside counts as occupied: a surface that retreats during training must find its cells.
 
         Args:
             points: N points.
         """
-        shape = self.shape(points.positions)
-        return self.density_at(shape.distances - self.cell), shape.features
+        distances = self.distance.values(points.positions)
+        return self.density_at(distances - self.cell), distances.new_zeros(len(points), 0)
 
 
 class NeuSField(SurfaceField):

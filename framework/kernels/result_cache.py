@@ -49,6 +49,14 @@ class _Value(NamedTuple):
         tensor = self.tensor
         return tensor.data_ptr() == other.data_ptr() and tensor.shape == other.shape and self.version == other._version
 
+    def equals(self, other: Tensor) -> bool:
+        """Return whether `other` is the same memory or has the same values, as weights that each call computes."""
+        if self.is_(other):
+            return True
+        tensor = self.tensor
+        alike = tensor.shape == other.shape and tensor.dtype == other.dtype and tensor.device == other.device
+        return alike and self.unchanged and torch.equal(tensor, other)
+
 
 class _Call(NamedTuple):
     """A call of an operation on one wave."""
@@ -65,7 +73,7 @@ class _Call(NamedTuple):
         return (
             self.key == key
             and len(self.parameters) == len(parameters)
-            and all(value.is_(parameter) for value, parameter in zip(self.parameters, parameters, strict=True))
+            and all(value.equals(parameter) for value, parameter in zip(self.parameters, parameters, strict=True))
             and all(value.unchanged for value in (self.result, *self.inputs))
         )
 

@@ -15,6 +15,9 @@ from nerfloom.kernels.math import safe_normalize
 from nerfloom.losses.functions import charbonnier, mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import ColorError
+from nerfloom.renderable import parts
+from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.scene.hidden_cells import HiddenCells
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
@@ -23,6 +26,8 @@ EVERY, ANYWHERE = 4, 8
 """`Eikonal` uses one in `EVERY` samples, so that others may be without a gradient and are skipped. For each `ANYWHERE`
 samples it adds a random position in the box."""
 
+TRIED = 1024
+"""Number of random positions in the box for `HiddenSpace`."""
 BEHIND = 0.03
 """Thickness of space behind points of a reconstruction that counts as solid, in halves of the box's shortest edge."""
 ABSOLUTE = 0.1
@@ -124,6 +129,30 @@ def normal_change(normals: Tensor, others: Tensor) -> Tensor:
         normals, others: (N, 3).
     """
     return (normals - others).square().sum(-1).mean()
+
+
+class HiddenSpace(LossTerm):
+    """Positive distances in hidden space (`HiddenCells`), which stays solid: nothing else determines its distances.
+
+    Without the term, hollows appear below a floor and inside of things, and meshes have their walls. The term is the
+    mean of max(f, 0) over random positions in the box, in halves of its shortest edge. It is 0 outside of hidden and
+    occupied cells.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("hidden", "hidden_loss_mult")
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return bool(parts(model, HiddenCells))
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        field, model = shown.model.field, shown.model
+        assert isinstance(field, SurfaceField)
+        hidden, grid = parts(model, HiddenCells)[0], parts(model, OccupancySampler)[0]
+        low, high = field.box
+        places = torch.lerp(low, high, torch.rand(TRIED, 3, device=low.device))
+        behind = hidden.at(places) & grid.occupied.index_select(0, grid.occupancy.cells(places))
+        return torch.where(behind, torch.relu(field.shape(places).distances), 0).mean() / field.size
 
 
 class KnownPoints(NamedTuple):

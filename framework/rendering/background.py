@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfloom.base.device import runs_ahead
 from nerfloom.data.scene import Scene
 from nerfloom.fields.base import Field
 from nerfloom.geometry.rays import Rays, Samples
@@ -31,6 +32,11 @@ class SphereRenderer(Renderer):
     by the transmittance of the inside. The far end of the last interval is at infinity, so any density there makes the
     ray opaque.
 
+    The outside is the rest of a ray. Where the inside ends rays early, with a transmittance of at most the bound of its
+    error, pictures leave out the outside too, within the same bound. In training on a CPU such a ray keeps it with a
+    probability, the transmittance relative to the bound, and its colour is then divided by this probability. So colours
+    and their gradients have the same expectation (Arvo and Kirk 1990).
+
     Args:
         renderer: renders the inside, with samples of an `InsideSphere`.
         sphere: (4,) centre and radius, scene units.
@@ -38,22 +44,71 @@ class SphereRenderer(Renderer):
         sampler: chooses samples along inverted rays.
         endless: whether the last interval is endless: for images without an alpha channel, which do not mark
             background.
+        thin: samples outside below this fraction of the mean gradient are thinned in training on the CPU; 0 for none.
     """
 
     sphere: Tensor
 
-    def __init__(self, renderer: Renderer, sphere: Tensor, field: Field, sampler: Sampler, endless: bool) -> None:
+    def __init__(
+        self,
+        renderer: Renderer,
+        sphere: Tensor,
+        field: Field,
+        sampler: Sampler,
+        endless: bool,
+        thin: float = 0.0,
+    ) -> None:
         super().__init__()
         self.renderer, self.field, self.sampler, self.endless = renderer, field, sampler, endless
         self.outputs = renderer.outputs
-        self.behind = VolumeRenderer()
+        self.behind = VolumeRenderer(thin=thin)
         self.register_buffer("sphere", sphere.clone())
 
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         inside = self.renderer.render(rays, samples, field, torch.zeros_like(background))
+        chosen = self._going_on(inside)
+        if chosen is None:
+            return self._over(rays, inside, background)
+        some, chances = chosen
+        behind = background if background.dim() == 1 else background[some]
+        shown = self._over(rays[some], _of_rays(inside, some), behind, chances)
+        return replace(
+            inside,
+            rgb=inside.rgb.index_copy(0, some, shown.rgb),
+            depth=inside.depth.index_copy(0, some, shown.depth),
+            median_depth=inside.median_depth.index_copy(0, some, shown.median_depth),
+            accumulation=inside.accumulation.index_copy(0, some, shown.accumulation),
+            num_samples=shown.num_samples,
+        )
+
+    def _over(self, rays: Rays, inside: Rendered, background: Tensor, chances: Tensor | None = None) -> Rendered:
+        """Composite the inside of R rays in front of the outside.
+
+        Args:
+            rays: the rays themselves.
+            inside: the inside before a black background.
+            background: (R, 3) or (3,) colour in [0, 1] behind everything.
+            chances: (R,) probabilities with which these rays were chosen; None for 1.
+        """
         inverted = InvertedRays.of(rays, self.sphere)
         outside = self.behind.render(inverted, self._sampled(inverted), self.field, background)
+        if chances is not None:
+            outside = replace(outside, rgb=outside.rgb / chances[:, None])
         return over_background(inside, outside, lambda u: distances_behind(u, rays, self.sphere))
+
+    @torch.no_grad()
+    def _going_on(self, inside: Rendered) -> tuple[Tensor, Tensor | None] | None:
+        """Return the rays (K,) whose outside is shown, and their probabilities (K,) in training; None for all rays."""
+        bound, left = inside.error_bound, 1 - inside.accumulation
+        if bound <= 0 or inside.coarse is not None:
+            return None
+        if not self.training:
+            return (left > bound).nonzero().squeeze(-1), None
+        if runs_ahead(left.device):  # it would have to be waited for
+            return None
+        chances = (left / bound).clamp(0, 1)
+        some = (torch.rand_like(chances) < chances).nonzero().squeeze(-1)
+        return some, chances[some]
 
     def _sampled(self, rays: InvertedRays) -> Samples:
         """Return samples of inverted rays; those of rays that end before the sphere are transparent."""
@@ -62,6 +117,13 @@ class SphereRenderer(Renderer):
         if samples.coarse is not None:
             samples = replace(samples, coarse=replace(samples.coarse, samples=_ending_at(samples.coarse.samples, ends)))
         return _ending_at(samples, ends)
+
+
+def _of_rays(inside: Rendered, some: Tensor) -> Rendered:
+    """Return the values of `some` (K,) of the rays, without further values; samples and weights are those of all."""
+    parts = (inside.rgb, inside.depth, inside.median_depth, inside.accumulation)
+    rgb, depth, median, opacity = (values.index_select(0, some) for values in parts)
+    return replace(inside, rgb=rgb, depth=depth, median_depth=median, accumulation=opacity, extras={})
 
 
 def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Tensor], Tensor]) -> Rendered:
@@ -134,8 +196,8 @@ def background_renderer(
     if str(config.sampler) == "hierarchical":
         coarse = make_field(config, scene)
         sampler = HierarchicalSampler(coarse, config.num_coarse_samples, config.num_fine_samples)
-    field = make_field(config, scene)
-    return SphereRenderer(renderer, foreground_sphere(config, scene), field, sampler, endless=not scene.has_alpha)
+    field, endless, thin = make_field(config, scene), not scene.has_alpha, config.thin_gradients
+    return SphereRenderer(renderer, foreground_sphere(config, scene), field, sampler, endless, thin)
 
 
 def _ending_at(samples: Samples, ends: Tensor) -> Samples:

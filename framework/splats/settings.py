@@ -62,6 +62,7 @@ class SplattingConfig(
         "scale_penalty": AT_LEAST_0,
         "flatness_penalty": AT_LEAST_0,
         "normal_loss_mult": AT_LEAST_0,
+        "distortion_loss_mult": AT_LEAST_0,
         "reduced_until": (0, 1),
         "memory_limit": AT_LEAST_0,
     }

@@ -54,8 +54,10 @@ from nerfloom.kernels.splats.blend import BLEND
 from nerfloom.kernels.splats.packed import PROJECT_PACKED, pack_gaussians
 from nerfloom.kernels.splats.project import PROJECT, RECORD, Record, SplatCamera, project_gaussians
 from nerfloom.kernels.splats.tiles import TILES, tile_lists
+from nerfloom.kernels.surfaces.crossings import MARCHED_CROSSINGS
 from nerfloom.kernels.surfaces.distance import DISTANCE_NETWORK
 from nerfloom.kernels.surfaces.samples import SURFACE_SAMPLES, UNIT_NORMALS, FirstShape, Intervals
+from nerfloom.kernels.surfaces.signed_distance import SIGNED_DISTANCES, SignedDistance
 from nerfloom.kernels.traced.colors import TRACED_COLORS, GridColor
 from nerfloom.kernels.traced.squared_error import TRACED_ERROR, PixelTargets
 from nerfloom.kernels.traced.trace import TRACE, GridDensity
@@ -110,6 +112,21 @@ def grid_density() -> GridDensity:
     size = BOX[1] - BOX[0]
     table, weights = 4 * torch.rand(GRID.num_entries, 2) - 2, [torch.randn(8, 6), torch.randn(5, 8)]
     return GridDensity(1 / size, -BOX[0] / size, table, GRID, None, weights)
+
+
+def signed_distance() -> SignedDistance:
+    """A ball on a floor, with a little of a network's output."""
+    scale = 1 / (BOX[1] - BOX[0])
+    floor = torch.tensor([0.0, 0.6, 0.8, -0.5])
+    shape = FirstShape(torch.tensor([0.0, 0.0, 0.5]), scale, 1.0, 0.7, 1e-3, floor)
+    weights = torch.randn(8, 6), torch.randn(5, 8)
+    return SignedDistance(-BOX[0] * scale, 1e-3 * torch.randn(GRID.num_entries, 2), GRID, *weights, shape)
+
+
+def through_a_box(count: int) -> March:
+    """A march of some rays whose steps are all occupied."""
+    occupied = torch.ones(16**3, dtype=torch.bool)
+    return march(rays()[:count], Occupancy(occupied, BOX, 16), 0.05, 0.0, None, 0.0)
 
 
 def octree() -> OctreeLayout:
@@ -183,6 +200,8 @@ CASES: dict[Operation[..., Any], Callable[[], Arguments]] = {
         Intervals(torch.nn.functional.normalize(torch.randn(50, 3), dim=-1), rand(50), 0.4),
     ),
     UNIT_NORMALS: lambda: (rand(50, 7),),
+    SIGNED_DISTANCES: lambda: (3 * torch.rand(50, 3) - 1, signed_distance()),
+    MARCHED_CROSSINGS: lambda: (through_a_box(12), signed_distance(), 0.02, 1.25),
     MULTISAMPLED_GRID: lambda: (rand(50, 1, 4), rand(GRID.num_entries, 2), GRID, None),
     UNIT_MULTISAMPLES: lambda: (frustums(), Pattern(6 * rand(50), torch.ones(50)), BOX, True),
     FRUSTUM_BALLS: lambda: (frustums(), BOX, True),

@@ -13,9 +13,11 @@ from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import MLP, Field
 from nerfloom.fields.deformed import DeformedField
+from nerfloom.fields.distance import GridDistance
 from nerfloom.fields.encoded import DensityField, EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.network_grid import NetworkGrid
+from nerfloom.fields.surface import Sharpness, VolSDFField
 from nerfloom.fields.tensor import VM, TensorField
 from nerfloom.geometry.points import Points
 from nerfloom.kernels import native, result_cache
@@ -181,6 +183,7 @@ OURS: dict[str, Callable[[], nn.Module]] = {
     "deformed network": lambda: moving(nerf()),
     "deformed hash grid": lambda: moving(EncodedField(BOX, grid())),
     "layers between": LayersBetween,
+    "weights that are computed": MadeWeights,
 }
 """Fields; none of their compiled operations may be evaluated twice."""
 UNUSUAL: dict[str, Callable[[], nn.Module]] = {
@@ -192,7 +195,6 @@ UNUSUAL: dict[str, Callable[[], nn.Module]] = {
     "in place": InPlace,
     "codes as many as a wave": lambda: Codes(25),
     "codes as many as chosen": lambda: Codes(45),
-    "weights that are computed": MadeWeights,
 }
 """Fields that lose some of the saving."""
 
@@ -250,6 +252,18 @@ def test_a_field_is_differentiated_and_not_evaluated_again(name: str) -> None:
     field = OURS[name]()
     ran = assert_as_plain(field, partial(at, field), chosen())
     assert ran == set()
+
+
+@needs_kernels
+def test_a_distance_whose_levels_open_is_not_evaluated_again() -> None:
+    """At each call the weights of the open levels are other memory with the same values."""
+    torch.manual_seed(0)
+    opening = HashGrid(4, 2, 4, 32, 9, opening=0.5)
+    nn.init.normal_(opening.table, std=0.01)
+    assert opening.opening is not None
+    opening.opening.opened.fill_(2.5)
+    field = VolSDFField(BOX, GridDistance(BOX, opening, 0.5, 16), Sharpness(20.0, 1e-3), 16)
+    assert "distance_network_forward" not in assert_as_plain(field, partial(at, field), chosen())
 
 
 @needs_kernels

@@ -328,6 +328,14 @@ MUTANTS = {
             "proposals spread over what is empty",
             "kernels/test_step_functions.py::test_blurred_weights_are_integrals_of_the_convolution"),
     ],
+    "nerfloom.kernels.surfaces.crossings": [
+        Mutant("crossing-from-inside", "_noted", "paths.was > 0", "paths.was == paths.was",
+            "a ray that starts inside a solid meets it at once",
+            "samplers/test_first_crossing.py::test_a_ray_that_starts_inside_has_to_leave_first"),
+        Mutant("crossing-hard-edges", "crossings", "(0.5 - 0.5 * A / radius).clamp(max=1)", "torch.ones_like(A)",
+            "edges of traced pictures are jagged, and a pixel too wide",
+            "samplers/test_first_crossing.py::test_edges_cover_the_share_of_a_pixel_that_they_hide"),
+    ],
     "nerfloom.losses.depth_normals": [
         Mutant("normals-of-distances-away", "normals_of_distances", "torch.linalg.cross(A, B)",
             "torch.linalg.cross(B, A)",
@@ -414,14 +422,6 @@ MUTANTS = {
         Mutant("gradient-scaling-inverted", "VolumeRenderer.values", "A / B", "B / A",
             "what is near cameras learns most: floaters",
             "rendering/test_volume.py::test_gradients_are_scaled_near_cameras_in_training_and_values_are_not"),
-    ],
-    "nerfloom.samplers.first_crossing": [
-        Mutant("crossing-from-inside", "_noted", "paths.was > 0", "paths.was == paths.was",
-            "a ray that starts inside a solid meets it at once",
-            "samplers/test_first_crossing.py::test_a_ray_that_starts_inside_has_to_leave_first"),
-        Mutant("crossing-hard-edges", "crossings", "(0.5 - 0.5 * A / radius).clamp(max=1)", "torch.ones_like(A)",
-            "edges of traced pictures are jagged, and a pixel too wide",
-            "samplers/test_first_crossing.py::test_edges_cover_the_share_of_a_pixel_that_they_hide"),
     ],
     "nerfloom.samplers.cells": [
         Mutant("grid-cells-transposed", "places", "[A, B, C, D]", "[A, D, C, B]",

@@ -170,6 +170,58 @@ def test_a_ray_that_ends_inside_sees_nothing_outside() -> None:
     assert not found.accumulation.any()
 
 
+def ended(bound: float, training: bool, copies: int = 1) -> tuple[Rendered, Tensor, Tensor]:
+    """Fog before fog, said to have ended at a transmittance; and the densities inside and outside."""
+    rays = rays_of(12)[torch.arange(12).repeat(copies)]
+    a, b = (torch.tensor(value).double().requires_grad_() for value in (1.0, 0.7))
+    inner, outer = Fog(a, torch.tensor([0.9, 0.2, 0.4]).double()), Fog(b, torch.tensor([0.1, 0.5, 0.8]).double())
+    renderer = SphereRenderer(VolumeRenderer(), SPHERE, outer, UniformSampler(5), endless=False).train(training)
+    samples = dataclasses.replace(uniform(InsideSphere(UniformSampler(7), SPHERE), inner, rays), early_stop=bound)
+    behind = torch.full((len(rays), 3), 0.6, dtype=torch.float64)
+    return renderer.render(rays, samples, inner, behind), a, b
+
+
+def left_inside(rendered: Rendered) -> Tensor:
+    """The transmittance (R,) of the inside alone."""
+    assert rendered.weights is not None
+    assert rendered.samples is not None
+    return 1 - rendered.samples.padded(rendered.weights).sum(-1).detach()
+
+
+def test_pictures_leave_out_what_is_behind_opaque_rays() -> None:
+    """Within the bound of the early stop, of the more opaque half; the other rays stay as they are."""
+    whole, *_ = ended(0.0, training=False)
+    left = left_inside(whole)
+    bound = float(left.median()) * (1 + 1e-6)
+    opaque = left <= bound
+    found, *_ = ended(bound, training=False)
+    assert int(opaque.sum()) == 6
+    for name in ("rgb", "accumulation", "depth", "median_depth"):
+        torch.testing.assert_close(getattr(found, name)[~opaque], getattr(whole, name)[~opaque])
+    apart = (found.rgb - whole.rgb).abs().amax(-1)
+    assert bool((apart <= left + 1e-9).all())
+    assert float(apart[opaque].max()) > 1e-3
+    torch.testing.assert_close(found.accumulation[opaque], (1 - left)[opaque])
+    assert found.num_samples == whole.num_samples - 5 * 6
+    assert found.error_bound == bound
+
+
+@pytest.mark.medium
+def test_training_draws_the_outside_of_opaque_rays_without_bias() -> None:
+    """Means over many draws of colours and of their gradients, against all of the outside."""
+    torch.manual_seed(0)
+    copies = 4_000
+    whole, *densities = ended(0.0, training=True)
+    truth = torch.autograd.grad(whole.rgb.square().sum() + whole.rgb[:, 0].sum(), densities)
+    found, *drawn = ended(float(left_inside(whole).max()), training=True, copies=copies)
+    assert int(found.num_samples) < 0.95 * copies * int(whole.num_samples)
+    mean = found.rgb.view(copies, -1, 3).mean(0)
+    torch.testing.assert_close(mean, whole.rgb, atol=0.01, rtol=0)
+    gradients = torch.autograd.grad(mean.square().sum() + mean[:, 0].sum(), drawn)
+    for value, true in zip(gradients, truth, strict=True):
+        assert float(value) == pytest.approx(float(true), rel=0.05)
+
+
 # -- where the inside ends ----------------------------------------------------------------------------------------
 
 

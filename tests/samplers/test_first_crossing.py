@@ -11,7 +11,8 @@ from nerfloom.cameras.view import View
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
-from nerfloom.samplers.first_crossing import FirstCrossing, Pieces, crossings
+from nerfloom.kernels.surfaces.crossings import Pieces, crossings
+from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.testing.ball import RADIUS
 from tests.test_surfaces import METHODS, trainer_of
 

@@ -219,9 +219,10 @@ def test_gaussians_turn_along_the_surface_that_they_show() -> None:
     assert angle() < 0.15
 
 
-def test_a_run_with_both_terms(shared_tiny: Path, tmp_path: Path) -> None:
+def test_a_run_with_all_terms(shared_tiny: Path, tmp_path: Path) -> None:
     """Growth and changes of the number included."""
-    settings: dict[str, Any] = {"flatness_penalty": 1.0, "normal_loss_mult": 0.05, "max_num_iterations": 40}
+    weights = {"flatness_penalty": 1.0, "normal_loss_mult": 0.05, "distortion_loss_mult": 10.0}
+    settings: dict[str, Any] = {**weights, "max_num_iterations": 40}
     trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, **settings)
     for _ in range(25):
         trainer.train_step()

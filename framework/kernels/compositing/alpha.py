@@ -17,6 +17,9 @@ from torch import Tensor
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import Composited, composite
 
+LEFT_BEHIND = 4e-4
+"""Maximum transmittance behind a sample with an alpha of 1, in float32 (`alpha_depth`)."""
+
 
 def alpha_depth(alpha: Tensor) -> Tensor:
     """Return the optical depth (N,) -log(1 - alpha). It is finite at 1, as is its gradient; NaN stays NaN.

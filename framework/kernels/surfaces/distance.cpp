@@ -1,97 +1,19 @@
 // A network on a hash grid with the gradient of its first output, forward and backward. See distance.py for the
 // reference and the equations.
 #include "grids/hash_grid_tangent.h"
-#include "networks/products.h"
-
-#include <memory>
+#include "surfaces/network.h"
 
 using namespace grid;
-using mlp::BLOCK;
+using namespace surfaces;
 
 namespace {
 
-// The weights of both layers, in whole vectors, with zeros outside.
-struct Network {
-    int inputs, hidden, outputs, wide[3];
-    std::vector<float> first_down, first_up;    // (inputs, hidden) and (hidden, inputs)
-    std::vector<float> second_down, second_up;  // (hidden, outputs) and (outputs, hidden)
-
-    Network(int inputs, int hidden, int outputs, const float* first, const float* second)
-        : inputs(inputs), hidden(hidden), outputs(outputs),
-          wide{mlp::padded(inputs), mlp::padded(hidden), mlp::padded(outputs)} {
-        const int64_t sizes[] = {inputs, hidden, outputs};
-        mlp::check_sizes(sizes, 2);
-        fill(first, inputs, hidden, wide[0], wide[1], first_down, first_up);
-        fill(second, hidden, outputs, wide[1], wide[2], second_down, second_up);
-    }
-    static void fill(const float* weights, int in, int out, int wide_in, int wide_out, std::vector<float>& down,
-                     std::vector<float>& up) {
-        down.assign(size_t(wide_in) * wide_out, 0);
-        up.assign(size_t(wide_in) * wide_out, 0);
-        for (int o = 0; o < out; o++)
-            for (int i = 0; i < in; i++) down[i * wide_out + o] = up[o * wide_in + i] = weights[o * in + i];
-    }
-    // The first output's weights of active units, by the hidden layer before ReLU, of one block.
-    void outward(const float* before, float* to) const {
-        for (int r = 0; r < BLOCK; r++)
-            for (int h = 0; h < wide[1]; h += LANES)
-                store(to + r * wide[1] + h, load(before + r * wide[1] + h) > 0 ? load(second_up.data() + h) : splat(0));
-    }
-    // Hidden layer (BLOCK, hidden) from inputs (BLOCK, inputs), before ReLU.
-    void into_hidden(const float* in, float* to) const {
-        mlp::product(in, wide[0], first_down.data(), inputs, wide[1], to, wide[1]);
-    }
-    void back_to_inputs(const float* from, float* to) const {
-        mlp::product(from, wide[1], first_up.data(), hidden, wide[0], to, wide[0]);
-    }
-};
-
-typedef std::unique_ptr<float[]> Buffer;
-
-inline Buffer buffer(size_t size) { return Buffer(new float[size]); }
-
-// Rows [n, n + size) of `from` (width, `stride` apart) to a block (BLOCK, wide), zeros outside.
-inline void read_rows(const float* from, int64_t stride, int width, int size, float* to, int wide) {
-    std::memset(to, 0, sizeof(float) * size_t(BLOCK) * wide);
-    for (int r = 0; r < size; r++) std::memcpy(to + r * wide, from + r * stride, sizeof(float) * width);
-}
-
-inline void write_rows(const float* from, int wide, int width, int size, float* to, int64_t stride) {
-    for (int r = 0; r < size; r++) std::memcpy(to + r * stride, from + r * wide, sizeof(float) * width);
-}
-
 template <int F>
-void forward(const float* positions, int64_t count, const float* table, const int64_t* resolutions,
-             const int64_t* offsets, int levels, const Network& net, float* out, int threads) {
-    const int64_t width = net.inputs, stride = net.outputs + 3;
-    const int *wide = net.wide;
+void forward(const float* positions, int64_t count, const Table& table, const Network& net, float* out, int threads) {
+    const int64_t stride = net.outputs + 3;
     for_ranges(threads, count, CHUNK, [&](int64_t begin, int64_t end) {
-        const int64_t size = end - begin;
-        const float* places = positions + begin * 3;
-        const Buffer encoded = buffer(size_t(size * width));  // then the gradient by it
-        alignas(64) float in[BLOCK * mlp::MAX_WIDTH], hidden[BLOCK * mlp::MAX_WIDTH], other[BLOCK * mlp::MAX_WIDTH];
-        encode<F>(places, 0, size, table, resolutions, offsets, levels, encoded.get());
-        for (int64_t n = 0; n < size; n += BLOCK) {
-            const int rows = int(std::min<int64_t>(BLOCK, size - n));
-            read_rows(encoded.get() + n * width, width, net.inputs, rows, in, wide[0]);
-            net.into_hidden(in, hidden);
-            net.outward(hidden, other);
-            net.back_to_inputs(other, in);
-            write_rows(in, wide[0], net.inputs, rows, encoded.get() + n * width, width);
-            mlp::activate(hidden, BLOCK * wide[1], mlp::RELU);
-            mlp::product(hidden, wide[1], net.second_down.data(), net.hidden, wide[2], other, wide[2]);
-            write_rows(other, wide[2], net.outputs, rows, out + (begin + n) * stride, stride);
-        }
-        Floats xyz[CHUNK / LANES][3], sum[CHUNK / LANES][3] = {};
-        for (int64_t n = 0; n < size; n += LANES) load_positions(places, n, block(n, size), xyz[n / LANES]);
-        for (int l = 0; l < levels; l++) {
-            const Level level = level_of(resolutions, offsets, l);
-            const auto run = level.dense ? add_position_gradient<F, true> : add_position_gradient<F, false>;
-            run(level, xyz, size, table, encoded.get() + l * F, width, sum);
-        }
-        for (int64_t n = 0; n < size; n++)
-            for (int axis = 0; axis < 3; axis++)
-                out[(begin + n) * stride + net.outputs + axis] = sum[n / LANES][axis][n % LANES];
+        const Buffer encoded = buffer(size_t((end - begin) * net.inputs));
+        outputs_and_gradient<F>(positions + begin * 3, end - begin, table, net, encoded.get(), out + begin * stride);
     });
 }
 
@@ -174,7 +96,8 @@ EXPORT int distance_network_forward(const float* positions, int64_t count, const
                                     int hidden, const float* second, int outputs, float* out, int threads) {
     return guarded([&] {
         const Network net(levels * features, hidden, outputs, first, second);
-#define CALL(F) forward<F>(positions, count, table, resolutions, offsets, levels, net, out, threads)
+        const Table hash{table, resolutions, offsets, levels};
+#define CALL(F) forward<F>(positions, count, hash, net, out, threads)
         FOR_FEATURES(features, CALL)
 #undef CALL
     });

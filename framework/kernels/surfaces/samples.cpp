@@ -2,21 +2,16 @@
 // colour.
 // See samples.py for the reference and the equations.
 #include "runtime/common.h"
+#include "surfaces/first_shape.h"
 
-#include <cmath>
 #include <vector>
+
+using surfaces::FirstShape;
 
 namespace {
 
 constexpr int64_t CHUNK = 512;
 constexpr int PLACED = 6;  // features before the network's: gradient and position
-
-// A ball, and a floor: its normal and its height along the normal.
-struct FirstShape {
-    const float *centre, *scale;
-    float size, radius, rounding;
-    const float* floor;
-};
 
 // Distance and gradient at LANES samples, and the derivatives of what stops light by both.
 struct Lanes {
@@ -27,18 +22,9 @@ struct Lanes {
               const float* lengths, int count, const FirstShape& first) {
         std::memset(this, 0, sizeof *this);
         for (int i = 0; i < count; i++, network += stride, positions += 3) {
-            float offset[3], squares = first.rounding * first.rounding, height = -first.floor[3];
-            for (int axis = 0; axis < 3; axis++) {
-                offset[axis] = positions[axis] - first.centre[axis];
-                squares += offset[axis] * offset[axis];
-                height += first.floor[axis] * positions[axis];
-            }
-            const float far = std::sqrt(squares);
-            const bool lower = height < far - first.radius;
-            distance[i] = (lower ? height : far - first.radius) + first.size * network[0];
-            for (int axis = 0; axis < 3; axis++)
-                gradient[axis][i] = (lower ? first.floor[axis] : offset[axis] / far) +
-                                    first.size * first.scale[axis] * network[stride - 3 + axis];
+            float along[3];
+            distance[i] = first.at(positions, network[0], network + stride - 3, along);
+            for (int axis = 0; axis < 3; axis++) gradient[axis][i] = along[axis];
             if (!directions) continue;
             for (int axis = 0; axis < 3; axis++) direction[axis][i] = directions[i * 3 + axis];
             length[i] = lengths[i];

@@ -60,6 +60,23 @@ class Intervals(NamedTuple):
     """Fraction of the slope's annealing that is done (`surface_opacity`)."""
 
 
+def shape_distance(positions: Tensor, first: FirstShape) -> tuple[Tensor, Tensor]:
+    """Return the distances (N,) of the first shape alone, and their gradients (N, 3), for any device and float type.
+
+    Args:
+        positions: (N, 3) scene coordinates.
+        first: the shape.
+    """
+    offsets = positions - first.centre
+    lengths = (offsets.square().sum(-1) + first.rounding**2).sqrt()
+    normal = first.floor[:3]
+    # Products and sums, because autocast would round a matrix product to bfloat16.
+    heights = (positions * normal).sum(-1) - first.floor[3]
+    lower = heights < lengths - first.radius
+    distances = torch.where(lower, heights, lengths - first.radius)
+    return distances, torch.where(lower[:, None], normal, offsets / lengths[:, None])
+
+
 def first_distance(network: Tensor, positions: Tensor, first: FirstShape) -> tuple[Tensor, Tensor]:
     """Return the distances (N,) and their gradients (N, 3), for any device and float type.
 
@@ -68,15 +85,8 @@ def first_distance(network: Tensor, positions: Tensor, first: FirstShape) -> tup
         positions: (N, 3) scene coordinates.
         first: the distance that the network's first output is added to.
     """
-    offsets = positions - first.centre
-    lengths = (offsets.square().sum(-1) + first.rounding**2).sqrt()
-    normal = first.floor[:3]
-    # Products and sums, because autocast would round a matrix product to bfloat16.
-    heights = (positions * normal).sum(-1) - first.floor[3]
-    lower = heights < lengths - first.radius
-    distances = torch.where(lower, heights, lengths - first.radius) + first.size * network[:, 0]
-    gradients = torch.where(lower[:, None], normal, offsets / lengths[:, None])
-    return distances, gradients + first.size * first.scale * network[:, -3:]
+    distances, gradients = shape_distance(positions, first)
+    return distances + first.size * network[:, 0], gradients + first.size * first.scale * network[:, -3:]
 
 
 def surface_samples(

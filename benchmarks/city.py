@@ -128,7 +128,7 @@ def measured(results: Path) -> Measured:
             city.json may have values by the names of `Measured`, which take precedence.
     """
     runs = _read(results / "methods-procedural.json").get("runs", [])
-    own = next((run for run in runs if run["method"] == METHOD), {})
+    own: dict[str, Any] = next((run for run in runs if run["method"] == METHOD), {})
     found = {
         "rays": own.get("rays_per_second", math.nan),
         "pixels": RENDERED / own.get("render_seconds", math.nan),

@@ -131,10 +131,14 @@ def _taken(content: dict[str, Any], placed: list[tuple[dict[str, Any], str]]) ->
     stated = [{key: frame.get(key, content.get(key)) for key in EXPOSURE} for frame, _ in placed]
     if not any(None not in values.values() for values in stated):
         return None
-    return tuple(
-        Taken() if None in values.values() else Taken.of(*(number(values[key], key, label, True) for key in EXPOSURE))
-        for values, (_, label) in zip(stated, placed, strict=True)
-    )
+    taken = []
+    for values, (_, label) in zip(stated, placed, strict=True):
+        if None in values.values():
+            taken.append(Taken())
+            continue
+        seconds, f_number, iso = (number(values[key], key, label, True) for key in EXPOSURE)
+        taken.append(Taken.of(seconds, f_number, iso))
+    return tuple(taken)
 
 
 def _has_exr(depths: tuple[Path | None, ...] | None) -> bool:

@@ -14,7 +14,7 @@ from nerfloom.base.optimised import RowChange
 from nerfloom.base.pace import Pace
 from nerfloom.base.processes import processes
 from nerfloom.base.user_cache import cache_folder
-from nerfloom.cameras.view import View
+from nerfloom.cameras.view import View, every
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.dispatch import CPP
 from nerfloom.kernels.mapped_tables import MappedTables
@@ -28,7 +28,7 @@ from nerfloom.model import Model
 from nerfloom.rendering.light import make_light
 from nerfloom.splats.capacity import Capacity
 from nerfloom.splats.density_control import DensityControl
-from nerfloom.splats.drawing import draw_colors, ray_directions, smallest_depth
+from nerfloom.splats.drawing import ray_directions, smallest_depth
 from nerfloom.splats.drawn import DrawsGaussians
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.learning import steps_per_move
@@ -173,7 +173,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         It is a factor of means over Gaussians in a loss. So the gradient of a Gaussian does not depend on the number of
         others in view.
         """
-        return 1.0 if self.seen is None else len(self.seen.index) / max(self.seen.count, 1)
+        return 1.0 if self.seen is None else len(self.seen.indices) / max(self.seen.total, 1)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
         return self.learnt_gaussians(time).map(Tensor.detach)
@@ -206,7 +206,9 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         if self.rows_in_view is None:
             return super().render_rgb(view, background)
         gaussians, camera = self.gaussians_in(view), self._camera(view)
-        return self.lit(draw_colors(gaussians, camera, view.stride, background, self.rasteriser), None)
+        drawn = self.rasteriser.draw(self.rasteriser.project(gaussians, camera), camera, background)
+        rgb, transmittance = every(drawn.image, view.stride), every(drawn.transmittance, view.stride)
+        return self.lit(rgb, transmittance, background, None)
 
     def _rows_of(self, view: View, camera: SplatCamera, learns: bool) -> Tensor | None:
         """Return the rows of the Gaussians that a view may show, with a memory limit; None for all."""
@@ -309,9 +311,9 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
                 possibly () on the device.
         """
         logits = self.columns["logits"].values.detach()[:, 0]
-        which = faint(logits if self.seen is None else logits[self.seen.index])
+        which = faint(logits if self.seen is None else logits[self.seen.indices])
         if self.seen is not None and which is not None:
-            which = self.seen.index[which]
+            which = self.seen.indices[which]
         by = noise(self.at_rest(which), size * self._extent.of(self.extent))
         self.columns["means"].values.data[slice(None) if which is None else which] += by / self.extent
 

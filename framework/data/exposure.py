@@ -105,7 +105,8 @@ def _read_exif(path: Path) -> Taken:
         exif.load(content)
         details = exif.get_ifd(DETAILS)
         device = " ".join(f"{exif.get(tag, '')}".strip("\0 ") for tag in (MAKER, MODEL)).strip()
-        return Taken.of(*(_positive(details.get(tag)) for tag in (SECONDS, F_NUMBER, ISO)), device=device)
+        seconds, f_number, iso = (_positive(details.get(tag)) for tag in (SECONDS, F_NUMBER, ISO))
+        return Taken.of(seconds, f_number, iso, device)
     except Exception:  # of any type, by missing files and by Pillow; a damaged image is reported when it is decoded
         return Taken()
 

@@ -102,5 +102,7 @@ class Scene:
 
     def to(self, device: torch.device | str) -> Scene:
         """Return the scene on `device`."""
-        tensors = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        tensors: dict[str, Any] = {
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
         return replace(self, **tensors)

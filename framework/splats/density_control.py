@@ -72,8 +72,8 @@ class GradientMean(nn.Module):
         if watched is None or not watched[1]:
             return
         records, gradient, rows = watched[0], watched[1][-1], self._rows
-        index: Tensor | slice = slice(None) if rows is None else rows.index
-        count = len(records) if rows is None else rows.count
+        index: Tensor | slice = slice(None) if rows is None else rows.indices
+        count = len(records) if rows is None else rows.total
         if len(self.sums) != count:
             self.sums = records.new_zeros(count, 2)
         sizes, shown = image_gradients(gradient, self._longer_side), records[:, Record.OPACITY] > 0

@@ -126,6 +126,9 @@ class SplattingConfig(
     normal_loss_mult: float = 0.0
     """Weight of the disagreement between the normals of Gaussians and those of the surface at the drawn distances, as
     in 2DGS. It counts after 7/30 of the budget. Such steps draw a second image, of normals."""
+    distortion_loss_mult: float = 0.0
+    """Weight of the spread of Gaussians along each ray, as in 2DGS. It counts after 1/10 of the budget. Such steps draw
+    a further image."""
     memory_limit: float | None = None
     """Memory for the Gaussians that images show, MB (1e6 bytes). All Gaussians and Adam's state are in files in
     --cache-dir. On a CPU only. Default: all in memory."""

@@ -23,9 +23,9 @@ class Change(NamedTuple):
 class Rows(NamedTuple):
     """Some of the Gaussians."""
 
-    index: Tensor
+    indices: Tensor
     """(K,) int64 their indices, ascending."""
-    count: int
+    total: int
     """Number N of all Gaussians."""
 
 

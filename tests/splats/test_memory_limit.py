@@ -68,7 +68,7 @@ def test_a_step_is_that_without_a_limit_for_what_it_may_show_and_leaves_the_rest
     first = {name: column.values.detach().clone() for name, column in limited.columns.items()}
     optimizers = trained(limited), trained(free)
     assert limited.seen is not None
-    assert torch.equal(limited.seen.index, near.nonzero()[:, 0])
+    assert torch.equal(limited.seen.indices, near.nonzero()[:, 0])
     for name, column in limited.columns.items():
         found, expected = column.values.detach(), free.columns[name].values.detach()[order]
         assert torch.equal(found[~near], first[name][~near]), name

@@ -115,7 +115,7 @@ def field_colors(model: RayModel[Any], centers: Tensor, size: float) -> Colors:
 
 
 def leaf_colors(leaves: PackedLeaves) -> Colors:
-    """Return the colours of an octree's own leaves, on the CPU."""
+    """Return the colours of an octree's own `leaves`, on the CPU."""
     terms = leaves.colors.shape[1] // 3
 
     def colors(chosen: Tensor, directions: Tensor) -> Tensor:

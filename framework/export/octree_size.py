@@ -69,7 +69,7 @@ def chosen(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> tuple[i
 
 
 def room_for(max_bytes: float, degree: int) -> int:
-    """Return the number of leaves with harmonics of a degree that a file has room for."""
+    """Return the number of leaves with harmonics of a `degree` that fit into a file of `max_bytes`."""
     return max(int(max_bytes / (COMPRESSED * (1 + 3 * (degree + 1) ** 2))), 0)
 
 

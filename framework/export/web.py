@@ -88,7 +88,7 @@ class PageFacts:
 
     @property
     def kind(self) -> str:
-        """What the page draws, a key of `SCRIPTS`."""
+        """The kind of the page, a key of `SCRIPTS`."""
         return "gaussians" if self.look else "octree"
 
 

@@ -33,7 +33,7 @@ def test_every_benchmark_shows_its_flags(name: str) -> None:
     done = called("ns-bench", name, "--help") if name in bench.KINDS else benchmarked(name, "--help")
     assert done.returncode == 0
     named = {"contention", "cache", "meshes", "operations", "frames"}
-    flags = {"poses": "--processed"} | dict.fromkeys(named, "--output")
+    flags = {"poses": "--processed", "city": "--results"} | dict.fromkeys(named, "--output")
     assert flags.get(name, "--output-dir") in done.stdout
 
 

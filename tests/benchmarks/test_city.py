@@ -10,11 +10,11 @@ import yaml
 
 from benchmarks.city import City, Constants, Measured, constants, markdown, measured, rows
 from nerfloom.base.errors import FlagError
+from nerfloom.base.json_files import write_json
 from nerfloom.blocks.block import TrainedBlock
 from nerfloom.blocks.files import BlockList, write_blocks
 from nerfloom.blocks.split import grid_blocks
 from nerfloom.blocks.visibility import Visibility
-from nerfloom.training.run import write_json
 
 ROOT = Path(__file__).parents[2]
 

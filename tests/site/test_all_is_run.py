@@ -39,6 +39,7 @@ ELSEWHERE = {
     r"python -m benchmarks (quadrature|processes|contention|cache|poses|tables)": (
         "tests/benchmarks/test_bench_command.py"
     ),
+    r"python -m benchmarks city": "tests/benchmarks/test_city.py",
     r"python -m nerfloom.cli.bench gpu": "tests/benchmarks/test_gpu.py",
     r"ns-bake": "tests/export/test_bake.py",
     r"ns-edit": "tests/edit/test_command.py",

@@ -20,6 +20,7 @@ from nerfloom.fields.normals import NormalHead, density_normals
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.color import to_linear, to_srgb
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.histograms.spacing import from_disparity, to_disparity
 from nerfloom.kernels.march.occupancy import Occupancy
@@ -139,12 +140,14 @@ def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.entry(15)
-def test_srgb_curves_have_no_gradient_and_a_value_at_black() -> None:
-    """Colours are as stored; numpy has curves for the light of photographs and for glTF files, without a gradient.
-
-    A curve that is learnt through needs a test of its slope at 0.
-    """
-    assert mentioned(r"\*\* *2\.4\b") == ["gltf.py", "light_spread.py"]
+def test_srgb_curves_have_a_slope_and_a_value_at_black() -> None:
+    """Colours are as stored; numpy has curves for the light of photographs and for glTF files, without a gradient."""
+    assert mentioned(r"\*\* *2\.4\b") == ["color.py", "gltf.py", "light_spread.py"]
+    for curve, linear in ((to_srgb, 12.92), (to_linear, 1 / 12.92)):
+        x = torch.tensor([0.0, 1e-30, 1e-4, 0.5, 1.0], requires_grad=True)
+        (slope,) = torch.autograd.grad(curve(x).sum(), x)
+        assert slope.tolist()[:3] == pytest.approx([linear] * 3, rel=1e-6)
+        assert bool(slope.isfinite().all()) and curve(x)[0] == 0
     black = light_of(np.zeros((16, 16, 3), np.uint8))
     assert black.tolist() == [[-9.0] * len(QUANTILES), [0.0] * len(QUANTILES), [0.0] * len(QUANTILES)]
 

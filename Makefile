@@ -38,6 +38,7 @@ lint: .venv/installed-test .venv/links
 	$(BIN)/mypy
 
 docs: .venv/installed-docs .venv/links
+	$(BIN)/python docs/building/prose.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	$(BIN)/python docs/building/check_links.py site
 

@@ -9,7 +9,7 @@ look; on Linux, set it up for torch's CPU builds first, or each session installs
     nox -s without_torch                         what needs no torch, under every Python, in a minute each
     nox -s cluster                               jobs on a real Ray cluster, with the version in constraints.txt
 
-docs/start/install.md says what ran and what did not.
+docs/platforms.md says what ran and what did not.
 """
 
 import os

@@ -21,7 +21,10 @@ from docs.building.measured import TABLES
 from nerfloom.benchmarks.results import read_rows
 
 DOCS = Path(__file__).parents[1]
-PAGES = ("figures.md", "published.md", "guides/choosing.md", "benchmarks.md", "stability.md")
+PAGES = (
+    "../README.md", "figures.md", "published.md", "guides/choosing.md", "benchmarks.md", "benchmarks-parts.md",
+    "stability.md",
+)  # fmt: skip
 """The pages with such tables."""
 COLUMNS = {column[0]: column for column in all_columns(("1", "1/2", "1/4", "1/8"), {})}
 MARK = re.compile(

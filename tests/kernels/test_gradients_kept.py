@@ -467,7 +467,7 @@ WITHOUT_A_GRADIENT = {
     "sort_by_ray", "gather_rows", "resample_intervals",  # documented to have none
     "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "hash_grid_tangent_adam", "multisampled_grid_adam",
     "hash_grid_tangent_forward",  # of the optimiser; and refused where a gradient is asked for
-    "signed_distances", "crossings_find", "crossings_take",  # distances and samples without one, for occupancy and pictures
+    "signed_distances", "crossings_find", "crossings_take",  # without one, for occupancy and pictures
     "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
     "splat_sort", "splat_bound", "splat_bin", "group_rows",  # whose results are indices
     "octree_weights", "adam_rows", "octree_trace_packed",  # documented to have none; of the optimiser; of bytes

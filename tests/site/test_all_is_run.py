@@ -55,6 +55,7 @@ ELSEWHERE = {
     r"torchrun": "tests/training/test_processes.py",
     r"python examples/": "tests/plug_and_play/test_examples.py",
     r"python docs/building/failures": "tests/site/test_failures.py",
+    r"python -m docs\.building\.tables": "tests/site/test_figures.py",
 }
 """Beginning of a command -> the test that runs it, or its like."""
 NOT_RUN = r"(nerfbaselines|pip install nerfbaselines)"

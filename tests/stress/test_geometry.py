@@ -147,7 +147,8 @@ def test_srgb_curves_have_a_slope_and_a_value_at_black() -> None:
         x = torch.tensor([0.0, 1e-30, 1e-4, 0.5, 1.0], requires_grad=True)
         (slope,) = torch.autograd.grad(curve(x).sum(), x)
         assert slope.tolist()[:3] == pytest.approx([linear] * 3, rel=1e-6)
-        assert bool(slope.isfinite().all()) and curve(x)[0] == 0
+        assert bool(slope.isfinite().all())
+        assert curve(x)[0] == 0
     black = light_of(np.zeros((16, 16, 3), np.uint8))
     assert black.tolist() == [[-9.0] * len(QUANTILES), [0.0] * len(QUANTILES), [0.0] * len(QUANTILES)]
 

@@ -38,7 +38,7 @@ class DrawsOctree(RendersRays):
     @property
     @abstractmethod
     def layout(self) -> OctreeLayout:
-        """Where the L leaves are."""
+        """The places of the L leaves."""
 
     @abstractmethod
     def depths(self, leaves: Tensor | None = None) -> Tensor:

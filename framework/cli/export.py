@@ -34,7 +34,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   ns-export tsdf RUN_FOLDER --output-dir exports
 
 Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat, levels and web need no
-data, others --data DIR. web also shows an octree of ns-bake (.octree).
+data, others --data DIR. web also shows an octree of ns-bake (.octree), and levels (.levels), which stream.
 
   ns-export web splat.ply --output-dir exports
 

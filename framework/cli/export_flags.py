@@ -112,7 +112,7 @@ class WebFlags(WebSettings, RegionFlags, ExportFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshFlags(MeshSettings, ExportFlags):
+class MeshFlags(MeshSettings, RegionFlags, ExportFlags):
     """Flags of every mesh."""
 
     format: Literal["ply", "obj", "glb"] = "ply"

@@ -30,7 +30,7 @@ class Lens:
     """Intrinsics shared by the images of a camera."""
 
     model: str
-    """OPENCV, OPENCV_FISHEYE or PINHOLE."""
+    """OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR; FISHEYE624 for images that are cut (`aria_lens.py`)."""
     values: dict[str, float]
     """w, h, fl_x, fl_y, cx, cy in pixels (the first pixel's centre is at 0.5), and the model's k1, k2, ..."""
 

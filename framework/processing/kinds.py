@@ -166,7 +166,7 @@ def _convert_record3d(flags: Record3DFlags) -> None:
         find_root(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
     with unpacked(flags.data, flags.output_dir, place) as export:
-        convert(export, flags.output_dir, flags.num_downscales, flags.most)
+        convert(export, flags.output_dir, flags.num_downscales, flags.most, flags.ply)
 
 
 def _convert_metashape(flags: MetashapeFlags) -> None:

@@ -20,11 +20,9 @@ from nerfloom.processing.images import PreparedImage, in_parallel, output_names,
 from nerfloom.processing.named_images import PlacedImages, reasons
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
-from nerfloom.processing.transforms import Frame, Lens, content, transformed, write_points
+from nerfloom.processing.transforms import POINTS, Frame, Lens, content, transformed, write_points
 from nerfloom.processing.views import View, Views, cut, view_lens
 
-POINTS = "sparse_pc.ply"
-"""File of the points."""
 PANORAMA, PERSPECTIVE = "EQUIRECTANGULAR", "OPENCV"
 """Models of lenses."""
 ALWAYS_CUT = {aria_lens.MODEL}

@@ -202,6 +202,9 @@ class PolycamFlags(PhoneFlags):
 class Record3DFlags(PhoneFlags):
     """Convert Record3D's export with EXR and RGBD."""
 
+    ply: Path | None = None
+    """Points that Record3D has exported of the same recording: a PLY file, or a folder of several."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ProgramFlags(ViewFlags):

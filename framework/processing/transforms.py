@@ -11,6 +11,8 @@ import numpy as np
 
 from nerfloom.base.errors import DataError
 
+POINTS = "sparse_pc.ply"
+"""File of the points beside transforms.json."""
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """(3, 4) transform from COLMAP's frame, which tends to have y down, to one with z up."""
 

@@ -32,7 +32,6 @@ from nerfloom.export.web import (
     pinhole,
     room,
     shown_cameras,
-    still_room,
     upright,
     with_still,
 )
@@ -111,7 +110,7 @@ def export_page(
     with torch.no_grad():
         picture = to_uint8(page.draw(camera))
     write_images([path.with_suffix(PICTURE_SUFFIX)], [picture])
-    content = with_still(page.text, picture, still_room(settings.max_megabytes)).encode("utf-8", "replace")
+    content = with_still(page.text, picture, settings.max_megabytes).encode("utf-8", "replace")
     write_atomically(path, lambda file: file.write(content))
     say(f"{len(content) / 1e6:.2f} MB, {page.words}: {path}")
     if moment is not None:
@@ -121,8 +120,7 @@ def export_page(
 
 
 def kind_of(model: Renderable) -> str:
-    """Return what the page of `model` shows if no setting says it, a key of `SCRIPTS`: what the model is, or
-    Gaussians."""
+    """Return what the page of `model` shows if no setting says it, a key of `SCRIPTS`."""
     if isinstance(model, DrawnLevels):
         return "levels"
     return "octree" if isinstance(model, DrawnOctree) else "gaussians"

@@ -51,7 +51,7 @@ SCRIPTS = {
 }
 """Files of the program of each kind of page, in their order."""
 STILL_SHARE, MAX_STILL = 0.05, 60_000
-"""Share of a page for the still picture, and the maximum size of its text, bytes."""
+"""Share of a page's room that is left for the still picture, and the maximum size of its text, bytes."""
 STILL_SIZES = ((600, 80), (600, 60), (400, 60), (200, 50))
 """Widths, pixels, and qualities of JPEG that are tried for it, one after the other."""
 NO_STILL = 'src="data:,"'
@@ -101,7 +101,7 @@ class PageFacts:
 
     @property
     def kind(self) -> str:
-        """What the page draws, a key of `SCRIPTS`."""
+        """The kind of scene that the page draws, a key of `SCRIPTS`."""
         return "levels" if self.levels else "gaussians" if self.look else "octree"
 
 
@@ -221,26 +221,19 @@ def room(facts: PageFacts, max_megabytes: float) -> float:
         ConfigError: if the limit is above MAX_MEGABYTES.
     """
     check_size(max_megabytes)
-    return (1e6 * max_megabytes - still_room(max_megabytes) - len(page(b"", facts).encode())) // 4 * 3
+    free = 1e6 * max_megabytes - len(page(b"", facts).encode())
+    return (free - min(STILL_SHARE * free, MAX_STILL)) // 4 * 3
 
 
-def still_room(max_megabytes: float) -> float:
-    """Return the number of bytes that a page has for the text of its still picture.
-
-    Args:
-        max_megabytes: maximum size of the page, in millions of bytes.
-    """
-    return min(STILL_SHARE * 1e6 * max_megabytes, MAX_STILL)
-
-
-def with_still(text: str, picture: np.ndarray, most: float) -> str:
+def with_still(text: str, picture: np.ndarray, max_megabytes: float) -> str:
     """Return a page with a still picture, which browsers show until the scene is drawn, or if they cannot draw it.
 
     Args:
         text: content of a page without one.
         picture: (H, W, 3) uint8 picture of the start view.
-        most: maximum number of bytes of its text; the page stays as it is if the picture does not fit.
+        max_megabytes: maximum size of the page, in millions of bytes; it stays as it is if no picture fits.
     """
+    most = min(1e6 * max_megabytes - len(text.encode("utf-8", "replace")), MAX_STILL)
     for width, quality in STILL_SIZES:
         content = io.BytesIO()
         small = Image.fromarray(picture)

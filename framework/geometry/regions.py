@@ -126,7 +126,13 @@ class Sphere:
         return Sphere(self.center, self.radius + by)
 
     def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Sphere:
-        """Return the ball after a similarity transform, as `Box.moved` does."""
+        """Return the ball after a similarity transform x -> scale * rotation @ x + shift.
+
+        Args:
+            rotation: (3, 3) rotation, float64, on the CPU.
+            scale: factor of lengths.
+            shift: (3,) shift, float64, on the CPU.
+        """
         center = scale * (rotation @ torch.tensor(self.center, dtype=torch.float64)) + shift
         return Sphere(_vector(center), scale * self.radius)
 

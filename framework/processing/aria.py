@@ -109,7 +109,10 @@ def read_capture(images: Path, results: Path, most: int) -> Capture:
 
 
 def image_times(folder: Path) -> tuple[dict[str, int], int]:
-    """Return the time of each image of the colour camera in a folder, microseconds, and the number of other images.
+    """Return the time of each image of the colour camera, microseconds, and the number of other images.
+
+    Args:
+        folder: folder of the images.
 
     Raises:
         DataError: if there is no image of that camera.

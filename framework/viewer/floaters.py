@@ -21,7 +21,7 @@ MAX_POINTS = 20_000
 
 
 class Floaters(NamedTuple):
-    """What floats in a scene."""
+    """The matter that floats in a scene."""
 
     positions: Tensor
     """(K, 3) float32 on the CPU, scene coordinates."""

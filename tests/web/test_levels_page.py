@@ -64,7 +64,7 @@ def test_chunks_lie_beside_the_page(file: LevelsFile, tmp_path: Path) -> None:
     for index in range(len(file.nodes)):
         expected = transformed(file.read(index), *model.placement.similarity())
         found = read_spz(out / "scene" / f"{index}.spz").gaussians
-        torch.testing.assert_close(found.means, expected.means, atol=1e-3, rtol=0)
+        torch.testing.assert_close(found.means, expected.means, atol=2e-3, rtol=0)
         total += len(found) if index in leaves(file) else 0
     assert total == 3000
     page = out / "scene.html"

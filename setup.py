@@ -14,8 +14,10 @@ import os
 import platform
 import runpy
 import sys
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from threading import Lock
 
 from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
@@ -76,6 +78,8 @@ NETWORK_FLAGS = ["-fno-wrapv"]
 class BuildKernels(build_ext):
     """Compiles the fastest variant for this processor; with NERFLOOM_VARIANTS=all every one that the compiler can."""
 
+    lock = Lock()
+
     def get_ext_filename(self, fullname: str) -> str:
         suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
         return os.path.join(*fullname.split(".")) + suffix
@@ -89,8 +93,10 @@ class BuildKernels(build_ext):
             self.extensions = []
             return
         variants, self.extensions = self.extensions, []
+        self.done, self.total, self.begun = 0, 0, time.monotonic()
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for group in [[each] for each in reversed(variants)] if HERE else [variants]:
+                self.total += sum(len(each.sources) for each in group)
                 jobs = [[pool.submit(self.compile_source, each, path) for path in each.sources] for each in group]
                 self.extensions += [each for each, job in zip(group, jobs, strict=True) if self.link(job, each)]
                 if self.extensions:
@@ -110,7 +116,19 @@ class BuildKernels(build_ext):
             ],
             depends=ext.depends,
         )
+        self.report(ext, source)
         return path
+
+    def report(self, ext: Extension, source: str) -> None:
+        """Say how many files are compiled, and the time left; pip shows it with -v."""
+        with self.lock:
+            self.done += 1
+            left = (time.monotonic() - self.begun) / self.done * (self.total - self.done)
+            variant = ext.name.rsplit(".", 1)[-1]
+            print(
+                f"kernels: {self.done} of {self.total} files, {left:.0f} s left ({variant}: {Path(source).name})",
+                flush=True,
+            )
 
     def link(self, compiled: list[Future[str]], ext: Extension) -> bool:
         """Link a variant; if it cannot be built, say why, and return False."""

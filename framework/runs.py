@@ -65,8 +65,8 @@ def process(photographs: str | Path, output_dir: str | Path, kind: str = "images
     Args:
         photographs: folder of photographs, a video, or the export of a phone's app or of another program.
         output_dir: folder to write; new or empty.
-        kind: images, video (each takes the other's input, too), polycam, record3d, metashape, realitycapture, odm or
-            bundler.
+        kind: images, video (each takes the other's input, too), polycam, record3d, metashape, realitycapture, odm,
+            bundler or aria.
         settings: flags of `ns-process-data` by name, with underscores, as in `matching_method="sequential"`.
 
     Raises:

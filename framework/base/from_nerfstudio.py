@@ -105,7 +105,6 @@ NO_FORMATS = (
 _MESH = "use 'marching-cubes' (methods with density) or 'tsdf' (all methods) for meshes"
 KINDS = {
     "poisson": _MESH,
-    "aria": "it is not supported here",
 }
 """Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent -> what to use instead."""
 

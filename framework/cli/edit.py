@@ -42,6 +42,9 @@ class EditFlags(RegionFlags, OpenFlags):
     """Remove faint Gaussians that training images see in front of surfaces."""
     reduce_to: int | None = None
     """Number of Gaussians to keep, those with most weight in training images, or by opacity and area."""
+    refit_steps: int = 0
+    """Steps in which the Gaussians of --reduce-to then learn to look like all of them, for files and runs with
+    photographs, such as 300; 0: none."""
     degree: int | None = None
     """Highest degree of harmonics to keep, 0 to 3."""
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
@@ -71,6 +74,10 @@ class EditFlags(RegionFlags, OpenFlags):
         from nerfloom.edit.recipe import read_recipe, step_of
 
         self.regions()  # a file that holds none is refused before any work
+        if self.refit_steps and self.reduce_to is None:
+            raise FlagError(f"--refit-steps is {self.refit_steps}; it belongs to --reduce-to, which is not given")
+        refit = {"refit_steps": self.refit_steps} if self.refit_steps else {}
+        reduced = None if self.reduce_to is None else {"count": self.reduce_to, **refit}
         box, sphere = self.box(), self.sphere()
         given: list[tuple[str, str, dict[str, Any] | None]] = [
             # Floaters are in front of surfaces, which a crop may remove.
@@ -81,7 +88,7 @@ class EditFlags(RegionFlags, OpenFlags):
             ("min-opacity", "drop_faint", _only("min_opacity", self.min_opacity)),
             ("max-size", "drop_large", _only("max_size", self.max_size)),
             ("drop-isolated", "drop_isolated", {} if self.drop_isolated else None),
-            ("reduce-to", "reduce_to", _only("count", self.reduce_to)),
+            ("reduce-to", "reduce_to", reduced),
             ("degree", "set_degree", _only("degree", self.degree)),
             ("up", "set_up", None if self.up is None else {"up": AXES[self.up]}),
             ("floor", "align_floor", {} if self.floor else None),

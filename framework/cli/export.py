@@ -34,7 +34,7 @@ usage: ns-export WHAT RUN_FOLDER --output-dir DIR [flags]
   ns-export tsdf RUN_FOLDER --output-dir exports
 
 Instead of a run, pass a file of Gaussians (.ply, .spz, .sog, .splat, .ksplat): gaussian-splat, levels and web need no
-data, others --data DIR. web also shows an octree of ns-bake (.octree).
+data, others --data DIR. web also shows an octree of ns-bake (.octree), and levels (.levels), which stream.
 
   ns-export web splat.ply --output-dir exports
 
@@ -52,7 +52,7 @@ def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
     name, (kind, file), rest = chosen
-    words, named = with_format(f"ns-export {name}", with_run(rest, ("--bounding-box-min", "--bounding-box-max")))
+    words, named = with_format(f"ns-export {name}", with_run(rest))
     flags = read_flags(kind, f"ns-export {name}", words, takes=OPENS)
     found = flags.check()
     path = flags.output_dir / file.format_map(vars(flags))

@@ -106,12 +106,13 @@ class LevelsFlags(LevelsSettings, RegionFlags, ExportFlags):
 class WebFlags(WebSettings, RegionFlags, ExportFlags):
     """Write scene.html: a page that shows the scene's Gaussians or octree, or ones that are made from a field.
 
-    Beside it, scene.jpg is the start view, for link previews.
+    Beside it, scene.jpg is the start view, for link previews. Of a file of levels, the folder scene has chunks that the
+    page loads from a web server.
     """
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshFlags(MeshSettings, ExportFlags):
+class MeshFlags(MeshSettings, RegionFlags, ExportFlags):
     """Flags of every mesh."""
 
     format: Literal["ply", "obj", "glb"] = "ply"

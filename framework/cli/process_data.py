@@ -24,6 +24,7 @@ kinds:
   realitycapture  photographs with the cameras of RealityCapture or RealityScan (CSV)
   odm             a project of OpenDroneMap or OpenSfM
   bundler         photographs with the cameras of Bundler (bundle.out), which many programs write
+  aria            images of Project Aria glasses with the trajectory that MPS has found
 
 ns-process-data KIND --help shows its flags.
 """

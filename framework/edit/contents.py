@@ -12,6 +12,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.scale import read_scale
 from nerfloom.data.offsets import read_offset
 from nerfloom.edit.edited import Edited
+from nerfloom.edit.refit import refitted
 from nerfloom.edit.sightings import sightings, training_views
 from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.splats.files import read_gaussians
@@ -45,7 +46,7 @@ def merge(edited: Edited, files: tuple[Path, ...]) -> Edited:
     return replace(edited, gaussians=Gaussians.joined([_padded(part, degree) for part in parts]))
 
 
-def reduce_to(edited: Edited, count: int) -> Edited:
+def reduce_to(edited: Edited, count: int, refit_steps: int = 0) -> Edited:
     """Keep the Gaussians that contribute most.
 
     A contribution is the sum of blending weights over all pixels of the training images. Without photographs it is
@@ -53,10 +54,14 @@ def reduce_to(edited: Edited, count: int) -> Edited:
 
     Args:
         count: maximum number of Gaussians.
+        refit_steps: number of steps in which the kept Gaussians learn to look like all of them, from the cameras of the
+            training images; 0 for none.
 
     Raises:
-        ConfigError: if Gaussians cannot be drawn for the cameras of the photographs.
+        ConfigError: if Gaussians cannot be drawn for the cameras of the photographs, or refitting lacks photographs.
     """
+    if refit_steps:
+        edited.photographed("refit_steps")
     if count >= len(edited):
         return edited
     if edited.has_photographs:
@@ -66,7 +71,8 @@ def reduce_to(edited: Edited, count: int) -> Edited:
     else:
         values = visibility(edited.gaussians).double()
         say("reduce_to: without photographs, Gaussians count by opacity times area")
-    return edited.kept(values.argsort(descending=True, stable=True)[:count].sort().values)
+    kept = edited.kept(values.argsort(descending=True, stable=True)[:count].sort().values)
+    return refitted(kept, edited, refit_steps) if refit_steps else kept
 
 
 def set_degree(edited: Edited, degree: int) -> Edited:

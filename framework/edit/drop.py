@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 
 from nerfloom.edit.edited import Edited
 from nerfloom.edit.sightings import sightings, training_views
@@ -48,8 +49,8 @@ def drop_isolated(edited: Edited, neighbours: int = 8, max_ratio: float = 5.0) -
     return edited.kept(distances <= max_ratio * torch.maximum(sizes, distances.median()))
 
 
-def drop_floaters(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_views: int = 3) -> Edited:
-    """Remove faint Gaussians that photographs see in front of the surfaces.
+def floating(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_views: int = 3) -> Tensor:
+    """Return the faint Gaussians that photographs see in front of the surfaces, (N,) bool on the CPU.
 
     A training image sees a Gaussian in front if it is nearer than 0.9 of the median depth in the pixel of its centre,
     or if that pixel has no surface.
@@ -65,4 +66,16 @@ def drop_floaters(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, 
     loaded = edited.photographed("drop_floaters")
     seen = sightings(edited.in_scene(), training_views(loaded, edited.look))
     floats = (seen.views >= min_views) & (seen.in_front >= share * seen.views) & (seen.in_front > 0)
-    return edited.kept(~(floats & (seen.opacity_in_front <= max_opacity)).cpu())
+    return (floats & (seen.opacity_in_front <= max_opacity)).cpu()
+
+
+def drop_floaters(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_views: int = 3) -> Edited:
+    """Remove faint Gaussians that photographs see in front of the surfaces, those that `floating` returns.
+
+    Args:
+        share, max_opacity, min_views: as in `floating`.
+
+    Raises:
+        ConfigError: as `floating`.
+    """
+    return edited.kept(~floating(edited, share, max_opacity, min_views))

@@ -54,6 +54,7 @@ RANGES: dict[str, Range] = {
     "tolerance": (TINY, math.inf),
     "seed": (0, 2**63 - 1),
     "count": (1, math.inf),
+    "refit_steps": (0, math.inf),
     "degree": (0, 3),
 }
 """Allowed ranges of settings, in whatever step."""

@@ -40,16 +40,22 @@ class Sightings:
     """(N,) float64 mean weight on its area, in those images: its opacity as they see it, 0 to 1; 0 without any."""
 
 
-def training_views(loaded: Loaded, look: Look) -> list[SplatCamera]:
-    """Return the cameras of training images of `loaded`, a run or a file with data, as drawn by `look`.
+def training_views(loaded: Loaded, look: Look, most: int = MAX_VIEWS) -> list[SplatCamera]:
+    """Return the cameras of training images, in their reduced sizes. The images are not decoded.
+
+    Args:
+        loaded: a run, or a file with data.
+        look: the settings of drawing.
+        most: maximum number of cameras, evenly spaced.
 
     Raises:
         ConfigError: if Gaussians cannot be drawn for such cameras.
+        DataError: if the data cannot be read.
     """
-    scene = loaded.model.scene
-    cameras = loaded.dataset("train").cameras
+    scene, parsed = loaded.model.scene, loaded.parsed("train")
+    cameras = parsed.cameras.scaled(1 / parsed.downscale_factor).to(loaded.model.device)
     found = []
-    for index in spread(len(cameras), MAX_VIEWS):
+    for index in spread(len(cameras), most):
         reduced = -(-max(cameras.sizes[index]) // MAX_SIDE)
         found.append(splat_camera(cameras[index : index + 1], smallest_depth(scene), look, reduced=reduced))
     return found

@@ -109,8 +109,8 @@ def _page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[R
 
 KINDS: dict[str, Kind] = {
     "pointcloud": Kind(PointSettings, (".ply",), _on_use("point_cloud.export_points"), is_cropped=True),
-    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _on_use("run_mesh.export_level_set")),
-    "tsdf": Kind(TsdfSettings, MESHES, _on_use("run_mesh.export_fused")),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _on_use("run_mesh.export_level_set"), is_cropped=True),
+    "tsdf": Kind(TsdfSettings, MESHES, _on_use("run_mesh.export_fused"), is_cropped=True),
     "gaussian-splat": Kind(
         SplatSettings, (".ply", ".spz", ".sog", ".glb"), _on_use("run_gaussians.export_gaussians"), is_cropped=True
     ),

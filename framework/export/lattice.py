@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfloom.base.errors import FlagError
+from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cameras.poses import Placement
 
 MAX_RESOLUTION = 1024
@@ -90,13 +90,13 @@ def lattice_of(
     if not 1 < resolution <= MAX_RESOLUTION:
         raise FlagError(f"--resolution is {resolution}; it must be from 2 to {MAX_RESOLUTION}")
     if (low is None) != (high is None):
-        raise FlagError("--bounding-box-min and --bounding-box-max belong together: give both, or none")
+        raise ConfigError("the corners low and high of a box belong together: give both, or none")
     first, last = box.double().cpu()
     axes = torch.eye(3, dtype=torch.float64)
     if low is not None and high is not None:
         first, last = torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
         if not all(a < b for a, b in zip(low, high, strict=True)) or not all(map(math.isfinite, (*low, *high))):
-            raise FlagError(f"--bounding-box-min {low} must be less than --bounding-box-max {high} along each axis")
+            raise ConfigError(f"the box is empty: its corner {low} must be less than {high} along each axis")
     spacing = float((last - first).max()) / resolution
     x, y, z = (max(math.ceil(float(edge) / spacing - 1e-6), 1) for edge in last - first)
     if low is None or placement is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.export.texture import Texture
+from nerfloom.geometry.regions import Region, inside_all
 from nerfloom.kernels.math import safe_normalize
 
 
@@ -42,6 +44,20 @@ def without_degenerate(mesh: Mesh) -> Mesh:
     """Return `mesh` without degenerate faces (two equal corners) and without unused vertices."""
     a, b, c = mesh.faces.unbind(-1)
     return mesh.with_faces((a != b) & (b != c) & (c != a))
+
+
+def within(mesh: Mesh, regions: Sequence[Region]) -> Mesh:
+    """Return the faces of `mesh` with all corners in all `regions`; all faces without regions.
+
+    Raises:
+        ConfigError: if there are none.
+    """
+    if not regions:
+        return mesh
+    kept = inside_all(mesh.vertices, regions)[mesh.faces].all(-1)
+    if not bool(kept.any()):
+        raise ConfigError("no face is in the region that is kept; take a larger region, or a higher --resolution")
+    return mesh if bool(kept.all()) else mesh.with_faces(kept)
 
 
 def vertex_normals(mesh: Mesh) -> Tensor:

@@ -18,10 +18,11 @@ from nerfloom.export import density, tsdf
 from nerfloom.export.colors import seen_colors, spread_colors
 from nerfloom.export.isosurface import isosurface
 from nerfloom.export.lattice import Lattice
-from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, without_degenerate
+from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, within, without_degenerate
 from nerfloom.export.seen import seen_part
 from nerfloom.export.texture import Texturing, painted
 from nerfloom.geometry.points import Points
+from nerfloom.geometry.regions import Region
 from nerfloom.kernels.math import safe_normalize
 from nerfloom.renderable import HasSignedDistance, Renderable, RendersRays
 
@@ -29,6 +30,8 @@ ColorFunction = Callable[[Tensor, Tensor], Tensor]
 """Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""
 COLOURED = 2**16
 """Number of vertices that are coloured at once."""
+ROUNDING = 1e-4
+"""Distance from a region that counts as in it, in cells."""
 NEWTON_STEPS, LEAST_SLOPE = 3, 0.1
 """Number of Newton steps onto a surface, and the minimum length of a gradient that a step divides by."""
 
@@ -45,6 +48,8 @@ class Cleaning:
     """Number of faces that the mesh is simplified to; None for no simplification."""
     min_views: int = 0
     """Minimum number of training cameras that see a face; 0 for any (`default_min_views`)."""
+    regions: tuple[Region, ...] = ()
+    """What is in all of these is kept, scene coordinates; none for everything on the lattice."""
 
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
@@ -213,7 +218,9 @@ def _finished(
 
     `onto` moves vertices onto the surface and returns their normals; None for normals of the faces.
     """
-    mesh = seen_part(without_degenerate(Mesh(lattice.positions(found[0]), found[1])), cameras, cleaning.min_views)
+    visible = seen_part(without_degenerate(Mesh(lattice.positions(found[0]), found[1])), cameras, cleaning.min_views)
+    # Vertices on a face of a region are in it, however they are rounded.
+    mesh = within(visible, [region.grown(ROUNDING * lattice.spacing) for region in cleaning.regions])
     eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
     mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
     if not len(mesh.faces):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from nerfloom.base.console import say
@@ -17,17 +18,26 @@ from nerfloom.export.meshing import Cleaning, density_mesh, distance_mesh, fused
 from nerfloom.export.seen import default_min_views
 from nerfloom.export.settings import MarchingCubesSettings, MeshSettings, TsdfSettings
 from nerfloom.export.texture import Texturing
+from nerfloom.geometry.regions import Region, bounds_of_all
 from nerfloom.renderable import HasDensity, HasSignedDistance
 from nerfloom.training.loaded import Loaded
 
 
-def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings) -> None:
-    """Write a mesh of a level of density, or of distance zero, of `loaded` to `path` by `settings`.
+def export_level_set(
+    loaded: Loaded, path: Path, settings: MarchingCubesSettings, regions: Sequence[Region] = ()
+) -> None:
+    """Write a mesh of a level of density, or of distance zero.
+
+    Args:
+        loaded: the run.
+        path: file to write.
+        settings: settings of the mesh.
+        regions: what is in all of these is kept, in the frame of exports; none for the scene's box.
 
     Raises:
         ConfigError: if a setting is out of range, the method has no density, or there is no surface.
     """
-    lattice, cleaning, texturing = _prepared(settings, loaded, path, default_min_views(loaded.model))
+    lattice, cleaning, texturing = _prepared(settings, loaded, path, regions, default_min_views(loaded.model))
     model, level, start = loaded.model, settings.isosurface_threshold, time.monotonic()
     if isinstance(model, HasSignedDistance):
         if level is not None:
@@ -49,13 +59,19 @@ def export_level_set(loaded: Loaded, path: Path, settings: MarchingCubesSettings
     _write(mesh, loaded.placement, path, start)
 
 
-def export_fused(loaded: Loaded, path: Path, settings: TsdfSettings) -> None:
-    """Write a mesh of fused depth images of `loaded`, in the frame of the input, to `path` by `settings`.
+def export_fused(loaded: Loaded, path: Path, settings: TsdfSettings, regions: Sequence[Region] = ()) -> None:
+    """Write a mesh of fused depth images, in the frame of the input.
+
+    Args:
+        loaded: the run, or a file with photographs.
+        path: file to write.
+        settings: settings of the mesh.
+        regions: as in `export_level_set`.
 
     Raises:
         ConfigError: if a setting is out of range, or there is no surface.
     """
-    lattice, cleaning, texturing = _prepared(settings, loaded, path, min_views=0)  # no view has fused the rest
+    lattice, cleaning, texturing = _prepared(settings, loaded, path, regions, min_views=0)  # no view has fused the rest
     if settings.max_num_views < 1:
         raise FlagError(f"--max-num-views is {settings.max_num_views}; it must be at least 1")
     start = time.monotonic()
@@ -65,15 +81,20 @@ def export_fused(loaded: Loaded, path: Path, settings: TsdfSettings) -> None:
 
 
 def _prepared(
-    settings: MeshSettings, loaded: Loaded, path: Path, min_views: int
+    settings: MeshSettings, loaded: Loaded, path: Path, regions: Sequence[Region], min_views: int
 ) -> tuple[Lattice, Cleaning, Texturing | None]:
     """Return the lattice and the settings of cleaning and texture, after checks of settings and installed packages.
 
     `min_views` replaces the setting if it is open.
     """
     require("export", "a mesh needs")
-    min_views = min_views if settings.min_views is None else settings.min_views
-    cleaning = Cleaning(settings.num_components, settings.min_component_share, settings.target_num_faces, min_views)
+    cleaning = Cleaning(
+        settings.num_components,
+        settings.min_component_share,
+        settings.target_num_faces,
+        min_views if settings.min_views is None else settings.min_views,
+        tuple(region.moved(*loaded.placement.similarity()) for region in regions),
+    )
     cleaning.check()
     texturing = None
     if settings.texture_size is not None:
@@ -81,8 +102,9 @@ def _prepared(
             raise ConfigError("--texture-size: a PLY file has no texture; take --format obj or --format glb")
         texturing = Texturing(settings.texture_size, settings.texture_seconds)
         texturing.check()
-    box, low, high = loaded.model.scene.box, settings.bounding_box_min, settings.bounding_box_max
-    return lattice_of(box, settings.resolution, loaded.placement, low, high), cleaning, texturing
+    corners = bounds_of_all(regions) if regions else (None, None)
+    lattice = lattice_of(loaded.model.scene.box, settings.resolution, loaded.placement, *corners)
+    return lattice, cleaning, texturing
 
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:

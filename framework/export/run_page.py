@@ -18,9 +18,10 @@ from nerfloom.evaluation.images import to_uint8
 from nerfloom.evaluation.paths import around
 from nerfloom.evaluation.videos import write_images
 from nerfloom.export.bake import Baking, bake
+from nerfloom.export.levels_page import levels_page
 from nerfloom.export.page_closeness import closeness
 from nerfloom.export.page_scenes import ScenePage, gaussian_page, octree_page
-from nerfloom.export.settings import PageKind, WebSettings
+from nerfloom.export.settings import WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
     PICTURE,
@@ -32,8 +33,10 @@ from nerfloom.export.web import (
     room,
     shown_cameras,
     upright,
+    with_still,
 )
 from nerfloom.geometry.regions import Region
+from nerfloom.levels.drawn import DrawnLevels
 from nerfloom.method import Method
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.octree import Octree
@@ -54,7 +57,7 @@ def export_page(
 ) -> None:
     """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 
-    A JPEG file of the start view, for link previews, is written beside it.
+    A JPEG file of the start view, for link previews, is written beside it, and of levels the folder of chunks.
 
     Args:
         loaded: the run or file.
@@ -66,9 +69,8 @@ def export_page(
     Raises:
         ConfigError: if the settings do not fit the run, or there is nothing to show.
     """
-    check_size(settings.max_megabytes)
-    check_url(settings.url)
-    model = loaded.model
+    model, kind = loaded.model, settings.kind or kind_of(loaded.model)
+    _check(settings, kind, model, regions)
     moment = moment_of(model.scene.moving, settings.time)
     dataset = None if loaded.source is None else _at(loaded.dataset("train"), moment)
     cameras, names = _cameras(model, dataset)
@@ -76,7 +78,7 @@ def export_page(
     start = start_of([names[index] for index in order], settings.start_view)
     ranks = shown_cameras(len(order), start)
     chosen = torch.tensor([order[rank] for rank in ranks])
-    kind, turn = settings.kind or kind_of(model), upright(cameras)
+    turn = upright(cameras)
     red, green, blue = model.background.tolist()
     facts = PageFacts(
         title=_title(loaded) if settings.title is None else printable(settings.title),
@@ -94,7 +96,9 @@ def export_page(
         url=settings.url or "",
         picture=path.with_suffix(PICTURE_SUFFIX).name,
     )
-    if kind == "octree":
+    if kind == "levels":
+        page = levels_page(loaded, path, facts, turn)
+    elif kind == "octree":
         octree = _octree(loaded, settings.fit_seconds, room(facts, settings.max_megabytes))
         page = octree_page(loaded, octree, cameras, facts, turn, settings.max_megabytes, regions)
     else:
@@ -102,21 +106,34 @@ def export_page(
         page = gaussian_page(loaded, found, look, facts, turn, settings.max_megabytes, regions)
     for cost in page.costs:
         say(cost)
-    content = page.text.encode("utf-8", "replace")
+    camera = framed(cameras[order[start] : order[start] + 1], *PICTURE).to(model.device)
+    with torch.no_grad():
+        picture = to_uint8(page.draw(camera))
+    write_images([path.with_suffix(PICTURE_SUFFIX)], [picture])
+    content = with_still(page.text, picture, settings.max_megabytes).encode("utf-8", "replace")
     write_atomically(path, lambda file: file.write(content))
     say(f"{len(content) / 1e6:.2f} MB, {page.words}: {path}")
     if moment is not None:
         say(f"the scene moves, and the page shows it at time {moment:g}, still")
-    camera = framed(cameras[order[start] : order[start] + 1], *PICTURE).to(model.device)
-    with torch.no_grad():
-        write_images([path.with_suffix(PICTURE_SUFFIX)], [to_uint8(page.draw(camera))])
-    if not regions:
+    if not regions and kind != "levels":
         _say_closeness(loaded, page, dataset, cameras, moment)
 
 
-def kind_of(model: Renderable) -> PageKind:
-    """Return what the page of `model` shows if no setting says it: an octree if the model is one, else Gaussians."""
+def kind_of(model: Renderable) -> str:
+    """Return what the page of `model` shows if no setting says it, a key of `SCRIPTS`."""
+    if isinstance(model, DrawnLevels):
+        return "levels"
     return "octree" if isinstance(model, DrawnOctree) else "gaussians"
+
+
+def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequence[Region]) -> None:
+    """Raise ConfigError if settings do not fit a page of a kind."""
+    check_size(settings.max_megabytes)
+    check_url(settings.url)
+    if isinstance(model, DrawnLevels) and kind != "levels":
+        raise ConfigError(f"--kind {kind}: a file of levels is shown as levels; leave it out")
+    if kind == "levels" and regions:
+        raise ConfigError("a page of levels shows all of them: crop what ns-export levels writes, by the same flags")
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
@@ -216,7 +233,7 @@ def _title(loaded: Loaded) -> str:
     return printable(f"{experiment} · {loaded.method}")
 
 
-def _about(loaded: Loaded, kind: PageKind, moment: float | None) -> str:
+def _about(loaded: Loaded, kind: str, moment: float | None) -> str:
     method, model = loaded.method, loaded.model
     made = f"with {method}" if loaded.is_run else f"from {printable(loaded.origin.name)}"
     parts = [f"Made by Nerfloom {made}."]
@@ -226,4 +243,8 @@ def _about(loaded: Loaded, kind: PageKind, moment: float | None) -> str:
         parts.append(f"The octree shown here is baked from {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")
-    return " ".join([*parts, "The page works offline and requests nothing from any host."])
+    if kind == "levels":
+        parts.append("The page loads finer levels of detail from the folder beside it, and requests nothing else.")
+    else:
+        parts.append("The page works offline and requests nothing from any host.")
+    return " ".join(parts)

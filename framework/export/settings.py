@@ -97,11 +97,7 @@ class MeshSettings:
     """Settings of every mesh."""
 
     resolution: int = 256
-    """Number of cells along the longest edge of the box, up to 1024."""
-    bounding_box_min: tuple[float, float, float] | None = None
-    """Minimum corner x y z of the searched box, in the frame and units of the input. Default: the scene's box."""
-    bounding_box_max: tuple[float, float, float] | None = None
-    """Maximum corner x y z of that box."""
+    """Number of cells along the longest edge of the scene's box, or of the region, up to 1024."""
     num_components: int = 0
     """Maximum number of separate pieces to keep, largest first; 0: all."""
     min_component_share: float = 0.001

@@ -1,6 +1,7 @@
 """A web page of a scene: one HTML file that opens from disk, offline, in any browser with WebGL 2.
 
 The page (`page/`) is our own, requests nothing from any host, and holds the scene in base64 and facts about it as JSON.
+Browsers without WebGL 2 show a still picture. A page of levels alone loads more, from the folder beside it.
 Gaussians are an SPZ file (`framework/splats/spz.py`), drawn as `framework/kernels/splats/project.py` does. Octrees have
 their own form (`octree_page.py`) and are drawn as `framework/kernels/octree/walk.h` does. All else is the same program.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 import base64
 import binascii
 import html
+import io
 import json
 import re
 import tempfile
@@ -20,7 +22,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urljoin
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 import nerfloom
@@ -41,10 +45,17 @@ MAX_CAMERAS = 300
 PICTURE = (1200, 630)
 """Width and height of the picture of link previews, pixels, in the aspect ratio that most programs show."""
 SCRIPTS = {
-    "gaussians": ("unpack.js", "webgl.js", "splats.js", "measure.js", "viewer.js"),
-    "octree": ("unpack.js", "webgl.js", "octree.js", "measure.js", "viewer.js"),
+    "gaussians": ("unpack.js", "webgl.js", "splats.js", "measure.js", "motion.js", "viewer.js"),
+    "levels": ("unpack.js", "webgl.js", "splats.js", "levels.js", "measure.js", "motion.js", "viewer.js"),
+    "octree": ("unpack.js", "webgl.js", "octree.js", "measure.js", "motion.js", "viewer.js"),
 }
 """Files of the program of each kind of page, in their order."""
+STILL_SHARE, MAX_STILL = 0.05, 60_000
+"""Share of a page's room that is left for the still picture, and the maximum size of its text, bytes."""
+STILL_SIZES = ((600, 80), (600, 60), (400, 60), (200, 50))
+"""Widths, pixels, and qualities of JPEG that are tried for it, one after the other."""
+NO_STILL = 'src="data:,"'
+"""The place of the still picture in a page."""
 LEVEL = 0.5
 """The scene is turned if the cosine between z and the cameras' mean up direction is below this."""
 DATA = re.compile(r'<script id="data" type="text/plain">([^<]*)</script>')
@@ -85,11 +96,13 @@ class PageFacts:
     """Address that the page will have; empty if unknown."""
     picture: str = ""
     """Name of a picture of PICTURE pixels beside the page, for link previews; empty for none."""
+    levels: dict[str, Any] | None = None
+    """The folder beside the page and the tree of its chunks (`levels_page.py`); None for a page of one file."""
 
     @property
     def kind(self) -> str:
         """The kind of the page, a key of `SCRIPTS`."""
-        return "gaussians" if self.look else "octree"
+        return "levels" if self.levels else "gaussians" if self.look else "octree"
 
 
 def upright(cameras: Cameras) -> Tensor:
@@ -208,7 +221,28 @@ def room(facts: PageFacts, max_megabytes: float) -> float:
         ConfigError: if the limit is above MAX_MEGABYTES.
     """
     check_size(max_megabytes)
-    return (1e6 * max_megabytes - len(page(b"", facts).encode())) // 4 * 3
+    free = 1e6 * max_megabytes - len(page(b"", facts).encode())
+    return (free - min(STILL_SHARE * free, MAX_STILL)) // 4 * 3
+
+
+def with_still(text: str, picture: np.ndarray, max_megabytes: float) -> str:
+    """Return a page with a still picture, which browsers show until the scene is drawn, or if they cannot draw it.
+
+    Args:
+        text: content of a page without one.
+        picture: (H, W, 3) uint8 picture of the start view.
+        max_megabytes: maximum size of the page, in millions of bytes; it stays as it is if no picture fits.
+    """
+    most = min(1e6 * max_megabytes - len(text.encode("utf-8", "replace")), MAX_STILL)
+    for width, quality in STILL_SIZES:
+        content = io.BytesIO()
+        small = Image.fromarray(picture)
+        small.thumbnail((width, width))
+        small.save(content, "JPEG", quality=quality)
+        address = f'src="data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"'
+        if len(address) <= most:
+            return text.replace(NO_STILL, address, 1)
+    return text
 
 
 def check_size(max_megabytes: float) -> None:
@@ -240,6 +274,7 @@ def page(payload: bytes, facts: PageFacts) -> str:
         "about": html.escape(facts.about),
         "lengths": html.escape(f"lengths are in {facts.unit or 'the unit of the input'}"),
         "preview": preview_tags(facts),
+        "requests": "; connect-src 'self'" if facts.levels else "",
         "version": html.escape(nerfloom.__version__),
         "style": (folder / "viewer.css").read_text(encoding="utf-8"),
         "script": "".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS[facts.kind]),

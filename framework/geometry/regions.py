@@ -68,6 +68,18 @@ class Box:
         found = self.along(points)
         return ((found >= points.new_tensor(self.low)) & (found <= points.new_tensor(self.high))).all(-1)
 
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Return the minimum and the maximum corner of the smallest box around it that is parallel to the frame."""
+        axes = torch.tensor(self.axes, dtype=torch.float64)
+        sides = torch.cartesian_prod(*torch.tensor([self.low, self.high], dtype=torch.float64).T)
+        corners = sides @ axes
+        return _vector(corners.amin(0)), _vector(corners.amax(0))
+
+    def grown(self, by: float) -> Box:
+        """Return the box with each face moved outwards `by` a length."""
+        (x0, y0, z0), (x1, y1, z1) = self.low, self.high
+        return Box((x0 - by, y0 - by, z0 - by), (x1 + by, y1 + by, z1 + by), self.axes)
+
     def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Box:
         """Return the box after a similarity transform x -> scale * rotation @ x + shift.
 
@@ -103,6 +115,26 @@ class Sphere:
     def contains(self, points: Tensor) -> Tensor:
         """Return whether `points` (N, 3) are in the ball, (N,) bool; its surface belongs to it."""
         return (points - points.new_tensor(self.center)).norm(dim=-1) <= self.radius
+
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Return the minimum and the maximum corner of the box around it that is parallel to the frame."""
+        (x, y, z), r = self.center, self.radius
+        return (x - r, y - r, z - r), (x + r, y + r, z + r)
+
+    def grown(self, by: float) -> Sphere:
+        """Return the ball with a radius that is larger `by` a length."""
+        return Sphere(self.center, self.radius + by)
+
+    def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Sphere:
+        """Return the ball after a similarity transform x -> scale * rotation @ x + shift.
+
+        Args:
+            rotation: (3, 3) rotation, float64, on the CPU.
+            scale: factor of lengths.
+            shift: (3,) shift, float64, on the CPU.
+        """
+        center = scale * (rotation @ torch.tensor(self.center, dtype=torch.float64)) + shift
+        return Sphere(_vector(center), scale * self.radius)
 
 
 Region: TypeAlias = Box | Sphere
@@ -160,3 +192,19 @@ def inside_all(points: Tensor, regions: Sequence[Region]) -> Tensor:
     if not bool(inside.any()):
         raise ConfigError("nothing is in the region that is kept; it is in the frame and unit of exports")
     return inside
+
+
+def bounds_of_all(regions: Sequence[Region]) -> tuple[Vector, Vector]:
+    """Return the minimum and the maximum corner of a box that holds what is in all of some regions.
+
+    Args:
+        regions: at least one.
+
+    Raises:
+        ConfigError: if nothing is in all of them.
+    """
+    corners = torch.tensor([region.bounds() for region in regions], dtype=torch.float64)
+    low, high = corners[:, 0].amax(0), corners[:, 1].amin(0)
+    if not bool((low < high).all()):
+        raise ConfigError("nothing is in all of the regions that are kept; they are in the frame and unit of exports")
+    return _vector(low), _vector(high)

@@ -58,6 +58,8 @@ class DrawnLevels(Renderable):
         self.file, self.scene, self.settings = file, scene.to(device), settings
         self.error = self._reported = settings.level_error
         """Level error of the last picture, pixels."""
+        self.placement = placement
+        """Placement of the file's coordinates in the scene."""
         self._device, self._to_file = device, placement.original_similarity()
         each, largest = file.gaussian_size, int(file.nodes.counts.max())
         self.most = int(settings.memory_limit * 1e6 / (each + DRAWN_SIZE))

@@ -11,6 +11,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.signals import Stopped, signal_of
 from nerfloom.processing.settings import (
+    AriaFlags,
     BundlerFlags,
     ColmapFlags,
     ImagesFlags,
@@ -22,10 +23,12 @@ from nerfloom.processing.settings import (
     RealityCaptureFlags,
     Record3DFlags,
     VideoFlags,
+    most_images,
 )
 
 if TYPE_CHECKING:
     from nerfloom.processing.capture import Capture
+    from nerfloom.processing.named_images import PlacedImages
     from nerfloom.processing.reconstruction import Reconstruction
 
 
@@ -163,7 +166,7 @@ def _convert_record3d(flags: Record3DFlags) -> None:
         find_root(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
     with unpacked(flags.data, flags.output_dir, place) as export:
-        convert(export, flags.output_dir, flags.num_downscales, flags.most)
+        convert(export, flags.output_dir, flags.num_downscales, flags.most, flags.ply)
 
 
 def _convert_metashape(flags: MetashapeFlags) -> None:
@@ -193,7 +196,16 @@ def _convert_bundler(flags: BundlerFlags) -> None:
     _convert(flags, flags.data, read_capture(flags.bundle, flags.image_list or find_list(flags.bundle)))
 
 
-def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
+def _convert_aria(flags: AriaFlags) -> None:
+    from nerfloom.processing.aria import read_capture
+    from nerfloom.processing.named_images import images_as_named
+
+    capture = read_capture(flags.data, flags.mps_data_dir, most_images(flags.max_dataset_size))
+    _convert(flags, flags.data, capture, images_as_named(capture))
+
+
+def _convert(flags: ProgramFlags, images: Path, capture: Capture, placed: PlacedImages | None = None) -> None:
+    """Write the data folder of a capture; its images are found by their names, if they are not `placed`."""
     from nerfloom.processing.named_images import placed_images
     from nerfloom.processing.output import check_apart, claim
     from nerfloom.processing.posed_folder import write_capture
@@ -202,7 +214,7 @@ def _convert(flags: ProgramFlags, images: Path, capture: Capture) -> None:
     if not images.is_dir():
         raise DataError(f"{images} is not a folder; it must be that of the photographs")
     check_apart(flags.output_dir, images)
-    placed = placed_images(images, capture)
+    placed = placed or placed_images(images, capture)
     claim(flags.output_dir, flags.data, flags.overwrite)
     views = Views(flags.num_views, flags.view_angle, flags.views_up_and_down)
     whole = flags.panoramas == "whole"
@@ -218,5 +230,6 @@ KINDS: dict[str, Kind] = {
     "realitycapture": Kind(RealityCaptureFlags, _convert_realitycapture),
     "odm": Kind(OdmFlags, _convert_odm),
     "bundler": Kind(BundlerFlags, _convert_bundler),
+    "aria": Kind(AriaFlags, _convert_aria),
 }
 """Kinds of input by name."""

@@ -64,6 +64,17 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
     return PlacedImages(placed, Counter(left_out))
 
 
+def images_as_named(capture: Capture) -> PlacedImages:
+    """Return the images of a capture whose cameras have the paths of their images as names.
+
+    Raises:
+        DataError: if it has no camera.
+    """
+    if not capture.cameras:
+        raise DataError(f"{capture.program} placed none of {capture.total} cameras: {reasons(capture.left_out)}")
+    return PlacedImages({Path(camera.name): camera for camera in capture.cameras}, Counter())
+
+
 def reasons(left_out: Counter[str]) -> str:
     """Return the numbers in `left_out` with their reasons, as the end of a message."""
     return ", ".join(f"{count} {reason}" for reason, count in left_out.items() if count) or "there are none"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,13 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import write_json
-from nerfloom.processing.capture import resized
+from nerfloom.processing.capture import Capture, PosedCamera, for_size_of, resized
 from nerfloom.processing.finite_numbers import finite, side
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.output import FINISHED, ready
+from nerfloom.processing.point_files import with_points
 from nerfloom.processing.pyramid import write_pyramid
-from nerfloom.processing.transforms import Frame, Lens, content
+from nerfloom.processing.transforms import POINTS, Frame, Lens, content, write_points
 
 
 def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
@@ -48,6 +50,7 @@ def write_folder(
     applied: np.ndarray,
     z_is_up: bool,
     crop: int = 0,
+    points: Path | None = None,
 ) -> None:
     """Prepare images and write a data folder.
 
@@ -61,10 +64,14 @@ def write_folder(
         z_is_up: whether z is up in the frame of the poses, as the phone has measured; otherwise the up direction is
             estimated from the poses.
         crop: pixels to cut off at each side.
+        points: PLY file of points in the phone's frame, or a folder of several; None for none.
 
     Raises:
-        DataError: if no image is readable, or an image and its lens differ in shape.
+        DataError: if no image is readable, an image and its lens differ in shape, or points cannot be used.
     """
+    cameras = [PosedCamera(name.as_posix(), pose, for_size_of(lens)) for name, (pose, lens) in posed.items()]
+    # Distances are compared, which are the same before and after a turn of the frame.
+    cloud = with_points(Capture("the phone", cameras, Counter()), points)
     prepared, _ = prepare_all(folder, list(posed), output / "images", upright=False, crop=crop)
     frames = []
     for image in prepared:
@@ -75,8 +82,11 @@ def write_folder(
             raise DataError(f"{folder / image.source}: {error}") from error
         frames.append(Frame(image.name, pose, cropped(lens, crop), source=image.source))
     write_pyramid(output / "images", [image.name for image in prepared], num_downscales)
+    if cloud.points is not None and cloud.colors is not None:
+        write_points(output / POINTS, cloud.points @ applied[:, :3].T + applied[:, 3], cloud.colors)
+        say(f"{len(cloud.points):,} points")
     more = {"orientation_override": "none"} if z_is_up else {}
-    write_json(output / FINISHED, content(frames, applied, None, more))
+    write_json(output / FINISHED, content(frames, applied, None if cloud.points is None else POINTS, more))
     say(f"{len(frames)} images with the phone's poses")
     say(ready(output))
 

@@ -66,7 +66,7 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
         write_pyramid(output / "images", kept, flags.num_downscales)
         write_pyramid(output / "masks", sorted(mask_of.values()), flags.num_downscales if mask_of else 0, masks=True)
         points = model.points @ transforms.Z_UP[:, :3].T
-        transforms.write_points(output / "sparse_pc.ply", points, model.colors)
+        transforms.write_points(output / transforms.POINTS, points, model.colors)
     summary = Summary(
         images=len(prepared),
         unreadable=len(unreadable),
@@ -82,7 +82,7 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
     _keep(work, output / "colmap", final)
     seconds = {stage: round(value, 2) for stage, value in summary.seconds.items()}
     (output / "colmap" / "summary.json").write_text(json.dumps({**asdict(summary), "seconds": seconds}, indent=2))
-    write_json(output / FINISHED, transforms.content(frames, transforms.Z_UP, "sparse_pc.ply", {}))
+    write_json(output / FINISHED, transforms.content(frames, transforms.Z_UP, transforms.POINTS, {}))
     if flags.mask_moving:
         _mask_moving(state)
     for line in lines(summary):

@@ -31,16 +31,28 @@ def with_points(capture: Capture, file: Path | None) -> Capture:
 
     Args:
         capture: the capture.
-        file: the PLY file, in the frame of the program; None leaves the capture as it is.
+        file: the PLY file, or a folder of several, in the frame of the program; None leaves the capture as it is.
 
     Raises:
-        DataError: if the file cannot be read, has no finite vertices, or most of them are far from the cameras.
+        DataError: if a file cannot be read, has no finite vertices, or most of them are far from the cameras.
     """
     if file is None:
         return capture
+    files = sorted(file.glob("*.ply")) if file.is_dir() else [file]
+    if not files:
+        raise DataError(f"{file} has no PLY file")
+    read = [_colored(each, max(MAX_POINTS // len(files), 1)) for each in files]
+    points, colors = (np.concatenate(part) for part in zip(*read, strict=True))
+    made = replace(capture, points=points, colors=colors)
+    check_points(made, file)
+    return made
+
+
+def _colored(file: Path, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (K, 3) float64 of a file and their colours (K, 3) uint8, at most `most`, evenly spaced in it."""
     element = vertices(file, read_header(file))
     colored = set(COLORS) <= set(element.names)
-    chosen = evenly_spaced(element.count, MAX_POINTS).numpy()
+    chosen = evenly_spaced(element.count, most).numpy()
     columns = [values[chosen] for values in read_columns(file, element, [*"xyz", *(COLORS if colored else ())])]
     if len(chosen) < element.count:
         say(f"{file}: {len(chosen):,} of {element.count:,} points are taken, evenly spaced in the file")
@@ -52,12 +64,9 @@ def with_points(capture: Capture, file: Path | None) -> Capture:
         raise DataError(f"{file} has no point that is finite; leave it out, or export it again")
     if not finite.all():
         say(f"{file}: {int((~finite).sum()):,} of {len(points):,} points are not finite and left out")
-    kept = np.nan_to_num(colors[finite].astype(np.float64)).clip(0, 255).round().astype(np.uint8)
-    made = replace(capture, points=points[finite], colors=kept)
-    check_points(made, file)
     if dict(element.columns)["x"] == "f4" and element.order != "ascii":
         _report_rounding(file, torch.from_numpy(points[finite]))
-    return made
+    return points[finite], np.nan_to_num(colors[finite].astype(np.float64)).clip(0, 255).round().astype(np.uint8)
 
 
 def _report_rounding(file: Path, points: Tensor) -> None:

@@ -14,18 +14,19 @@ from PIL import Image
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import write_json
+from nerfloom.processing import aria_lens
 from nerfloom.processing.capture import Capture, PosedCamera
 from nerfloom.processing.images import PreparedImage, in_parallel, output_names, prepare_all, save
 from nerfloom.processing.named_images import PlacedImages, reasons
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.pyramid import write_pyramid
-from nerfloom.processing.transforms import Frame, Lens, content, transformed, write_points
+from nerfloom.processing.transforms import POINTS, Frame, Lens, content, transformed, write_points
 from nerfloom.processing.views import View, Views, cut, view_lens
 
-POINTS = "sparse_pc.ply"
-"""File of the points."""
 PANORAMA, PERSPECTIVE = "EQUIRECTANGULAR", "OPENCV"
 """Models of lenses."""
+ALWAYS_CUT = {aria_lens.MODEL}
+"""Models of lenses that transforms.json cannot express."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def _models_to_cut(models: set[str], whole: bool) -> set[str]:
     if whole and PANORAMA in models and len(models) > 1:
         raise DataError("--panoramas whole: there are images of other lenses, too, and a data folder has one model")
     if len(models) == 1:
-        return set() if whole else models & {PANORAMA}
+        return models & (ALWAYS_CUT if whole else {PANORAMA, *ALWAYS_CUT})
     return models - {PERSPECTIVE}
 
 

@@ -24,7 +24,7 @@ from nerfloom.processing.polycam import Z_UP
 from nerfloom.processing.transforms import Lens, transformed
 
 
-def convert(export: Path, output: Path, num_downscales: int, max_images: int) -> None:
+def convert(export: Path, output: Path, num_downscales: int, max_images: int, ply: Path | None = None) -> None:
     """Write a data folder from an export.
 
     An image's number is the index of its pose in metadata.json; images may be missing.
@@ -34,9 +34,10 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
         output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
         max_images: maximum number of images, evenly spaced.
+        ply: PLY file of points in the frame of the poses, or a folder of several; None for none.
 
     Raises:
-        DataError: if `export` is not an export or has no usable image.
+        DataError: if `export` is not an export or has no usable image, or the points cannot be used.
     """
     root = find_root(export)
     path = root / "metadata.json"
@@ -56,7 +57,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int) ->
     lenses = lenses_of(metadata, len(poses), path)
     poses = transformed(poses, Z_UP)  # y is up in the image of the first camera
     posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly_spaced(usable, max_images)}
-    write_folder(root / "rgb", posed, output, num_downscales, Z_UP, z_is_up=False)
+    write_folder(root / "rgb", posed, output, num_downscales, Z_UP, z_is_up=False, points=ply)
 
 
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:

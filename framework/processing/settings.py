@@ -164,13 +164,23 @@ class PhoneFlags(OutputFlags):
 
     def check(self) -> None:
         super().check()
-        if self.max_dataset_size < 2 and self.max_dataset_size != -1:
-            raise FlagError(f"--max-dataset-size is {self.max_dataset_size}; it must be at least 2, or -1 for all")
+        most_images(self.max_dataset_size)
 
     @property
     def most(self) -> int:
         """Maximum number of images to take."""
-        return sys.maxsize if self.max_dataset_size == -1 else self.max_dataset_size
+        return most_images(self.max_dataset_size)
+
+
+def most_images(asked: int) -> int:
+    """Return the maximum number of images of --max-dataset-size, which is `asked`, or -1 for all.
+
+    Raises:
+        FlagError: if it is out of range.
+    """
+    if asked < 2 and asked != -1:
+        raise FlagError(f"--max-dataset-size is {asked}; it must be at least 2, or -1 for all")
+    return sys.maxsize if asked == -1 else asked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,6 +201,9 @@ class PolycamFlags(PhoneFlags):
 @dataclass(frozen=True, kw_only=True)
 class Record3DFlags(PhoneFlags):
     """Convert Record3D's export with EXR and RGBD."""
+
+    ply: Path | None = None
+    """Points that Record3D has exported of the same recording: a PLY file, or a folder of several."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,3 +250,20 @@ class BundlerFlags(ProgramFlags):
     """File of cameras and points, such as bundle.out."""
     image_list: Path | None = None
     """List of the images, in the order of the cameras. Default: list.txt beside the bundle or one folder up."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AriaFlags(ProgramFlags):
+    """Convert images of Project Aria glasses (--data, a folder that vrs extract-all has written) with MPS's results."""
+
+    mps_data_dir: Path
+    """Folder of MPS's results: closed_loop_trajectory.csv, online_calibration.jsonl and, if there, semidense points,
+    also in its folder slam."""
+    max_dataset_size: int = 300
+    """Maximum number of images to take, evenly spaced; -1 for all."""
+    num_views: int = 1
+    """Number of views cut out of an image; the first looks ahead."""
+
+    def check(self) -> None:
+        super().check()
+        most_images(self.max_dataset_size)

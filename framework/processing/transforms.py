@@ -11,6 +11,8 @@ import numpy as np
 
 from nerfloom.base.errors import DataError
 
+POINTS = "sparse_pc.ply"
+"""File of the points beside transforms.json."""
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """(3, 4) transform from COLMAP's frame, which tends to have y down, to one with z up."""
 
@@ -30,7 +32,7 @@ class Lens:
     """Intrinsics shared by the images of a camera."""
 
     model: str
-    """OPENCV, OPENCV_FISHEYE or PINHOLE."""
+    """OPENCV, OPENCV_FISHEYE, PINHOLE or EQUIRECTANGULAR; FISHEYE624 for images that are cut (`aria_lens.py`)."""
     values: dict[str, float]
     """w, h, fl_x, fl_y, cx, cy in pixels (the first pixel's centre is at 0.5), and the model's k1, k2, ..."""
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfloom.base.errors import DataError
+from nerfloom.processing import aria_lens
 from nerfloom.processing.transforms import Lens
 
 BAND = 256
@@ -85,7 +86,7 @@ def cut(image: np.ndarray, lens: Lens, views: Views) -> Iterator[View]:
 
     Args:
         image: (H, W, C) uint8.
-        lens: lens of the image, of a model in OPENCV, OPENCV_FISHEYE and EQUIRECTANGULAR.
+        lens: lens of the image, of a model in OPENCV, OPENCV_FISHEYE, EQUIRECTANGULAR and FISHEYE624.
         views: directions and angle.
     """
     target = view_lens(lens, views.angle)
@@ -114,10 +115,6 @@ def positions(lens: Lens, view: Lens, rotation: np.ndarray, rows: slice) -> tupl
         Columns and rows (R, W) in the image, float64, pixels, where the first pixel's centre is at 0.5; and (R, W)
         bool, whether the position is inside the image.
     """
-    import torch
-
-    from nerfloom.geometry.lenses import DISTORTED, Distortion, project
-
     down, across = np.mgrid[rows, : int(view.values["w"])] + 0.5
     local = np.stack(
         [
@@ -127,15 +124,27 @@ def positions(lens: Lens, view: Lens, rotation: np.ndarray, rows: slice) -> tupl
         ],
         -1,
     )
+    x, y, visible = _projected(lens, (local @ rotation.T).reshape(-1, 3))
+    unit = math.pi if lens.model == "EQUIRECTANGULAR" else 1.0  # the focal length of a panorama is half its width
+    columns = x.reshape(across.shape) * (lens.values["fl_x"] / unit) + lens.values["cx"]
+    lines = y.reshape(across.shape) * (lens.values["fl_y"] / unit) + lens.values["cy"]
+    inside = (columns >= 0) & (columns <= lens.values["w"]) & (lines >= 0) & (lines <= lens.values["h"])
+    return columns, lines, inside & visible.reshape(across.shape)
+
+
+def _projected(lens: Lens, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where a lens shows directions (N, 3): x and y (N,) of its image plane, y down, and whether it does."""
+    if lens.model == aria_lens.MODEL:
+        return aria_lens.project(directions, lens.values)
+    import torch
+
+    from nerfloom.geometry.lenses import DISTORTED, Distortion, project
+
     model, names = _MODELS[lens.model]
     coefficients = torch.tensor([[lens.values.get(name, 0.0) for name in names]], dtype=torch.float64)
     distortion = Distortion.of(model, coefficients) if model in DISTORTED else None
-    x, y, visible = project(model, torch.from_numpy((local @ rotation.T).reshape(-1, 3)), distortion)
-    unit = math.pi if model == "equirectangular" else 1.0  # the focal length of a panorama is half its width
-    columns = x.numpy().reshape(across.shape) * (lens.values["fl_x"] / unit) + lens.values["cx"]
-    lines = y.numpy().reshape(across.shape) * (lens.values["fl_y"] / unit) + lens.values["cy"]
-    inside = (columns >= 0) & (columns <= lens.values["w"]) & (lines >= 0) & (lines <= lens.values["h"])
-    return columns, lines, inside & visible.numpy().reshape(across.shape)
+    x, y, visible = project(model, torch.from_numpy(directions), distortion)
+    return x.numpy(), y.numpy(), visible.numpy()
 
 
 def interpolated(image: np.ndarray, columns: np.ndarray, rows: np.ndarray, wraps: bool) -> np.ndarray:

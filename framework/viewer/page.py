@@ -17,6 +17,8 @@ from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.commands import Commands
 from nerfloom.viewer.crop_panel import CropPanel
 from nerfloom.viewer.export_panel import ExportPanel
+from nerfloom.viewer.floater_panel import FloaterPanel
+from nerfloom.viewer.floaters import can_find
 from nerfloom.viewer.keys import Key, add_keys
 from nerfloom.viewer.measure_panel import MeasurePanel
 from nerfloom.viewer.panel import Panel
@@ -91,6 +93,8 @@ class Page:
         if queue.loaded.source is not None:
             with tabs.add_tab("Photographs"):
                 cameras = CameraPanel(client, self._photographs, move)
+                if can_find(queue.loaded):
+                    FloaterPanel(client, queue, panel.request)
             parts.append(cameras)
             keys += [
                 Key("N", "Next photograph", lambda: cameras.step(1)),

@@ -63,7 +63,7 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
     for what, kind, flags in (
         ("marching-cubes", "ply", ()),
         ("marching-cubes", "glb", ("--target-num-faces", 1000)),
-        ("tsdf", "obj", ("--bounding-box-min", -1.3, -1.3, -1.3, "--bounding-box-max", 1.3, 1.3, 1.3)),
+        ("tsdf", "obj", ("--crop-box=-1.3,-1.3,-1.3,1.3,1.3,1.3",)),
     ):
         export(monkeypatch, what, *given, "--resolution", 32, "--format", kind, "--num-components", 1, *flags)
         mesh = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
@@ -86,15 +86,14 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
         main, "marching-cubes", *given, "--isosurface-threshold", 0, status=2
     )
     assert "--resolution is 2048" in refused(main, "tsdf", *given, "--resolution", 2048, status=2)
-    box = ("--bounding-box-min", 50, 50, 50, "--bounding-box-max", 51, 51, 51)
+    top = np.array([0.0, 0.0, 1.0])
+    export(monkeypatch, "marching-cubes", *given, "--resolution", 24, "--crop-sphere", "0,0,1,0.7")
+    cap = trimesh.load(tmp_path / "mesh.ply", process=False, force="mesh")
+    assert len(cap.faces) > 30
+    assert np.linalg.norm(cap.vertices - top, axis=1).max() < 0.7 + 1e-3
+    box = ("--crop-box", "50,50,50,51,51,51")
     assert "no training view sees a surface in the box" in refused(main, "tsdf", *coarse, *box)
     assert "no occupied cell in the box" in refused(main, "marching-cubes", *coarse, *box)
-
-
-@pytest.mark.parametrize("corner", [("0", "0", "0"), ("-1", "0.5", "1.5e2"), ("1", "-2", "-3")])
-def test_a_run_may_follow_the_corner_of_a_box(corner: tuple[str, ...], tmp_path: Path, refused: Refused) -> None:
-    said = refused(main, "tsdf", "--bounding-box-min", *corner, tmp_path / "none", "--output-dir", tmp_path)
-    assert str(tmp_path / "none") in said
 
 
 def test_the_grid_and_all_cameras_are_written(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

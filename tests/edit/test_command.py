@@ -115,6 +115,7 @@ def test_no_input_is_written_over(file: Path, tmp_path: Path, refused: Refused) 
         (("--min-opacity", 2), "--min-opacity"),
         (("--max-size", 0), "--max-size"),
         (("--reduce-to", 0), "--reduce-to"),
+        (("--refit-steps", 10), "--refit-steps"),
         (("--degree", 4), "--degree"),
         (("--scale", -1), "--scale"),
         (("--max-megabytes", 0), "--max-megabytes"),

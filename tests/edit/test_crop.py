@@ -11,7 +11,7 @@ from nerfloom import edit
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.edit.crop import inside_polygon
 from nerfloom.edit.edited import Edited
-from nerfloom.geometry.regions import Box, Region, Sphere, inside_all, read_region, write_region
+from nerfloom.geometry.regions import Box, Region, Sphere, bounds_of_all, inside_all, read_region, write_region
 from nerfloom.splats.files import write_gaussians
 from nerfloom.training.load import load
 from tests.dataparsers.captures import HEIGHT, POINTS, WIDTH, poses, seen_at, write_capture
@@ -117,6 +117,44 @@ def test_files_that_hold_no_region_are_refused(text: str, tmp_path: Path) -> Non
     with pytest.raises(ConfigError) as error:
         read_region(tmp_path / "r.yml")
     assert "\n" not in str(error.value)
+
+
+REGIONS: list[Region] = [
+    Box((-0.5, -1.0, 0.0), (1.0, 0.3, 2.0)),
+    Box((-0.5, -1.0, 0.0), (1.0, 0.3, 2.0), ((0.6, 0.8, 0.0), (-0.8, 0.6, 0.0), (0.0, 0.0, 1.0))),
+    Sphere((0.3, -0.2, 0.5), 1.2),
+]
+
+
+@pytest.mark.parametrize("region", REGIONS, ids=["box", "turned", "sphere"])
+def test_bounds_hold_a_region_and_are_tight(region: Region) -> None:
+    random = torch.Generator().manual_seed(0)
+    points = 6 * torch.rand(400_000, 3, generator=random, dtype=torch.float64) - 3
+    inside = points[region.contains(points)]
+    low, high = torch.tensor(region.bounds(), dtype=torch.float64)
+    assert ((inside >= low) & (inside <= high)).all()
+    assert float((inside.amin(0) - low).max()) < 0.15
+    assert float((high - inside.amax(0)).max()) < 0.15
+
+
+@pytest.mark.parametrize("region", REGIONS, ids=["box", "turned", "sphere"])
+def test_a_grown_region_holds_what_is_near_and_a_moved_one_what_moved(region: Region) -> None:
+    random = torch.Generator().manual_seed(1)
+    points = 6 * torch.rand(20_000, 3, generator=random, dtype=torch.float64) - 3
+    inside, offset = points[region.contains(points)], torch.randn(3, generator=random, dtype=torch.float64)
+    near = inside + 0.1 * offset / offset.norm()
+    assert not region.contains(near).all()
+    assert region.grown(0.1 + 1e-9).contains(near).all()
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.1], [0.3, 0, 0.2], [-0.1, -0.2, 0]]).double())
+    moved = region.grown(1e-9).moved(turn, 2.5, offset)
+    assert torch.equal(moved.contains(2.5 * points @ turn.T + offset), region.contains(points))
+
+
+def test_regions_apart_have_no_bounds() -> None:
+    with pytest.raises(ConfigError, match="nothing is in all"):
+        bounds_of_all([Sphere((0.0, 0.0, 0.0), 1.0), Box((2.0, -1.0, -1.0), (3.0, 1.0, 1.0))])
+    low, high = bounds_of_all([Sphere((0.0, 0.0, 0.0), 1.0), Box((0.5, -9.0, -9.0), (9.0, 0.5, 9.0))])
+    assert (low, high) == ((0.5, -1.0, -1.0), (1.0, 0.5, 1.0))
 
 
 def test_inside_of_a_polygon() -> None:

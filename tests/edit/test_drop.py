@@ -14,11 +14,8 @@ from nerfloom.edit.sightings import sightings
 from nerfloom.kernels.splats.blend import MAX_ALPHA
 from nerfloom.kernels.splats.project import BLUR, MIN_ALPHA
 from nerfloom.splats.drawing import splat_camera
-from nerfloom.splats.files import write_gaussians
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.training.load import load
-from tests.dataparsers.captures import POINTS, poses, write_capture
-from tests.edit.clouds import at, scattered
+from tests.edit.clouds import at, ball_in_capture, scattered
 from tests.splats.test_method import camera
 
 
@@ -112,20 +109,7 @@ def test_without_anything_in_view() -> None:
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Edited:
-    """An opaque ball in the middle of a capture, a faint Gaussian on it, and the last one in front of it."""
-    folder = tmp_path_factory.mktemp("ball")
-    data = write_capture(folder / "capture")
-    middle = torch.from_numpy(POINTS.mean(0))
-    index = torch.arange(900, dtype=torch.float64) + 0.5
-    z, angle = 1 - 2 * index / 900, index * math.pi * (3 - math.sqrt(5))
-    around = (1 - z.square()).sqrt()
-    unit = torch.stack([around * angle.cos(), around * angle.sin(), z], -1)
-    towards = torch.from_numpy(poses()[4, :3, 3]) - middle
-    towards = towards / towards.norm()
-    given = at(torch.cat([middle + 0.5 * unit, (middle + 0.5 * towards)[None], (middle + 0.9 * towards)[None]]), 0.05)
-    given.logits[-2:] = math.log(0.2 / 0.8)
-    write_gaussians(folder / "ball.ply", given.map(torch.Tensor.float))
-    return Edited.of(load(folder / "ball.ply", data=data))
+    return ball_in_capture(tmp_path_factory.mktemp("ball"))
 
 
 def test_floaters_of_a_capture_are_dropped(ball: Edited) -> None:

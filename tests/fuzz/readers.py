@@ -55,7 +55,7 @@ from nerfloom.geometry.regions import Box, read_region, write_region
 from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.levels.files import read_levels
 from nerfloom.octrees.files import read_octree, write_octree
-from nerfloom.processing import bundler, metashape, opensfm, polycam, realitycapture, record3d
+from nerfloom.processing import aria, bundler, metashape, opensfm, polycam, realitycapture, record3d
 from nerfloom.processing.capture import Capture
 from nerfloom.processing.images import prepare_all
 from nerfloom.processing.listing import find_images
@@ -86,6 +86,7 @@ from tests.images import noise
 from tests.levels.made import built, cloud
 from tests.octrees.balls import ball
 from tests.processing.programs import write_bundler, write_metashape, write_odm, write_realitycapture
+from tests.processing.test_aria import write_recording
 from tests.splats.foreign_files import write_compressed, write_ksplat, write_splat
 from tests.training.helpers import tiny_run
 
@@ -372,6 +373,10 @@ def read_bundler(folder: Path) -> Capture:
     return bundler.read_capture(folder / "bundle.out", folder / "list.txt")
 
 
+def read_aria(folder: Path) -> Capture:
+    return aria.read_capture(folder / "images", folder / "mps", 300)
+
+
 OPENSFM = (
     "projection_type", "width", "focal", "focal_x", "c_x", "k1", "rotation", "translation", "camera", "shots",
     "coordinates",
@@ -616,6 +621,11 @@ READERS: dict[str, Reader] = {
         write_realitycapture, partial(convert, read_realitycapture, "photographs"), ("cameras.csv",)
     ),
     "odm": Reader(write_odm, partial(convert, read_odm, "images"), ("opensfm/reconstruction.json",), OPENSFM),
+    "aria": Reader(
+        write_recording,
+        partial(convert, read_aria, "images"),
+        tuple(f"mps/slam/{name}" for name in ("closed_loop_trajectory.csv", "online_calibration.jsonl")),
+    ),
     "bundler": Reader(write_bundler, partial(convert, read_bundler, "photographs"), ("bundle.out", "list.txt")),
     "config": Reader(write_config, read_config, ("config.yml",), ("method", "dataparser", "machine", "data", "name")),
     "comparison": Reader(write_recipe, read_recipe, ("recipe.yml",), ("methods", "data", "repeats", "target_psnr")),

@@ -9,12 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from nerfloom.base.errors import DataError
+from nerfloom.data.ply import write_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.processing import polycam, record3d
-from tests.dataparsers.captures import poses, worst_miss
+from tests.dataparsers.captures import POINTS, poses, worst_miss
 from tests.dataparsers.test_polycam import STAMPS, write_polycam
 from tests.dataparsers.test_record3d import COUNT, write_record3d
 
@@ -98,6 +101,24 @@ def test_reduced_images_of_record3d(tmp_path: Path) -> None:
     worst = worst_miss(scene, poses(COUNT)[order])
     print(f"rays miss known points by {worst:.1e} of their distance")
     assert worst < 2e-6
+
+
+def test_points_of_record3d_move_with_the_poses(tmp_path: Path) -> None:
+    """Those of all files of a folder; a point that a camera sees is where its ray leads."""
+    folder = write_record3d(tmp_path / "recording")
+    (tmp_path / "points").mkdir()
+    for number, point in enumerate(POINTS):
+        write_points(
+            tmp_path / "points" / f"{number}.ply", torch.from_numpy(point[None]), torch.full((1, 3), 0.25 * number)
+        )
+    record3d.convert(folder, tmp_path / "out", 0, 100, tmp_path / "points")
+    assert json.loads((tmp_path / "out" / "transforms.json").read_text())["ply_file_path"] == "sparse_pc.ply"
+    scene = Nerfstudio(eval_interval=0).parse(tmp_path / "out", "train")
+    assert scene.points is not None
+    found = scene.placement.original_points(scene.points)
+    np.testing.assert_allclose(found, POINTS, atol=1e-5)
+    with pytest.raises(DataError, match="has no PLY file"):
+        record3d.convert(folder, tmp_path / "other", 0, 100, folder)
 
 
 def test_images_that_are_not_taken_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,6 +30,7 @@ ELSEWHERE = {
     r"ns-process-data (polycam|record3d) .*(zip|r3d)": "tests/processing/test_archives.py",
     r"ns-process-data (polycam|record3d) ": "tests/truth/test_processing.py",
     r"ns-process-data (metashape|realitycapture|odm|bundler) ": "tests/processing/test_programs.py",
+    r"ns-process-data aria ": "tests/processing/test_aria.py",
     r"ns-process-data (images|video) .*equirectangular": "tests/processing/test_views.py",
     r"ns-process-data images .*(FISHEYE|scan/images)": "tests/truth/test_processing.py",
     r"ns-process-data images .*--resume": "tests/processing/test_process_command.py",

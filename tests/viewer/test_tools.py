@@ -170,6 +170,20 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
     assert region.contains(means).all()
 
 
+def test_floaters_are_counted(browser: Chromium, shared_tiny: Path, tmp_path: Path) -> None:
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", max_num_iterations=60)
+    trainer.train()
+    with started(command("ns-viewer"), trainer.folder, "--websocket-port", 18407) as (_, address):
+        tab = browser.open(address)
+        shown(tab)
+        tab.press("Photographs")
+        tick(tab, "Show floaters")
+        until(lambda: "Gaussians float" in text_of(tab))
+        tick(tab, "Show floaters")
+        until(lambda: "Gaussians float" not in text_of(tab))
+        tab.close()
+
+
 def test_a_video_has_a_bar_and_is_downloaded(browser: Chromium, run: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 18007) as (_, address):
         tab = browser.open(address)

@@ -2,7 +2,6 @@
 
 import math
 import re
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,6 @@ from tests.octrees.balls import grains
 from tests.patience import PATIENCE
 from tests.web.helpers import ASLANT, SIZE, octree_facts, some_cameras, some_facts, some_gaussians
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 CLOSE = 45.0
 """Least PSNR of the browser's picture against our renderer's, dB. Rounding to 8 bits alone leaves 59."""
 FLAGS = (
@@ -36,15 +34,6 @@ FLAGS = (
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--force-device-scale-factor=1"),
     *("--virtual-time-budget=20000", "--window-size=500,500"),
 )
-
-
-@pytest.fixture(scope="module")
-def browser() -> str:
-    """The path of Chromium."""
-    for name in NAMES:
-        if found := shutil.which(name):
-            return found
-    pytest.skip("there is no Chromium; the page is not opened")
 
 
 def opened(browser: str, folder: Path, address: str, *flags: str) -> str:
@@ -205,6 +194,44 @@ def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: P
     assert float(distance) < 0.9 * float(away)
     assert float((moved - eye).norm()) > 0.1
     assert (camera, reset) == ("1", first)
+
+
+MOTION = """<script>
+const wait = setInterval(() => {
+  const state = document.documentElement.dataset;
+  if (state.state !== "ready") return;
+  clearInterval(wait);
+  if (typeof DeviceOrientationEvent !== "function") { state.seen = "none"; return; }
+  const turn = (alpha, beta) => window.dispatchEvent(
+    new DeviceOrientationEvent("deviceorientation", { alpha, beta, gamma: 0 }));
+  const seen = [state.eye];
+  turn(200, 90); // not yet
+  document.getElementById("motion").click();
+  turn(10, 90); turn(40, 90);
+  seen.push(state.eye);
+  document.getElementById("motion").click();
+  turn(90, 90);
+  seen.push(state.eye);
+  state.seen = seen.join("|");
+}, 50);
+</script>"""
+
+
+@pytest.mark.medium
+def test_a_phone_turns_the_view(browser: str, scene: Path, tmp_path: Path) -> None:
+    """By 30 degrees about the vertical through what is looked at, while it is switched on."""
+    file = tmp_path / "motion.html"
+    file.write_text(scene.read_text(encoding="utf-8").replace("</body>", MOTION + "</body>"), encoding="utf-8")
+    dom = opened(browser, tmp_path, f"{file.as_uri()}#sort=here", "--dump-dom")
+    found = re.search(r'data-seen="([^"]*)"', dom)
+    assert found is not None, dom[:300]
+    if found[1] == "none":
+        pytest.skip("this Chromium has no orientation events")
+    start, turned, after = (torch.tensor([float(x) for x in text.split()]) for text in found[1].split("|"))
+    focus, c, s = torch.tensor(some_facts().focus), math.cos(math.pi / 6), math.sin(math.pi / 6)
+    about = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(turned, focus + about @ (start - focus), atol=5e-3, rtol=0)
+    assert torch.equal(after, turned)
 
 
 @pytest.mark.medium

@@ -1,5 +1,6 @@
 """The content of the web page of Gaussians."""
 
+import base64
 import fnmatch
 import json
 import math
@@ -9,6 +10,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import imageio.v3 as iio
+import numpy as np
 import pytest
 import torch
 
@@ -29,6 +31,7 @@ from nerfloom.export.web import (
     pinhole,
     shown_cameras,
     upright,
+    with_still,
 )
 from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.look import Look
@@ -165,6 +168,26 @@ def test_a_page_asks_no_host_and_runs_no_text() -> None:
     for word in ("http:", "https:", "//cdn", "eval(", "new Function", "innerHTML", "SharedArrayBuffer", "import("):
         assert word not in text, word
     assert "default-src 'none'" in text
+
+
+def test_a_still_picture_fits_into_its_room() -> None:
+    """Smaller where there is little, and none where there is hardly any; the scene in the page stays."""
+    text, picture = page(b"123", some_facts()), np.zeros((630, 1200, 3), np.uint8)
+    picture[:, :400] = (200, 40, 40)
+    assert 'alt="test"' in text
+    size = len(text.encode())
+    assert with_still(text, picture, 1e-6 * size + 1e-5) == text
+    widths = list[int]()
+    for room in (100_000, 2_500):
+        found = with_still(text, picture, 1e-6 * (size + room))
+        assert len(found.encode()) <= size + min(room, 60_000)
+        assert payload_of(found) == b"123"
+        written = re.search(r'<img id="still"[^>]*base64,([^"]*)"', found)
+        assert written is not None
+        small = iio.imread(base64.b64decode(written[1]))
+        assert np.abs(small[5, 5].astype(int) - (200, 40, 40)).max() < 20
+        widths.append(small.shape[1])
+    assert widths[0] > widths[1]
 
 
 def test_damaged_pages_are_refused() -> None:

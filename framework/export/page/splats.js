@@ -3,36 +3,73 @@
 // GPU idle, and costs a call of its own where WebGL runs in software.
 
 const BATCH = 4096; // Gaussians an instance, and places in a row of the texture of their order
+const ROW_OF_TABLE = 1024; // Gaussians in a row of the texture of their table
 const HEADER = 16; // bytes of an SPZ file of version 2 (framework/splats/spz.py), before one array an attribute
 const TEXEL = 16; // bytes
 
-/** Return the scene of a page: what it is made of, `follow` and `drawer`. Gaussians are sorted by a worker, or `here`. */
+/** Return the scene of a page: how many `things` it shows, `follow` and `drawer`. Gaussians are sorted by a worker, or
+ * `here`. A page of levels has those of its coarsest level, and loads others (levels.js). */
 function sceneOf(raw, facts, here) {
-  const gaussians = gaussiansOf(raw), sort = sortingElsewhere(gaussians.centers, here);
-  const sorted = { order: null, times: 0 };
-  let wanted = null, sorting = false;
+  const gaussians = gaussiansOf(raw);
+  if (facts.levels) return levelsOf(gaussians, facts, here);
+  const store = storeOf(facts, gaussians.degree, gaussians.rows, here);
+  store.add(0, gaussians, 0);
+  store.show([0]);
+  return { things: "Gaussians", ...store, count: gaussians.count };
+}
+
+/** Return a store of Gaussians of a degree, in chunks that take `rows` rows of a table for the GPU.
+ *
+ *     add(id, gaussians, row)   adds a chunk, from a row on
+ *     remove(id)                removes a chunk that is not `used`
+ *     show(ids)                 chooses the chunks that are drawn
+ *     used(id)                  whether a chunk is drawn, or may be until the next order comes
+ *     follow(view, changed)     has them sorted for a view; true if there is an order to draw in. `changed` is called at
+ *                               each new one
+ */
+function storeOf(facts, degree, rows, here) {
+  const chunks = new Map(), sort = sortingElsewhere(here);
+  const sorted = { order: null, times: 0 }, store = { degree, rows, chunks, sorted, ids: [] };
+  let wanted = null, sorting = false, pending = [], ordered = [];
   return {
-    count: gaussians.count,
-    things: "Gaussians",
-    /** Have Gaussians sorted for a view; true if there is an order to draw in. `changed` is called at each new one. */
+    add(id, gaussians, row) {
+      if (gaussians.degree !== degree) throw new Refused("The parts of this page do not fit together. Export the page again.");
+      chunks.set(id, { gaussians, row });
+      sort.add(id, gaussians.centers, ROW_OF_TABLE * row);
+    },
+    remove(id) {
+      chunks.delete(id);
+      sort.remove(id);
+    },
+    show(ids) {
+      if (ids.length === store.ids.length && ids.every((id, k) => id === store.ids[k])) return;
+      store.ids = ids;
+      wanted = null;
+    },
+    used: (id) => [store.ids, pending, ordered].some((ids) => ids.includes(id)),
     follow(view, changed) {
       const from = { eye: view.eye, axis: facts.look.sort === "depth" ? axesOf(view).forward : null };
       const numbers = [...from.eye, ...(from.axis || [])];
       if (!sorting && !(wanted && wanted.every((x, k) => x === numbers[k]))) {
         sorting = true;
         wanted = numbers;
-        sort(from, (order) => {
+        pending = store.ids;
+        sort.sort({ ...from, ids: pending }, (order) => {
           sorted.order = order;
           sorted.times += 1;
           sorting = false;
+          ordered = pending;
           changed();
         });
       }
       return sorted.order !== null;
     },
-    drawer: (gl) => drawer(gl, gaussians, sorted, facts),
+    drawer: (gl) => drawer(gl, store, facts),
   };
 }
+
+/** Return the number of texels of a Gaussian with harmonics up to a degree. */
+const texelsOf = (degree) => 2 + Math.ceil((3 * ((degree + 1) ** 2 - 1)) / TEXEL);
 
 /** Return the Gaussians of an unpacked SPZ file: centres (N x 3, scene coordinates), and a table for the GPU.
  *
@@ -48,11 +85,10 @@ function gaussiansOf(raw) {
   if (view.getUint32(4, true) !== 2 || degree > 3 || raw[13] > 30) refuse("their header is not one of ours");
   const rest = 3 * ((degree + 1) ** 2 - 1);
   if (raw.length !== HEADER + count * (19 + rest)) refuse("they are not as long as their header says");
-  const extra = Math.ceil(rest / TEXEL), texels = 2 + extra;
+  const texels = texelsOf(degree);
   const positions = HEADER, alphas = positions + 9 * count, colors = alphas + count, scales = colors + 3 * count;
   const turns = scales + 3 * count, harmonics = turns + 3 * count;
-  const width = 1024 * texels; // a row of the texture holds 1024 Gaussians
-  const rows = Math.max(Math.ceil(count / 1024), 1);
+  const width = ROW_OF_TABLE * texels, rows = Math.max(Math.ceil(count / ROW_OF_TABLE), 1);
   const table = new Uint8Array(rows * width * TEXEL), centers = new Float32Array(3 * count);
   const floats = new Float32Array(table.buffer);
   for (let i = 0; i < count; i++) {
@@ -69,7 +105,7 @@ function gaussiansOf(raw) {
     table[to + 15] = raw[alphas + i];
     for (let k = 0, from = harmonics + rest * i; k < rest; k++) table[to + 2 * TEXEL + k] = raw[from + k];
   }
-  return { count, degree, centers, table: new Uint32Array(table.buffer), width, rows, texels };
+  return { count, degree, centers, table: new Uint32Array(table.buffer), rows, texels };
 }
 
 /** Return the vertex shader for harmonics up to a degree. */
@@ -104,7 +140,7 @@ void main() {
   uint rank = uint(gl_InstanceID) * ${BATCH}u + (uint(gl_VertexID) >> 2);
   if (rank >= count) return;
   uint which = texelFetch(order, ivec2(rank % ${BATCH}u, rank / ${BATCH}u), 0).r;
-  ivec2 at = ivec2(int(which & 1023u) * ${2 + extra}, int(which >> 10));
+  ivec2 at = ivec2(int(which % ${ROW_OF_TABLE}u) * ${texelsOf(degree)}, int(which / ${ROW_OF_TABLE}u));
   uvec4 first = texelFetch(table, at, 0);
   vec3 mean = uintBitsToFloat(first.xyz), p = turn * (mean - eye);
   if (p.z <= near) return;
@@ -176,22 +212,30 @@ uniform sampler2D image;
 out vec4 drawn;
 void main() { drawn = vec4(clamp(texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb, 0.0, 1.0), 1.0); }`;
 
-/** Return functions that draw Gaussians on a canvas, in the order that `sorted` holds, and that find surfaces.
+/** Return functions that draw the chunks of a store on a canvas, in the order that it holds, and that find surfaces.
  *
  * Colours are summed in 16-bit floats where the browser can: in 8 bits each of a hundred layers would be rounded.
  */
-function drawer(gl, gaussians, sorted, facts) {
-  const { look, near } = facts;
-  const splat = program(gl, vertexShader(gaussians.degree), FRAGMENT), copy = program(gl, WHOLE, COPY);
-  const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-  if (gaussians.width > most || gaussians.rows > most) {
+function drawer(gl, store, facts) {
+  const { look, near } = facts, { degree, rows: tableRows, chunks, sorted } = store, held = new Map();
+  const splat = program(gl, vertexShader(degree), FRAGMENT), copy = program(gl, WHOLE, COPY);
+  const most = gl.getParameter(gl.MAX_TEXTURE_SIZE), tableWidth = ROW_OF_TABLE * texelsOf(degree);
+  if (tableWidth > most || tableRows > most) {
     throw new Refused("This device's graphics cannot hold this many Gaussians; export with a lower --max-megabytes.");
   }
-  const { width: tableWidth, rows: tableRows } = gaussians;
   texture(gl, gl.TEXTURE0, gl.RGBA32UI, tableWidth, tableRows);
-  gl.texSubImage2D(
-    gl.TEXTURE_2D, 0, 0, 0, tableWidth, tableRows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, gaussians.table);
-  texture(gl, gl.TEXTURE2, gl.R32UI, BATCH, Math.max(Math.ceil(gaussians.count / BATCH), 1));
+  texture(gl, gl.TEXTURE2, gl.R32UI, BATCH, Math.max(Math.ceil((ROW_OF_TABLE * tableRows) / BATCH), 1));
+  /** Give the GPU the chunks that it does not have yet. */
+  const holdChunks = () => {
+    for (const [id, { gaussians, row }] of chunks) {
+      if (held.get(id) === gaussians) continue;
+      held.set(id, gaussians);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.texSubImage2D(
+        gl.TEXTURE_2D, 0, 0, row, tableWidth, gaussians.rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, gaussians.table);
+    }
+    for (const id of held.keys()) if (!chunks.has(id)) held.delete(id);
+  };
 
   const whole = gl.createVertexArray(), each = gl.createVertexArray();
   gl.bindVertexArray(each);
@@ -217,11 +261,11 @@ function drawer(gl, gaussians, sorted, facts) {
     return buffer;
   };
 
-  let held = 0;
+  let times = 0;
   const holdOrder = () => {
-    const { order, times } = sorted;
-    if (held === times) return;
-    held = times;
+    const { order } = sorted;
+    if (times === sorted.times) return;
+    times = sorted.times;
     drawn = order.length;
     const rows = Math.floor(drawn / BATCH), rest = drawn % BATCH;
     gl.activeTexture(gl.TEXTURE2);
@@ -233,6 +277,7 @@ function drawer(gl, gaussians, sorted, facts) {
 
   return {
     draw(camera, background) {
+      holdChunks();
       holdOrder();
       const { width, height } = gl.canvas, { made, uniforms } = splat, first = target(width, height);
       gl.viewport(0, 0, width, height);
@@ -262,86 +307,120 @@ function drawer(gl, gaussians, sorted, facts) {
       gl.uniform1i(copy.uniforms.image, 1);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     },
-    surfaceAt: (...where) => surfaceAt(gaussians, facts, ...where),
+    surfaceAt: (...where) => surfaceAt(store.ids.map((id) => chunks.get(id).gaussians), facts, ...where),
   };
 }
 
-/** Return a function that sorts Gaussians from far to near, by radix on the bits of their squared distances, or of their
- * depths along an axis where one is given. */
-function sorter(centers) {
-  const count = centers.length / 3;
-  const keys = new Float32Array(count), bits = new Uint32Array(keys.buffer), counts = new Uint32Array(65536);
-  const order = new Uint32Array(count), between = new Uint32Array(count);
-  return ({ eye: [x, y, z], axis }) => {
-    for (let i = 0, k = 0; i < count; i++, k += 3) {
-      const a = centers[k] - x, b = centers[k + 1] - y, c = centers[k + 2] - z;
-      keys[i] = axis ? Math.max(a * axis[0] + b * axis[1] + c * axis[2], 0) : a * a + b * b + c * c;
-    }
-    for (const shift of [0, 16]) {
-      counts.fill(0);
-      for (let i = 0; i < count; i++) counts[(bits[i] >>> shift) & 65535]++;
-      for (let value = 65535, start = 0; value >= 0; value--) {
-        const number = counts[value];
-        counts[value] = start;
-        start += number;
+/** Return a sorter of chunks of Gaussians: from far to near, by radix on the bits of their squared distances, or of their
+ * depths along an axis where one is given. Its order has the places of Gaussians in the table. */
+function sorter() {
+  const chunks = new Map(), counts = new Uint32Array(65536);
+  let keys = new Float32Array(0), bits, order, between, places;
+  return {
+    add(id, centers, first) { chunks.set(id, { centers, first }); },
+    remove(id) { chunks.delete(id); },
+    sort({ eye: [x, y, z], axis, ids }) {
+      const shown = ids.map((id) => chunks.get(id));
+      const count = shown.reduce((sum, { centers }) => sum + centers.length / 3, 0);
+      if (count > keys.length) {
+        keys = new Float32Array(count);
+        bits = new Uint32Array(keys.buffer);
+        [order, between, places] = [0, 1, 2].map(() => new Uint32Array(count));
       }
-      for (let i = 0; i < count; i++) {
-        const which = shift ? between[i] : i;
-        (shift ? order : between)[counts[(bits[which] >>> shift) & 65535]++] = which;
+      let filled = 0;
+      for (const { centers, first } of shown) {
+        for (let k = 0; k < centers.length; k += 3, filled++) {
+          const a = centers[k] - x, b = centers[k + 1] - y, c = centers[k + 2] - z;
+          keys[filled] = axis ? Math.max(a * axis[0] + b * axis[1] + c * axis[2], 0) : a * a + b * b + c * c;
+          places[filled] = first + k / 3;
+        }
       }
-    }
-    return order;
+      for (const shift of [0, 16]) {
+        counts.fill(0);
+        for (let i = 0; i < count; i++) counts[(bits[i] >>> shift) & 65535]++;
+        for (let value = 65535, start = 0; value >= 0; value--) {
+          const number = counts[value];
+          counts[value] = start;
+          start += number;
+        }
+        for (let i = 0; i < count; i++) {
+          const which = shift ? between[i] : i;
+          (shift ? order : between)[counts[(bits[which] >>> shift) & 65535]++] = shift ? places[which] : which;
+        }
+      }
+      return order ? order.subarray(0, count) : new Uint32Array(0);
+    },
   };
 }
 
-/** Return a function ({ eye, axis }, done) that sorts in a worker; in the page itself where workers are refused. */
-function sortingElsewhere(centers, here) {
-  const local = () => {
-    const sort = sorter(centers);
-    return (from, done) => done(sort(from));
+/** Return a sorter that works in a worker, whose `sort` is given a function that takes the order; in the page itself
+ * where workers are refused. */
+function sortingElsewhere(here) {
+  const chunks = new Map();
+  let worker = null, waiting = null, local = null;
+  const inPage = () => {
+    if (!local) {
+      local = sorter();
+      for (const [id, [centers, first]] of chunks) local.add(id, centers, first);
+    }
+    return local;
   };
-  if (here || typeof Worker !== "function") return local();
-  const source = `${sorter}
-let sort;
-onmessage = ({ data }) => {
-  if (data.centers) { sort = sorter(data.centers); return; }
-  const order = sort(data).slice();
-  postMessage(order, [order.buffer]);
-};`;
-  let worker, waiting = null, fallback = null;
   const refused = () => {
     worker = null;
-    fallback = fallback || local();
-    if (waiting) fallback(...waiting);
+    if (!waiting) return;
+    const [from, done] = waiting;
     waiting = null;
+    done(inPage().sort(from));
   };
-  try {
-    worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
-    worker.onerror = (event) => { event.preventDefault(); refused(); };
-    worker.onmessage = ({ data }) => {
-      const [, done] = waiting;
-      waiting = null;
-      done(data);
-    };
-    worker.postMessage({ centers });
-  } catch (error) {
-    refused();
+  const source = `${sorter}
+const held = sorter();
+onmessage = ({ data: { add, remove, sort } }) => {
+  if (add) held.add(...add);
+  if (remove !== undefined) held.remove(remove);
+  if (!sort) return;
+  const order = held.sort(sort).slice();
+  postMessage(order, [order.buffer]);
+};`;
+  if (!here && typeof Worker === "function") {
+    try {
+      worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+      worker.onerror = (event) => { event.preventDefault(); refused(); };
+      worker.onmessage = ({ data }) => {
+        const [, done] = waiting;
+        waiting = null;
+        done(data);
+      };
+    } catch (error) {
+      refused();
+    }
   }
-  return (from, done) => {
-    if (!worker) { fallback(from, done); return; }
-    waiting = [from, done];
-    worker.postMessage(from);
+  return {
+    add(id, centers, first) {
+      chunks.set(id, [centers, first]);
+      if (worker) worker.postMessage({ add: [id, centers, first] });
+      else if (local) local.add(id, centers, first);
+    },
+    remove(id) {
+      chunks.delete(id);
+      if (worker) worker.postMessage({ remove: id });
+      else if (local) local.remove(id);
+    },
+    sort(from, done) {
+      if (!worker) { done(inPage().sort(from)); return; }
+      waiting = [from, done];
+      worker.postMessage({ sort: from });
+    },
   };
 }
 
 /** Return the surface at a position of a picture, or null: as far away as the Gaussian that makes the ray half opaque. */
-function surfaceAt(gaussians, { look, near }, view, width, height, x, y) {
-  const camera = cameraOf(view, width, height), { right, down, forward } = axesOf(view), bytes = gaussians.table;
+function surfaceAt(chunks, { look, near }, view, width, height, x, y) {
+  const camera = cameraOf(view, width, height), { right, down, forward } = axesOf(view);
   const byte = (word, k) => (word >>> (8 * k)) & 255, crossed = [];
   const low = [(-0.15 * width - camera.cx) / camera.fx, (-0.15 * height - camera.cy) / camera.fy];
   const high = [(1.15 * width - camera.cx) / camera.fx, (1.15 * height - camera.cy) / camera.fy];
-  for (let i = 0; i < gaussians.count; i++) {
-    const at = 4 * gaussians.texels * i, mean = [0, 1, 2].map((k) => gaussians.centers[3 * i + k] - view.eye[k]);
+  for (const { count, texels, centers, table: bytes } of chunks) for (let i = 0; i < count; i++) {
+    const at = 4 * texels * i, mean = [0, 1, 2].map((k) => centers[3 * i + k] - view.eye[k]);
     const z = dot(mean, forward);
     if (z <= near) continue;
     const place = [dot(mean, right) / z, dot(mean, down) / z], scales = [0, 1, 2].map((k) => Math.exp(byte(bytes[at + 4], k) / 16 - 10));

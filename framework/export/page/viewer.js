@@ -4,9 +4,9 @@
 // by pixel; spin=1 turns around the scene; quality=full draws every pixel and quality=fast a quarter of them; sort=here
 // and inflate=here do without worker and DecompressionStream.
 //
-// What the scene is made of is the matter of splats.js or octree.js: sceneOf(raw, facts, here) returns how many `things`
-// there are, follow(view, changed), true if it can be drawn, and drawer(gl), which has draw(camera, background) and
-// surfaceAt(view, width, height, x, y).
+// What the scene is made of is the matter of splats.js, with levels.js, or octree.js: sceneOf(raw, facts, here) returns
+// how many `things` there are, follow(view, changed), true if it can be drawn, and drawer(gl), which has
+// draw(camera, background) and surfaceAt(view, width, height, x, y).
 
 const element = (id) => document.getElementById(id);
 const canvas = element("canvas"), options = new URLSearchParams(location.hash.slice(1));
@@ -297,6 +297,7 @@ function show(gl, scene, facts) {
     measure.clear();
     dirty = true;
   }
+  const tilt = motion((dx, dy) => { if (spinning) spin(false); look(orbited(view, dx, dy)); });
   const reset = () => { spin(false); jump(start); };
   const behind = () => {
     const at = BACKGROUNDS.findIndex((color) => color.every((x, k) => x === background[k]));
@@ -345,9 +346,10 @@ function show(gl, scene, facts) {
   slider.addEventListener("input", () => { spin(false); jump(Number(slider.value)); });
   for (const [id, action] of Object.entries({
     previous: () => jump(camera - 1), next: () => jump(camera + 1), reset, spin: () => spin(!spinning),
-    measure: () => setMeasuring(!measuring), behind, full, quality: () => draw(quality + 1),
+    measure: () => setMeasuring(!measuring), motion: tilt, behind, full, quality: () => draw(quality + 1),
     ask: () => help(), close: () => help(false),
   })) element(id).addEventListener("click", action);
+  if (!hasMotion()) element("motion").hidden = true;
   if (!document.documentElement.requestFullscreen) element("full").hidden = true;
   if (cameras.length < 2) element("cameras").hidden = true;
   if (plain) document.body.classList.add("bare");

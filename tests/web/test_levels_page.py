@@ -1,0 +1,152 @@
+"""The page of levels of detail: its folder of chunks, and the browser that loads them."""
+
+import json
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+import nerfloom
+from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.view import View
+from nerfloom.cli.export import main
+from nerfloom.evaluation.metrics import psnr
+from nerfloom.export.levels_page import levels_page
+from nerfloom.export.web import DATA, gaussians_of
+from nerfloom.levels.drawn import DrawnLevels
+from nerfloom.levels.files import LevelsFile
+from nerfloom.levels.settings import DetailSettings
+from nerfloom.splats.drawing import draw_colors, splat_camera
+from nerfloom.splats.spz import read_spz
+from nerfloom.splats.transform import transformed
+from tests.cli.helpers import called
+from tests.conftest import Refused
+from tests.levels.made import built, cloud, leaves, scene
+from tests.web.helpers import SIZE, some_cameras, some_facts
+from tests.web.test_browser import opened, pictured
+
+UPRIGHT = torch.eye(3, dtype=torch.float64)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> LevelsFile:
+    return built(tmp_path / "cloud.levels", cloud(3000, 2), 300, memory=2.0)
+
+
+def facts_in(page: Path) -> dict[str, Any]:
+    found = re.search(r'<script id="facts" type="application/json">([^<]*)</script>', page.read_text(encoding="utf-8"))
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_chunks_lie_beside_the_page(file: LevelsFile, tmp_path: Path) -> None:
+    """In the frame of the page, which is that of the scene here; chunks of an earlier page are removed."""
+    out = tmp_path / "out"
+    (out / "scene").mkdir(parents=True)
+    (out / "scene" / "99999.spz").write_bytes(b"old")
+    (out / "scene" / "mine.spz").write_bytes(b"of somebody else")
+    done = called("ns-export", "web", file.path, "--output-dir", out)
+    assert done.returncode == 0, done.stderr
+    assert "3,000 Gaussians in" in " ".join(done.stderr.split())
+    model = nerfloom.load(file.path).model
+    assert isinstance(model, DrawnLevels)
+    names = {f"{index}.spz" for index in range(len(file.nodes))} | {"mine.spz"}
+    assert {each.name for each in (out / "scene").iterdir()} == names
+    total = 0
+    for index in range(len(file.nodes)):
+        expected = transformed(file.read(index), *model.placement.similarity())
+        found = read_spz(out / "scene" / f"{index}.spz").gaussians
+        torch.testing.assert_close(found.means, expected.means, atol=2e-3, rtol=0)
+        total += len(found) if index in leaves(file) else 0
+    assert total == 3000
+    page = out / "scene.html"
+    text, facts = page.read_text(encoding="utf-8"), facts_in(page)
+    assert "connect-src 'self'" in text
+    assert DATA.search(text) is not None
+    assert len(gaussians_of(text)) == facts["levels"]["counts"][-1] == int(file.nodes.counts[-1])
+    assert facts["levels"]["parents"] == file.nodes.parents.tolist()
+    assert (facts["levels"]["folder"], facts["levels"]["total"]) == ("scene", 3000)
+    assert 'src="data:image/jpeg;base64,' in text
+    assert (out / "scene.jpg").is_file()
+
+
+def test_what_a_page_of_levels_cannot_be(file: LevelsFile, tmp_path: Path, refused: Refused) -> None:
+    out = ("--output-dir", tmp_path / "out")
+    assert "ns-export levels" in refused(main, "web", file.path, *out, "--crop-sphere", "0,0,0,1")
+    assert "leave it out" in refused(main, "web", file.path, *out, "--kind", "octree")
+    assert not (tmp_path / "out" / "scene").exists()
+
+
+# -- in a browser -------------------------------------------------------------------------------------------------
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """A static host that prints nothing."""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@contextmanager
+def hosted(folder: Path) -> Iterator[str]:
+    """The address of a folder on a static host."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@pytest.fixture
+def page(file: LevelsFile, tmp_path: Path) -> tuple[Path, DrawnLevels]:
+    """A page in the frame of the file, and the levels as we draw them."""
+    model = DrawnLevels(file, Placement.of(None, 1.0), scene(), torch.device("cpu"), DetailSettings(1.0, 100.0))
+    loaded: Any = SimpleNamespace(model=model, origin=file.path)
+    path = tmp_path / "host" / "scene.html"
+    path.parent.mkdir()
+    path.write_text(levels_page(loaded, path, some_facts(), UPRIGHT).text, encoding="utf-8")
+    return path, model
+
+
+@pytest.mark.slow
+def test_the_browser_loads_and_draws_the_levels_that_we_draw(
+    browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path
+) -> None:
+    """The colours that SPZ rounds are not those of the coarsest level."""
+    path, model = page
+    own = model.render_rgb(View(some_cameras()[1:2]), torch.ones(3)).clamp(0, 1)
+    assert float(own.std()) > 0.05  # there is something to see
+    assert len(model.cut(View(some_cameras()[1:2])).nodes) > 1
+    with hosted(path.parent) as host:
+        address = f"{host}/scene.html"
+        dom = opened(browser, tmp_path, f"{address}#camera=1&plain=1", "--dump-dom")
+        shot = pictured(browser, SimpleNamespace(as_uri=lambda: address), tmp_path, 1)  # type: ignore[arg-type]
+    assert 'data-missing="0"' in dom, dom[:300]
+    assert shot.shape == (SIZE[1], SIZE[0], 3)
+    camera = splat_camera(some_cameras()[1:2], 0.05)
+    coarsest = draw_colors(model.file.read(len(model.file.nodes) - 1), camera, 1, torch.ones(3)).clamp(0, 1)
+    found, coarse = psnr(shot, own), psnr(coarsest, own)
+    print(f"PSNR of the browser's picture of levels against ours {found:.1f} dB, of the coarsest {coarse:.1f}")
+    assert found > 35
+    assert found > coarse + 5
+
+
+@pytest.mark.slow
+def test_from_disk_the_coarsest_level_is_shown_and_why(
+    browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path
+) -> None:
+    dom = opened(browser, tmp_path, f"{page[0].as_uri()}#sort=here", "--dump-dom")
+    assert 'data-state="ready"' in dom
+    assert "Only a coarse version is shown" in dom

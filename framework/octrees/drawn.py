@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,7 +17,8 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import OctreeLight, error_bound
 from nerfloom.kernels.octree.packed import trace_packed
-from nerfloom.kernels.octree.walk import leaf_at
+from nerfloom.kernels.octree.walk import leaf_at, smallest_cells
+from nerfloom.octrees.coarser import with_levels
 from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import RendersRays
 from nerfloom.rendering.outputs import Output
@@ -109,7 +111,10 @@ class DrawsOctree(RendersRays):
         with self.rendering():
             for some in pixels.reshape(-1).split(max(self.rays_at_once // per_pixel, 1)):
                 rays = view.camera.pixel_rays(some, self.scene.near, self.scene.far, None, offsets)
-                rendered = self.render(replace(rays, camera_indices=None), background)
+                radii = rays.pixel_radii
+                if radii is not None:  # that of parallel rays does not grow with the distance
+                    radii = None if view.camera.model == "orthographic" else radii / per_pixel**0.5
+                rendered = self.render(replace(rays, camera_indices=None, pixel_radii=radii), background)
                 parts.append(rendered.to_pixels(per_pixel, self.outputs))
         size = tuple(pixels.shape)
         return Picture(
@@ -125,6 +130,8 @@ class DrawsOctree(RendersRays):
 
 class DrawnOctree(DrawsOctree):
     """A renderable of an octree that does not change.
+
+    Pictures from afar use coarser levels, which are derived when the first such picture is drawn.
 
     Args:
         octree: the octree, on the device that renders it.
@@ -155,4 +162,21 @@ class DrawnOctree(DrawsOctree):
         return max(self._largest, 1.0)
 
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
-        return trace_packed(self.layout, self.octree.leaves, rays, background, stop)
+        octree = self._for_rays(rays)
+        return trace_packed(octree.layout, octree.leaves, rays, background, stop)
+
+    @cached_property
+    def _with_levels(self) -> Octree:
+        return with_levels(self.octree)
+
+    def _for_rays(self, rays: Rays) -> Octree:
+        """Return the octree with the levels that rays may need: the given one if no pixel is wide enough for others."""
+        smallest = smallest_cells(rays)
+        if smallest is None or not len(rays):
+            return self.octree
+        low, high = rays.origins.aminmax(dim=0)
+        first, last = self.layout.box
+        edge = float(smallest.amax() * torch.maximum(high - first, last - low).norm())
+        if not edge > self.layout.cell:
+            return self.octree
+        return self._with_levels.finest(1 + sum(level.cell < edge for level in self._with_levels.layout.levels))

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.octree.layout import OctreeLayout
-from nerfloom.kernels.octree.packed import PackedLeaves
+from nerfloom.kernels.octree.packed import CODES, PackedLeaves
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,16 @@ class Octree:
         return replace(
             self, layout=layout, leaves=replace(leaves, codes=leaves.codes[kept], colors=leaves.colors[kept])
         )
+
+    def finest(self, count: int) -> Octree:
+        """Return the octree with at most `count` levels, the finest ones."""
+        levels, leaves = self.layout.levels[:count], self.leaves
+        layout = levels[0].within(levels[1:])
+        kept = layout.firsts_of_levels[-1]
+        leaves = replace(
+            leaves, codes=leaves.codes[:kept], table=leaves.table[: CODES * len(levels)], colors=leaves.colors[:kept]
+        )
+        return replace(self, layout=layout, leaves=leaves)
 
     @property
     def scene(self) -> Scene:

@@ -4,12 +4,16 @@ All leaves are cubes of one size, the cells of a grid over a box. Of the octree'
 cells, their octants of 4^3, and cells. A dense grid of bricks says where they are and, in empty space, how far away the
 nearest one is, so that a ray passes it in few steps. An octant is a bit set of its cells, as in Laine and Karras 2010,
 "Efficient sparse voxel octrees", and the leaves of an octant follow each other.
+
+A grid may have coarser ones around it, each with cells of twice the edge. They show what lies outside of its box, and
+what a ray meets where its pixel is much wider than a cell (`walk.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -24,6 +28,8 @@ MAX_DISTANCE = 16
 """Maximum recorded distance to a brick, in bricks."""
 MAX_BRICKS = 2**24
 """Maximum number of bricks in the box, empty ones included."""
+MAX_LEVELS = 24
+"""Maximum number of grids around one another, as in `walk.h`."""
 BRICKS_AT_ONCE = 2**12
 """Number of bricks whose cells are listed together; each takes some kilobytes meanwhile."""
 
@@ -43,7 +49,10 @@ class OctreeLayout:
     firsts: Tensor
     """(B, 8) int32 index of the first leaf of each octant."""
     num_leaves: int
-    """Number of leaves."""
+    """Number of leaves, without those of coarser grids."""
+    coarser: OctreeLayout | None = None
+    """The grid with cells of twice the edge, whose box contains this one's; None if there is none. Leaves are numbered
+    grid by grid, those of the finest first."""
 
     @classmethod
     def build(cls, origin: Tensor, cell: float, size: Sequence[int], cells: Tensor) -> tuple[OctreeLayout, Tensor]:
@@ -92,6 +101,33 @@ class OctreeLayout:
             len(key),
         ), rows
 
+    def within(self, coarser: Sequence[OctreeLayout]) -> OctreeLayout:
+        """Return the grid with other grids around it.
+
+        Args:
+            coarser: the grids, each with cells of twice the edge of the one before; their own `coarser` is replaced.
+        """
+        return replace(self, coarser=coarser[0].within(coarser[1:]) if coarser else None)
+
+    @property
+    def levels(self) -> list[OctreeLayout]:
+        """The grid itself and the coarser ones, finest first."""
+        return [self, *([] if self.coarser is None else self.coarser.levels)]
+
+    @property
+    def firsts_of_levels(self) -> list[int]:
+        """Index of the first leaf of each grid in `levels`, and the number of all leaves."""
+        return [0, *accumulate(level.num_leaves for level in self.levels)]
+
+    def level_of(self, leaves: Tensor) -> Tensor:
+        """Return the index (N,) int64 in `levels` of the grid of each of some `leaves` (N,) int64."""
+        ends = torch.tensor(self.firsts_of_levels[1:], device=leaves.device)
+        return torch.bucketize(leaves, ends, right=True)
+
+    def edges_of(self, leaves: Tensor, kind: torch.dtype) -> Tensor:
+        """Return the edge (N,) of each of some `leaves` (N,) int64, scene units, in a float type `kind`."""
+        return self.cell * (1 << self.level_of(leaves)).to(kind)
+
     @property
     def size(self) -> tuple[int, int, int]:
         """Number of bricks along each axis."""
@@ -122,16 +158,22 @@ class OctreeLayout:
         """Return the layout on `device`."""
         moved = (values.to(device) for values in (self.origin, self.bricks, self.masks, self.firsts))
         origin, bricks, masks, firsts = moved
-        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.num_leaves)
+        coarser = None if self.coarser is None else self.coarser.to(device)
+        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.num_leaves, coarser)
 
     def arguments(self) -> tuple[Any, ...]:
         """Check the layout's arguments of compiled functions and return them."""
-        count = (len(self.masks), 8)
+        levels = self.levels
         return (
-            native.pointer(self.origin, "the origin", (3,)), self.cell, native.integers(self.size),
-            native.pointer(self.bricks, "the bricks", self.size, torch.int32),
-            native.pointer(self.masks, "the masks", count, torch.int64),
-            native.pointer(self.firsts, "the octants", count, torch.int32),
+            len(levels), self.cell,
+            native.pointers([native.pointer(level.origin, "the origin", (3,)) for level in levels]),
+            native.integers(tuple(count for level in levels for count in level.size)),
+            native.pointers([native.pointer(level.bricks, "the bricks", level.size, torch.int32) for level in levels]),
+            native.pointers([native.pointer(level.masks, "the masks", (len(level.masks), 8), torch.int64)
+                             for level in levels]),
+            native.pointers([native.pointer(level.firsts, "the octants", (len(level.masks), 8), torch.int32)
+                             for level in levels]),
+            native.integers(tuple(self.firsts_of_levels)),
         )  # fmt: skip
 
 

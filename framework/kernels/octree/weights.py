@@ -35,7 +35,7 @@ def raise_weights_reference(
 ) -> Tensor:
     """Compute `raise_weights` in PyTorch; `layout`, `raw`, `rays`, `weights` and `stop` are as there."""
     samples, leaves = leaf_samples(layout, rays)
-    tau = depths_of(raw[leaves, 0]) * samples.deltas / layout.cell
+    tau = depths_of(raw[leaves, 0]) * samples.deltas / layout.edges_of(leaves, samples.deltas.dtype)
     through = torch.exp(-exclusive_sum(tau, samples))
     found = torch.where(through >= stop, through * -torch.expm1(-tau), torch.zeros_like(tau))
     weights.scatter_reduce_(0, leaves, found.to(weights), "amax")
@@ -47,7 +47,7 @@ RAISE_WEIGHTS: Operation[..., Tensor] = Operation("raise_weights", raise_weights
 
 @RAISE_WEIGHTS.implementation(CPP, order=0)
 def _raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0) -> Tensor:
-    count, opacity = layout.num_leaves, rays.fars.new_empty(len(rays))
+    count, opacity = layout.firsts_of_levels[-1], rays.fars.new_empty(len(rays))
     _weights(
         *layout.arguments(), native.pointer(raw, "raw densities", (count, 1)), count,
         *ray_arguments(contiguous(rays)), stop, native.pointer(weights, "weights", (count,)), opacity.data_ptr(),

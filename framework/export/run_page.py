@@ -19,7 +19,7 @@ from nerfloom.evaluation.paths import around
 from nerfloom.evaluation.videos import write_images
 from nerfloom.export.bake import Baking, bake
 from nerfloom.export.page_closeness import closeness
-from nerfloom.export.page_scenes import ScenePage, gaussian_page, octree_page
+from nerfloom.export.page_scenes import BEYOND_THE_BOX, ScenePage, gaussian_page, octree_page
 from nerfloom.export.settings import PageKind, WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
@@ -35,7 +35,7 @@ from nerfloom.export.web import (
 )
 from nerfloom.geometry.regions import Region
 from nerfloom.method import Method
-from nerfloom.octrees.drawn import DrawnOctree
+from nerfloom.octrees.drawn import DrawnOctree, DrawsOctree
 from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
@@ -181,6 +181,8 @@ def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:
     if isinstance(loaded.model, DrawnOctree):
         return loaded.model.octree.to("cpu")
     _check_seconds(seconds)
+    if loaded.model.scene.unbounded and not isinstance(loaded.model, DrawsOctree):
+        raise ConfigError(BEYOND_THE_BOX)
     return bake(loaded, Baking(max_bytes=max_bytes, seconds=seconds))
 
 

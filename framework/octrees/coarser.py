@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels.octree.layout import BRICK, MAX_LEVELS, OctreeLayout
-from nerfloom.kernels.octree.packed import PackedLeaves
+from nerfloom.kernels.octree.packed import CODES, PackedLeaves
 from nerfloom.octrees.octree import Octree
 from nerfloom.octrees.packing import packed, packed_depths
 
@@ -34,29 +34,56 @@ def halved(octree: Octree) -> Octree:
 def with_levels(octree: Octree) -> Octree:
     """Return an octree with coarser levels, down to a single leaf. The finest level stays as it is.
 
+    A box around others keeps its leaves, and has larger ones for what is in the others too.
+
     Args:
-        octree: the octree, of one level.
+        octree: the octree, as in its file.
     """
-    layout, leaves = octree.layout, octree.leaves
-    level, depths, colors = layout, leaves.depths(), leaves.colors.float()
-    levels, parts = list[OctreeLayout](), [(leaves.codes, leaves.table, leaves.colors)]
-    while level.num_leaves > 1 and len(levels) < MAX_LEVELS - 1:
-        # A coefficient is linear in its byte, so means of bytes are bytes of means, with the same scale and offset.
-        level, depths, colors = _joined(level, depths, colors)
+    leaves, given = octree.leaves, octree.layout.levels
+    firsts, levels, parts = octree.layout.firsts_of_levels, list[OctreeLayout](), list[tuple[Tensor, ...]]()
+    level, depths, colors = _own(octree, 0)
+    while len(levels) < MAX_LEVELS:
         levels.append(level)
-        parts.append((*packed_depths(depths), colors.round().to(torch.uint8)))
-    codes, tables, bytes_ = (torch.cat(each) for each in zip(*parts, strict=True))
+        if len(levels) > 1:
+            # A coefficient is linear in its byte, so means of bytes are bytes of means, with the same scale and offset.
+            parts.append((*packed_depths(depths), colors.round().to(torch.uint8)))
+        if level.own_leaves <= 1 and len(levels) >= len(given):
+            break
+        level, depths, colors = _joined(level, depths, colors)
+        if len(levels) < len(given):
+            level, depths, colors = _merged((level, depths, colors), _own(octree, len(levels)))
+    first = leaves.codes[: firsts[1]], leaves.table[:CODES], leaves.colors[: firsts[1]]
+    codes, tables, bytes_ = (torch.cat(each) for each in zip(first, *parts, strict=True))
     leaves = PackedLeaves(codes, tables, bytes_, leaves.scales, leaves.offsets)
-    return replace(octree, layout=layout.within(levels), leaves=leaves)
+    return replace(octree, layout=levels[0].within(levels[1:]), leaves=leaves)
 
 
-def _joined(layout: OctreeLayout, depths: Tensor, values: Tensor) -> tuple[OctreeLayout, Tensor, Tensor]:
-    """Return a grid with cells of twice the edge, and the depths (M,) and values (M, W) of its M leaves.
+Level = tuple[OctreeLayout, Tensor, Tensor]
+"""A grid of L leaves, the optical depths (L,) of their edges, and values (L, W) that are linear in their colours."""
+
+
+def _own(octree: Octree, number: int) -> Level:
+    """Return a level of an octree by itself, with the bytes of its colours."""
+    leaves, firsts = octree.leaves, octree.layout.firsts_of_levels
+    part, table = slice(firsts[number], firsts[number + 1]), leaves.table[CODES * number : CODES * (number + 1)]
+    return octree.layout.levels[number].within([]), table[leaves.codes[part].long()], leaves.colors[part].float()
+
+
+def _merged(inner: Level, outer: Level) -> Level:
+    """Return the leaves of two grids of equal cells, in the second grid; the first covers a part of its box."""
+    shift = ((inner[0].origin - outer[0].origin) / outer[0].cell).round().long()
+    cells = torch.cat([inner[0].cells() + shift, outer[0].cells()])
+    layout, order = OctreeLayout.build(outer[0].origin, outer[0].cell, outer[0].size, cells)
+    return layout, torch.cat([inner[1], outer[1]])[order], torch.cat([inner[2], outer[2]])[order]
+
+
+def _joined(layout: OctreeLayout, depths: Tensor, values: Tensor) -> Level:
+    """Return the level with cells of twice the edge.
 
     Args:
         layout: the grid of L leaves.
         depths: (L,) optical depth of their edges.
-        values: (L, W) values that are linear in the colour.
+        values: (L, W) values that are linear in their colours.
     """
     cells, (x, y, z) = layout.cells(), ((bricks + 1) // 2 for bricks in layout.size)
     whole, height, width = cells // 2, BRICK * y, BRICK * z

@@ -16,7 +16,7 @@ from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import OctreeLight, error_bound
-from nerfloom.kernels.octree.packed import trace_packed
+from nerfloom.kernels.octree.packed import CODES, trace_packed
 from nerfloom.kernels.octree.walk import leaf_at, smallest_cells
 from nerfloom.octrees.coarser import with_levels
 from nerfloom.octrees.octree import Octree
@@ -91,7 +91,7 @@ class DrawsOctree(RendersRays):
         """Return the density (N,) at `points`, in 1/length."""
         leaf = leaf_at(self.layout, points.positions)
         met, density = leaf >= 0, torch.zeros(len(leaf), device=leaf.device)
-        density[met] = self.depths(leaf[met]) / self.layout.cell
+        density[met] = self.depths(leaf[met]) / self.layout.edges_of(leaf[met], density.dtype)
         return density
 
     @property
@@ -152,7 +152,8 @@ class DrawnOctree(DrawsOctree):
 
     def depths(self, leaves: Tensor | None = None) -> Tensor:
         packed = self.octree.leaves
-        return packed.table[(packed.codes if leaves is None else packed.codes[leaves]).long()]
+        chosen = torch.arange(len(packed.codes), device=self.device) if leaves is None else leaves
+        return packed.table[packed.codes[chosen].long() + CODES * self.layout.level_of(chosen)]
 
     def coefficients(self) -> Tensor:
         return self.octree.leaves.coefficients()
@@ -162,21 +163,27 @@ class DrawnOctree(DrawsOctree):
         return max(self._largest, 1.0)
 
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
-        octree = self._for_rays(rays)
+        octree = self._from_afar(rays)
+        if octree is None:
+            octree, rays = self.octree, replace(rays, pixel_radii=None)
         return trace_packed(octree.layout, octree.leaves, rays, background, stop)
 
     @cached_property
     def _with_levels(self) -> Octree:
         return with_levels(self.octree)
 
-    def _for_rays(self, rays: Rays) -> Octree:
-        """Return the octree with the levels that rays may need: the given one if no pixel is wide enough for others."""
+    def _from_afar(self, rays: Rays) -> Octree | None:
+        """Return the octree with the levels that rays may need; None if no pixel is wide in its smallest box.
+
+        In boxes around it, cells and the width of pixels grow alike.
+        """
         smallest = smallest_cells(rays)
         if smallest is None or not len(rays):
-            return self.octree
+            return None
         low, high = rays.origins.aminmax(dim=0)
         first, last = self.layout.box
         edge = float(smallest.amax() * torch.maximum(high - first, last - low).norm())
         if not edge > self.layout.cell:
-            return self.octree
-        return self._with_levels.finest(1 + sum(level.cell < edge for level in self._with_levels.layout.levels))
+            return None
+        levels = self._with_levels.layout.levels
+        return self._with_levels.finest(max(1 + sum(level.cell < edge for level in levels), len(self.layout.levels)))

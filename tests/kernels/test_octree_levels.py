@@ -45,7 +45,7 @@ def by_short_steps(layout: OctreeLayout, depths: Tensor, colors: Tensor, rays: R
     tables = []
     for level, first in zip(layout.levels, layout.firsts_of_levels, strict=False):
         table = torch.full([BRICK * count for count in level.size], -1)
-        table[tuple(level.cells().T)] = first + torch.arange(level.num_leaves)
+        table[tuple(level.cells().T)] = first + torch.arange(level.own_leaves)
         tables.append(table)
     edges, out = layout.edges_of(torch.arange(len(depths)), torch.float64), []
     t = (torch.arange(STEPS, dtype=torch.float64) + 0.5) * (END / STEPS)
@@ -71,7 +71,7 @@ def by_short_steps(layout: OctreeLayout, depths: Tensor, colors: Tensor, rays: R
 def test_each_point_of_a_ray_is_shown_by_the_level_of_the_rule() -> None:
     torch.manual_seed(0)
     layout, rays = nested(), rays_through(24)
-    count = layout.firsts_of_levels[-1]
+    count = layout.num_leaves
     depths, colors = torch.rand(count, dtype=torch.float64), torch.rand(count, 3, dtype=torch.float64)
     smallest = smallest_cells(rays)
     assert smallest is not None
@@ -101,7 +101,7 @@ def test_the_width_of_a_pixel_is_measured_in_cells() -> None:
 def test_compiled_levels_are_the_references(levels: int) -> None:
     torch.manual_seed(levels)
     layout, rays, background = nested(levels=levels), rays_through(3000), torch.rand(3000, 3)
-    count = layout.firsts_of_levels[-1]
+    count = layout.num_leaves
     codes, colors = (torch.randint(CODES, shape, dtype=torch.uint8) for shape in ((count,), (count, 12)))
     tables = torch.cat([torch.linspace(0, 1 + level, CODES) for level in range(levels)])
     leaves = PackedLeaves(codes, tables, colors, torch.rand(12) / 255, torch.rand(12) - 0.5)
@@ -114,7 +114,7 @@ def test_compiled_levels_are_the_references(levels: int) -> None:
 def test_levels_have_gradients_and_weights() -> None:
     torch.manual_seed(3)
     layout, rays, background = nested(), rays_through(1000), torch.rand(1000, 3)
-    count, found = layout.firsts_of_levels[-1], []
+    count, found = layout.num_leaves, []
     for kind in (torch.float32, torch.float64):
         torch.manual_seed(4)
         raw, coefficients = (torch.randn(count, width, dtype=torch.float64).to(kind) for width in (1, 12))
@@ -126,7 +126,7 @@ def test_levels_have_gradients_and_weights() -> None:
         found.append((light.color.detach(), raw.grad, coefficients.grad))
     for value, truth in zip(*found, strict=True):
         assert relative_error(value, truth) < 5e-4
-    assert all(part.any() for part in found[0][1].split([level.num_leaves for level in layout.levels]))
+    assert all(part.any() for part in found[0][1].split([level.own_leaves for level in layout.levels]))
     weights = torch.zeros(2, count)
     raise_weights(layout, raw.detach().float(), rays, weights[0])
     raise_weights_reference(layout, raw.detach().float(), rays, weights[1])
@@ -143,18 +143,18 @@ def test_wide_pixels_alone_see_coarser_leaves_in_the_same_box() -> None:
     halves = torch.unique(fine.cells() // 2, dim=0)
     coarse, _ = OctreeLayout.build(origin, 2 * CELL, (2, 1, 1), halves)
     layout = fine.within([coarse])
-    count, rays = layout.firsts_of_levels[-1], rays_through(500)
+    count, rays = layout.num_leaves, rays_through(500)
     codes, colors = (torch.randint(CODES, shape, dtype=torch.uint8) for shape in ((count,), (count, 3)))
     leaves = PackedLeaves(codes, torch.linspace(0, 3, CODES).repeat(2), colors, torch.ones(3) / 255, torch.zeros(3))
     first = replace(
-        leaves, codes=codes[: fine.num_leaves], colors=colors[: fine.num_leaves], table=leaves.table[:CODES]
+        leaves, codes=codes[: fine.own_leaves], colors=colors[: fine.own_leaves], table=leaves.table[:CODES]
     )
     plain = trace_packed(fine, first, rays, torch.ones(3))
     narrow = trace_packed(layout, leaves, replace(rays, pixel_radii=torch.zeros(500)), torch.ones(3))
     assert torch.equal(plain.color, narrow.color)
     assert torch.equal(plain.opacity, narrow.opacity)
     wide = trace_packed(layout, leaves, replace(rays, pixel_radii=torch.full((500,), 1e3)), torch.ones(3))
-    second = replace(leaves, codes=codes[fine.num_leaves :], colors=colors[fine.num_leaves :], table=first.table)
+    second = replace(leaves, codes=codes[fine.own_leaves :], colors=colors[fine.own_leaves :], table=first.table)
     alone = trace_packed(coarse, second, rays, torch.ones(3))
     met = rays.origins.norm(dim=-1) > 2  # others start in the box, where a pixel of any radius is narrow
     assert int(met.sum()) > 50
@@ -173,5 +173,5 @@ def test_a_position_is_in_the_finest_box_that_contains_it() -> None:
     seen = torch.cat(outside)
     assert torch.equal(found[seen], expected[seen])
     assert bool((found[~seen] != expected[~seen]).all())
-    assert layout.level_of(expected).bincount().tolist() == [level.num_leaves for level in layout.levels]
+    assert layout.level_of(expected).bincount().tolist() == [level.own_leaves for level in layout.levels]
     assert leaf_at(layout, torch.tensor([[9.0, 0, 0], [torch.nan, 0, 0]])).tolist() == [-1, -1]

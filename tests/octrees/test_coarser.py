@@ -1,6 +1,7 @@
 """Coarser levels: their densities in closed form, and pictures from afar against supersampled ones."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from nerfloom.cameras.cameras import Cameras, subpixels
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
+from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.encodings.spherical_harmonics import CONSTANT
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.packed import trace_packed
@@ -16,7 +18,7 @@ from nerfloom.octrees.coarser import halved, with_levels
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.octree import Octree
 from nerfloom.octrees.packing import packed
-from tests.octrees.balls import ball
+from tests.octrees.balls import ball, boxes
 
 CELL, BRICKS = 0.02, 16
 BLACK = torch.zeros(3)
@@ -63,18 +65,36 @@ def test_levels_end_with_a_leaf_and_begin_with_the_given_ones() -> None:
     levels = found.layout.levels
     assert [level.size for level in levels] == [(4, 4, 4), (2, 2, 2), *[(1, 1, 1)] * 4]
     assert [level.cell / octree.layout.cell for level in levels] == [2.0**number for number in range(6)]
-    assert levels[-1].num_leaves == 1
+    assert levels[-1].own_leaves == 1
     leaves, count = found.leaves, octree.layout.num_leaves
     assert torch.equal(leaves.codes[:count], octree.leaves.codes)
     assert torch.equal(leaves.colors[:count], octree.leaves.colors)
     assert torch.equal(leaves.table[:256], octree.leaves.table)
-    assert len(leaves.codes) == found.layout.firsts_of_levels[-1]
+    assert len(leaves.codes) == found.layout.num_leaves
     assert found.finest(1).layout.coarser is None
     assert torch.equal(found.finest(1).leaves.codes, octree.leaves.codes)
     middle = with_levels(octree).finest(2)
     assert [level.size for level in middle.layout.levels] == [(4, 4, 4), (2, 2, 2)]
     deepest = leaves.depths(found.layout.level_of(torch.arange(len(leaves.codes))))
     assert float(deepest[count:].max()) > 9  # cells of twice the edge, inside of the ball
+
+
+def test_boxes_around_others_have_larger_leaves_inside_too() -> None:
+    octree = boxes()
+    given, found = octree.layout.levels, with_levels(octree)
+    levels = found.layout.levels
+    assert [level.size for level in levels[:4]] == [(4, 4, 4)] * 3 + [(2, 2, 2)]
+    alone = with_levels(octree.finest(1))
+    inside = alone.layout.levels[1]
+    assert levels[1].own_leaves == given[1].own_leaves + inside.own_leaves
+    rays = Rays(torch.tensor([[0.03, -60.0, 0.02]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    model, radius = DrawnOctree(octree, octree.scene), torch.tensor([0.004])
+    far = model.light(replace(rays, pixel_radii=radius), BLACK, 0.0)
+    assert float(far.opacity) > 0.9  # the ball, as a few large leaves
+    near = model.light(replace(rays, pixel_radii=radius / 100), BLACK, 0.0)
+    plain = trace_packed(octree.layout, octree.leaves, rays, BLACK)
+    assert torch.equal(near.color, plain.color)
+    assert not torch.equal(far.color, plain.color)
 
 
 def chequered() -> Octree:

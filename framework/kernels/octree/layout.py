@@ -48,7 +48,7 @@ class OctreeLayout:
     """(B, 8) int64 leaves of each octant, bit x + 4 y + 16 z for cell (x, y, z) of octant x + 2 y + 4 z."""
     firsts: Tensor
     """(B, 8) int32 index of the first leaf of each octant."""
-    num_leaves: int
+    own_leaves: int
     """Number of leaves, without those of coarser grids."""
     coarser: OctreeLayout | None = None
     """The grid with cells of twice the edge, whose box contains this one's; None if there is none. Leaves are numbered
@@ -109,6 +109,29 @@ class OctreeLayout:
         """
         return replace(self, coarser=coarser[0].within(coarser[1:]) if coarser else None)
 
+    def part(self, kept: Tensor) -> tuple[OctreeLayout, Tensor]:
+        """Return the layout with some of its leaves, and the index (K,) that each of them has here.
+
+        Args:
+            kept: (K,) int64 indices of the leaves that are kept, each once.
+        """
+        found, rows, firsts = list[OctreeLayout](), list[Tensor](), self.firsts_of_levels
+        for level, first, end in zip(self.levels, firsts, firsts[1:], strict=False):
+            own = kept[(kept >= first) & (kept < end)]
+            layout, order = OctreeLayout.build(level.origin, level.cell, level.size, level.cells()[own - first])
+            found.append(layout)
+            rows.append(own[order])
+        return found[0].within(found[1:]), torch.cat(rows)
+
+    def around(self) -> Tensor:
+        """Return the corner (3,) of a box with the same centre and twice the edges, scene units."""
+        return self.origin - self.cell * BRICK / 2 * torch.tensor(self.size, device=self.origin.device)
+
+    @property
+    def num_leaves(self) -> int:
+        """Number of leaves of all levels."""
+        return self.firsts_of_levels[-1]
+
     @property
     def levels(self) -> list[OctreeLayout]:
         """The grid itself and the coarser ones, finest first."""
@@ -117,7 +140,7 @@ class OctreeLayout:
     @property
     def firsts_of_levels(self) -> list[int]:
         """Index of the first leaf of each grid in `levels`, and the number of all leaves."""
-        return [0, *accumulate(level.num_leaves for level in self.levels)]
+        return [0, *accumulate(level.own_leaves for level in self.levels)]
 
     def level_of(self, leaves: Tensor) -> Tensor:
         """Return the index (N,) int64 in `levels` of the grid of each of some `leaves` (N,) int64."""
@@ -147,19 +170,19 @@ class OctreeLayout:
         return torch.empty_like(places).index_copy_(0, index, places)
 
     def cells(self) -> Tensor:
-        """Return the coordinates (L, 3) int64 of the leaves, in cells."""
+        """Return the coordinates (L, 3) int64 of the grid's own leaves, in cells."""
         return cells_of(self.places(), self.masks)
 
     def centers(self) -> Tensor:
-        """Return the centres (L, 3) of the leaves, scene units."""
-        return self.origin + self.cell * (self.cells() + 0.5)
+        """Return the centres (L, 3) of the leaves of all levels, scene units."""
+        return torch.cat([level.origin + level.cell * (level.cells() + 0.5) for level in self.levels])
 
     def to(self, device: torch.device | str) -> OctreeLayout:
         """Return the layout on `device`."""
         moved = (values.to(device) for values in (self.origin, self.bricks, self.masks, self.firsts))
         origin, bricks, masks, firsts = moved
         coarser = None if self.coarser is None else self.coarser.to(device)
-        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.num_leaves, coarser)
+        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.own_leaves, coarser)
 
     def arguments(self) -> tuple[Any, ...]:
         """Check the layout's arguments of compiled functions and return them."""

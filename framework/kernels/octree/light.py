@@ -121,7 +121,7 @@ def check_leaves(layout: OctreeLayout, raw: Tensor, coefficients: Tensor) -> Non
     Raises:
         ValueError: if there are not L of each, or K is not 1, 4, 9 or 16.
     """
-    count = layout.firsts_of_levels[-1]
+    count = layout.num_leaves
     if len(raw) != count or len(coefficients) != count:
         raise ValueError(f"there are {count} leaves, and values of {len(raw)} and {len(coefficients)}")
     if coefficients.shape[1] not in [3 * (degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)]:

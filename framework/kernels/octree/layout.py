@@ -13,8 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -32,6 +33,21 @@ MAX_LEVELS = 24
 """Maximum number of grids around one another, as in `walk.h`."""
 BRICKS_AT_ONCE = 2**12
 """Number of bricks whose cells are listed together; each takes some kilobytes meanwhile."""
+
+
+class Tables(NamedTuple):
+    """The arrays of a layout of V levels, level after level, for kernels that cannot take an array of pointers."""
+
+    frames: Tensor
+    """(V, 4) float32 corner of the first cell and a cell's edge, scene units."""
+    numbers: Tensor
+    """(V, 6) int64 bricks along each axis, and where the level begins in `bricks`, in `masks` and among leaves."""
+    bricks: Tensor
+    """(X Y Z + ...) int32, as in the layouts; indices count the level's own bricks."""
+    masks: Tensor
+    """(B, 8) int64."""
+    firsts: Tensor
+    """(B, 8) int32; indices count the level's own leaves."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +199,26 @@ class OctreeLayout:
         origin, bricks, masks, firsts = moved
         coarser = None if self.coarser is None else self.coarser.to(device)
         return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.own_leaves, coarser)
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The arrays of all levels, level after level."""
+        levels, device = self.levels, self.origin.device
+        frames = torch.stack([torch.cat([level.origin, level.origin.new_tensor([level.cell])]) for level in levels])
+        bricks, masks, firsts = (
+            torch.cat([getattr(level, name).view(shape) for level in levels])
+            if len(levels) > 1
+            else getattr(self, name)
+            for name, shape in (("bricks", (-1,)), ("masks", (-1, 8)), ("firsts", (-1, 8)))
+        )
+        begins = zip(
+            accumulate((level.bricks.numel() for level in levels), initial=0),
+            accumulate((len(level.masks) for level in levels), initial=0),
+            self.firsts_of_levels,
+            strict=True,
+        )
+        rows = [[*level.size, *row] for level, row in zip(levels, begins, strict=False)]
+        return Tables(frames, torch.tensor(rows, device=device), bricks, masks, firsts)
 
     def arguments(self) -> tuple[Any, ...]:
         """Check the layout's arguments of compiled functions and return them."""

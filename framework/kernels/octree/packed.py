@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import (
     LAYOUT,
@@ -22,6 +22,7 @@ from nerfloom.kernels.octree.light import (
     ray_arguments,
 )
 from nerfloom.kernels.octree.walk import smallest_cells
+from nerfloom.kernels.triton_backend import later
 
 _trace_packed = native.Function("octree_trace_packed", LAYOUT + "pppppi" + RAYS + "ppfpppppi")
 CODES = 256
@@ -110,3 +111,6 @@ def _packed(
         native.pointer(background, "the background", (len(rays), 3)), stop, *addresses, native.threads(),
     )  # fmt: skip
     return out
+
+
+TRACE_PACKED.implementation(TRITON, order=0)(later("octree.trace_triton", "trace_packed"))

@@ -8,10 +8,11 @@ from torch import Tensor
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.compositing.density import exclusive_sum, ray_sum
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import LAYOUT, RAYS, contiguous, depths_of, ray_arguments
 from nerfloom.kernels.octree.walk import leaf_samples
+from nerfloom.kernels.triton_backend import later
 
 _weights = native.Function("octree_weights", LAYOUT + "pq" + RAYS + "fppi")
 
@@ -54,3 +55,6 @@ def _raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tenso
         native.threads(),
     )  # fmt: skip
     return opacity
+
+
+RAISE_WEIGHTS.implementation(TRITON, order=0)(later("octree.trace_triton", "raise_weights"))

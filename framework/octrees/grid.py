@@ -42,7 +42,7 @@ class Grid:
         return Grid(self.origin - half, 2 * self.cell, self.size, self.level + 1)
 
     def own(self, cells: Tensor) -> Tensor:
-        """Return whether no smaller grid covers cells (N, 3), (N,) bool."""
+        """Return whether no smaller grid covers `cells` (N, 3), (N,) bool."""
         first = BRICK // 4 * torch.tensor(self.size)
         return ~((cells >= first) & (cells < 3 * first)).all(-1) | (self.level == 0)
 

@@ -25,7 +25,7 @@ from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import OctreeLight, contiguous, outputs_of
 from nerfloom.kernels.octree.packed import PackedLeaves
 from nerfloom.kernels.octree.walk import smallest_cells
-from nerfloom.kernels.octree.walk_triton import FRAME, advance, begin, change, look, outside, place
+from nerfloom.kernels.octree.walk_triton import FRAME, _advance, _begin, _change, _look, _outside, _place
 from nerfloom.kernels.triton_launch import blocks, launch, opacity_of
 
 RAYS = 32
@@ -109,15 +109,15 @@ def _walk(
     here, columns = r < rays, tl.arange(0, N)
     if of_color is not None:  # the backward pass
         opaque, behind, mixed = _known(directions, color, opacity, of_color, of_opacity, r, here, BASIS, N, BLOCK)
-    level, far, t = begin(origins, directions, nears, fars, smallest, frames, numbers, r, here, levels, LIMITED, BLOCK)
-    px, dx, x, py, dy, y, pz, dz, z = place(origins, directions, frames, numbers, r, here, level, t)
+    level, far, t = _begin(origins, directions, nears, fars, smallest, frames, numbers, r, here, levels, LIMITED, BLOCK)
+    px, dx, x, py, dy, y, pz, dz, z = _place(origins, directions, frames, numbers, r, here, level, t)
     through, half = tl.full([BLOCK], 1.0, tl.float32), tl.full([BLOCK], -1.0, tl.float32)
     mean, count, sums = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.int32), tl.zeros([BLOCK, N], tl.float32)
     going = level >= 0
     while tl.max(going.to(tl.int32), 0) > 0:
         known = tl.maximum(level, 0)
-        size, low_x, low_y, low_z, leaf = look(numbers, bricks, masks, firsts, known, x, y, z, going)
-        reach, x, y, z = advance(size, low_x, low_y, low_z, px, dx, py, dy, pz, dz, t, far)
+        size, low_x, low_y, low_z, leaf = _look(numbers, bricks, masks, firsts, known, x, y, z, going)
+        reach, x, y, z = _advance(size, low_x, low_y, low_z, px, dx, py, dy, pz, dz, t, far)
         met, length = going & (leaf >= 0), (reach - t) / tl.load(frames + known * FRAME + 3)
         edge, tau, weight = _light(values, table, known, leaf, met, length, through)
         after = through - weight
@@ -140,12 +140,12 @@ def _walk(
                 half = tl.where(crosses, t + (reach - t) * share, half)
         if peaks is not None:  # the bits of numbers of at least 0 are in their order
             tl.atomic_max(peaks + leaf, weight.to(tl.int32, bitcast=True), mask=met, sem="relaxed")
-        t = tl.where(going, tl.where(outside(numbers, known, x, y, z), far, reach), t)
+        t = tl.where(going, tl.where(_outside(numbers, known, x, y, z), far, reach), t)
         through, going = after, going & (tl.where(after < limit, 0, 1) != 0)  # NaN goes on
         leaving = going & (t >= far)
         if MANY:
             if tl.max(leaving.to(tl.int32), 0) > 0:
-                level, far, px, dx, x, py, dy, y, pz, dz, z = change(
+                level, far, px, dx, x, py, dy, y, pz, dz, z = _change(
                     origins, directions, nears, fars, smallest, frames, numbers, r, here, leaving, level, far, t, x, y,
                     z, levels, LIMITED, BLOCK,
                 )  # fmt: skip

@@ -58,7 +58,10 @@ def leaf_samples(layout: OctreeLayout, rays: Rays, smallest: Tensor | None = Non
 
 
 def leaf_at(layout: OctreeLayout, positions: Tensor) -> Tensor:
-    """Return the leaf (N,) int64 at `positions` (N, 3) in scene units, in the first level with a box there, or -1."""
+    """Return the leaf (N,) int64 at `positions` (N, 3) in scene units; -1 where `layout` has none.
+
+    Of several levels, the finest has it whose box contains the position.
+    """
     leaves = torch.full_like(positions[:, 0], -1, dtype=torch.int64)
     unknown = torch.ones_like(leaves, dtype=torch.bool)
     for level, first in zip(layout.levels, layout.firsts_of_levels, strict=False):

@@ -86,7 +86,7 @@ def _stand(origins, directions, frames, numbers, r, here, level, now, axis: tl.c
 
 
 @triton.jit
-def begin(
+def _begin(
     origins, directions, nears, fars, smallest, frames, numbers, r, here, levels, LIMITED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -104,7 +104,7 @@ def begin(
 
 
 @triton.jit
-def place(origins, directions, frames, numbers, r, here, level, now):
+def _place(origins, directions, frames, numbers, r, here, level, now):
     """Return origin, direction and cell at a distance, in the level's cells, along each axis."""
     px, dx, x = _stand(origins, directions, frames, numbers, r, here, level, now, 0)
     py, dy, y = _stand(origins, directions, frames, numbers, r, here, level, now, 1)
@@ -113,16 +113,16 @@ def place(origins, directions, frames, numbers, r, here, level, now):
 
 
 @triton.jit
-def change(
+def _change(
     origins, directions, nears, fars, smallest, frames, numbers, r, here, leaving, level, far, t, x, y, z, levels,
     LIMITED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Return levels, their ends, and `place`, of rays after those that are leaving their level are in another."""
+    """Return levels, their ends, and `_place`, of rays after those that are leaving their level are in another."""
     other, end, _ = _enter(
         origins, directions, nears, fars, smallest, frames, numbers, r, leaving, t, levels, LIMITED, BLOCK
     )
     level, far = tl.where(leaving, other, level), tl.where(leaving, end, far)
-    px, dx, i, py, dy, j, pz, dz, k = place(origins, directions, frames, numbers, r, here, level, t)
+    px, dx, i, py, dy, j, pz, dz, k = _place(origins, directions, frames, numbers, r, here, level, t)
     x, y, z = tl.where(leaving, i, x), tl.where(leaving, j, y), tl.where(leaving, k, z)
     return level, far, px, dx, x, py, dy, y, pz, dz, z
 
@@ -136,7 +136,7 @@ def _ones(word):
 
 
 @triton.jit
-def look(numbers, bricks, masks, firsts, level, x, y, z, going):
+def _look(numbers, bricks, masks, firsts, level, x, y, z, going):
     """Return the block around cells: its edge and low corner, and its leaf; -1 if it is empty."""
     of = numbers + level * NUMBERS
     i, j, k = x // BRICK, y // BRICK, z // BRICK
@@ -173,7 +173,7 @@ def _moved(low, size, side, leave, p, d, reach):
 
 
 @triton.jit
-def advance(size, low_x, low_y, low_z, px, dx, py, dy, pz, dz, t, far):
+def _advance(size, low_x, low_y, low_z, px, dx, py, dy, pz, dz, t, far):
     """Return the distances where rays leave blocks, or their ranges, and the next cells."""
     side_x, leave_x = _side(low_x, size, px, dx)
     side_y, leave_y = _side(low_y, size, py, dy)
@@ -187,7 +187,7 @@ def advance(size, low_x, low_y, low_z, px, dx, py, dy, pz, dz, t, far):
 
 
 @triton.jit
-def outside(numbers, level, x, y, z):
+def _outside(numbers, level, x, y, z):
     """Return whether cells are outside of the level's box."""
     of = numbers + level * NUMBERS
     below = (x < 0) | (y < 0) | (z < 0)

@@ -116,7 +116,7 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
         """Set the leaves and their values.
 
         Args:
-            layout: where the L leaves are.
+            layout: where the L leaves are. Checkpoints hold no coarser levels.
             raw: (L, 1) raw densities, as in `trace_octree`.
             coefficients: (L, 3 K) coefficients of the leaves.
         """

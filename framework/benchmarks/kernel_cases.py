@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nerfloom.benchmarks.octree_cases import in_octrees
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.adam.adam import sparse_adam
 from nerfloom.kernels.compositing.density import composite, distortion
@@ -72,7 +73,8 @@ class Case:
 def cases() -> Iterator[Case]:
     """Yield all cases, grouped by operation."""
     torch.manual_seed(0)
-    for kernel, run, followed, inputs in (*_along_rays(), *_at_points(), *_marched(), *_projected(), *_on_images()):
+    families = (*_along_rays(), *_at_points(), *_marched(), *_projected(), *_on_images(), *in_octrees())
+    for kernel, run, followed, inputs in families:
         for kind, given in zip(KINDS, inputs, strict=True):
             yield Case(kernel, kind, run, given, followed if kind != "empty" else "")
 

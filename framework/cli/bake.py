@@ -19,8 +19,9 @@ MIN_RESOLUTION, MAX_RESOLUTION = 16, 1024
 class BakeFlags(RunFlags):
     """Bake a trained run into an octree (.octree), which ns-eval, ns-render and ns-viewer open like a run.
 
-    The scene must lie in a box and be still. Colours are fitted to the field, and then learnt from the photographs. A
-    run of voxels is an octree already: its leaves are kept, and --resolution and --fine-tune-seconds have no effect."""
+    The scene must be still; beyond its box there are larger boxes with larger cells. Colours are fitted to the field,
+    and then learnt from the photographs. A run of voxels is an octree already: its leaves are kept, and --resolution
+    and --fine-tune-seconds have no effect."""
 
     output_path: Path | None = None
     """File to write, NAME.octree. Default: scene.octree in the run's folder."""
@@ -28,8 +29,8 @@ class BakeFlags(RunFlags):
     """Maximum size of the file, millions of bytes. It limits the degree of harmonics first, then the number of
     leaves."""
     resolution: int | None = None
-    """Cells along the longest edge of the box of all matter, 16 to 1024. Default: up to 512, fewer for small images or
-    if half of the leaves would not fit."""
+    """Cells along the longest edge of the box of all matter, or of each box of a capture, 16 to 1024. Default: up to
+    512, and 256 in a capture; fewer for small images or if half of the leaves would not fit."""
     degree: int | None = None
     """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes; that of a run of voxels."""
     fine_tune_seconds: float = 30.0

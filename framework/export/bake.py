@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from nerfloom.base.console import say, track
@@ -38,6 +39,8 @@ MAX_BYTES = 30e6
 """Default of the maximum size of a file, bytes."""
 MIN_RESOLUTION, MAX_RESOLUTION = 32, 512
 """Range of the cells along the longest edge, if no number is given."""
+MAX_UNBOUNDED_RESOLUTION = 256
+"""Maximum of this number in an unbounded scene, where each of several boxes has as many cells."""
 CELLS_PER_PIXEL = 1.28
 """Cells along the longest edge, if no number is given, relative to the pixels along the images' longer side. Images do
 not see each of much smaller cells, and pictures from elsewhere have holes."""
@@ -65,13 +68,14 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
         settings: size, resolution and time.
 
     Raises:
-        ConfigError: if an octree of a box cannot show what the run shows.
+        ConfigError: if an octree cannot show what the run shows.
     """
     model = loaded.model
     layout, depths, coefficients = (
         _as_learnt(model, loaded, settings) if isinstance(model, DrawsOctree) else _baked(loaded, settings)
     )
     leaves, lost = packed(depths, coefficients)
+    leaves = replace(leaves, table=leaves.table.repeat(len(layout.levels)))
     say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
     scene = model.scene
     return Octree(layout, leaves, loaded.input_placement, scene.near, scene.far, scene.has_alpha, scene.image_size)
@@ -89,9 +93,8 @@ def _as_learnt(model: DrawsOctree, loaded: Loaded, settings: Baking) -> tuple[Oc
     if layout.num_leaves > room_for(settings.max_bytes, degree):
         cameras, scene = loaded.dataset("train").to("cpu").cameras, model.scene
         seen = seen_leaves(layout, raw_of(depths)[:, None], cameras, scene.near, scene.far)
-        kept = chosen(seen.largest, settings.max_bytes, (degree,))[1]
-        layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
-        depths, coefficients = depths[kept[rows]], coefficients[kept[rows]]
+        layout, rows = layout.part(chosen(seen.largest, settings.max_bytes, (degree,))[1])
+        depths, coefficients = depths[rows], coefficients[rows]
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, as they were learnt")
     return layout, depths, coefficients
 
@@ -102,7 +105,8 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     seed_step(loaded.run.config.machine.seed, 0)
     degrees = DEGREES if settings.degree is None else (settings.degree,)
     pixels = int(CELLS_PER_PIXEL * model.scene.image_size)
-    resolution = settings.resolution or min(max(pixels, MIN_RESOLUTION), MAX_RESOLUTION)
+    most = MAX_UNBOUNDED_RESOLUTION if model.scene.unbounded else MAX_RESOLUTION
+    resolution = settings.resolution or min(max(pixels, MIN_RESOLUTION), most)
     layout, raw, seen = _visible(model, dataset, resolution)
     while settings.resolution is None and resolution > MIN_RESOLUTION:
         if not is_too_fine(seen.largest, settings.max_bytes, degrees):
@@ -114,20 +118,22 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     visible = len(visible_leaves(seen.largest))
     if len(kept) < visible:
         say(f"the size leaves room for {len(kept):,} of {visible:,} leaves: those with the largest weights")
-    layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
-    kept = kept[rows]
-    raw, seen = raw[kept], replace(seen, largest=seen.largest[kept], by_view=seen.by_view[kept])
+    layout, rows = layout.part(kept)
+    raw, seen = raw[rows], seen.part(rows)
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
-    centers = layout.centers()
-    coefficients = fitted_colors(field_colors(model, centers, layout.cell), centers, seen, degree)
-    depths = depths_of(raw[:, 0])
+    firsts, fitted = layout.firsts_of_levels, list[Tensor]()
+    for level, first, end in zip(layout.levels, firsts, firsts[1:], strict=False):
+        if first < end:
+            centers, part = level.within([]).centers(), seen.part(torch.arange(first, end))
+            fitted.append(fitted_colors(field_colors(model, centers, level.cell), centers, part, degree))
+    coefficients, depths = torch.cat(fitted), depths_of(raw[:, 0])
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
     return layout, depths, coefficients
 
 
 def _bakeable(loaded: Loaded) -> RayModel[Any]:
-    """Return the run's model; refuse what an octree of a box cannot show."""
+    """Return the run's model; refuse what an octree cannot show."""
     model, name = loaded.model, loaded.method
     if not isinstance(model, RayModel):
         raise ConfigError(f"{name} has no field to bake; take a run of a method that casts rays")
@@ -138,8 +144,8 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
         reason = "its scene moves, and an octree does not"
     elif model.scene.warped:
         reason = "its rays are in normalised device coordinates; train without --ndc"
-    elif model.scene.unbounded:
-        reason = "its scene extends beyond its box, where an octree ends"
+    elif model.scene.unbounded and not model.field.unbounded:
+        reason = "its scene extends beyond its box, where its field ends"
     if reason is not None:
         raise ConfigError(f"this run of {name} cannot be baked: {reason}; 'ns-export web' shows it as Gaussians")
     return model
@@ -148,15 +154,15 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
 def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
     """Return cells with matter, their raw densities (L, 1), and what training images see of them."""
     search = MatterSearch(model)
-    grid = search.tight(resolution)
-    cells, depths = search.cells(grid)
-    layout, rows = OctreeLayout.build(grid.origin, grid.cell, grid.size, cells)
+    grids = search.grids(resolution)
+    layout, depths = search.layout(grids)
     if not layout.num_leaves:
         raise ConfigError("the run has no matter in its box; is it trained?")
-    raw = raw_of(depths[rows])[:, None]
+    raw = raw_of(depths)[:, None]
     seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
     visible = len(visible_leaves(seen.largest))
-    edges = " x ".join(str(8 * count) for count in grid.size)
+    edges = " x ".join(str(8 * count) for count in grids[0].size)
+    edges += f" x {len(grids)}" if len(grids) > 1 else ""
     say(f"{layout.num_leaves:,} of {edges} cells have matter, and training images see {visible:,} of these")
     return layout, raw, seen
 

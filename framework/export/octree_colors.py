@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -49,6 +49,10 @@ class Seen:
     """(V, 3) positions of their cameras."""
     pixels: PixelSet
     """Pixels, of all images, whose rays meet a leaf."""
+
+    def part(self, kept: Tensor) -> Seen:
+        """Return the visibility of the leaves `kept` (N,) int64."""
+        return replace(self, largest=self.largest[kept], by_view=self.by_view[kept])
 
 
 @torch.no_grad()

@@ -117,8 +117,7 @@ def _reduced(octree: Octree, seen: Seen, degree: int, kept: Tensor) -> Octree:
     part = octree.part(kept)
     if degree == octree.degree:
         return part
-    seen = replace(seen, largest=seen.largest[kept], by_view=seen.by_view[kept])
-    coefficients = fitted_colors(leaf_colors(part.leaves), part.layout.centers(), seen, degree)
+    coefficients = fitted_colors(leaf_colors(part.leaves), part.layout.centers(), seen.part(kept), degree)
     return replace(part, leaves=packed(part.leaves.depths(), coefficients)[0])
 
 

@@ -24,6 +24,9 @@ from nerfloom.splats.look import Look
 from nerfloom.splats.transform import transformed
 from nerfloom.training.loaded import Loaded
 
+BEYOND_THE_BOX = "a page traces octrees of one box, and this scene extends beyond it: give --kind gaussians"
+"""Refusal of an octree of several boxes."""
+
 
 @dataclass(frozen=True)
 class ScenePage:
@@ -90,6 +93,8 @@ def octree_page(
     model = loaded.model
     if not octree.layout.num_leaves:
         raise ConfigError("the octree has no leaves to show; bake it again")
+    if octree.layout.coarser is not None:
+        raise ConfigError(BEYOND_THE_BOX)
     inside = inside_all(loaded.placement.original_points(octree.layout.centers()), regions)
     kept = octree if bool(inside.all()) else octree.part(inside.nonzero()[:, 0])
     text, found, costs = make_octree_page(kept, turn, cameras.to("cpu"), facts, most)

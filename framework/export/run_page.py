@@ -20,8 +20,8 @@ from nerfloom.evaluation.videos import write_images
 from nerfloom.export.bake import Baking, bake
 from nerfloom.export.levels_page import levels_page
 from nerfloom.export.page_closeness import closeness
-from nerfloom.export.page_scenes import ScenePage, gaussian_page, octree_page
-from nerfloom.export.settings import WebSettings
+from nerfloom.export.page_scenes import BEYOND_THE_BOX, ScenePage, gaussian_page, octree_page
+from nerfloom.export.settings import PageKind, WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
     PICTURE,
@@ -38,7 +38,7 @@ from nerfloom.export.web import (
 from nerfloom.geometry.regions import Region
 from nerfloom.levels.drawn import DrawnLevels
 from nerfloom.method import Method
-from nerfloom.octrees.drawn import DrawnOctree
+from nerfloom.octrees.drawn import DrawnOctree, DrawsOctree
 from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
@@ -198,6 +198,8 @@ def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:
     if isinstance(loaded.model, DrawnOctree):
         return loaded.model.octree.to("cpu")
     _check_seconds(seconds)
+    if loaded.model.scene.unbounded and not isinstance(loaded.model, DrawsOctree):
+        raise ConfigError(BEYOND_THE_BOX)
     return bake(loaded, Baking(max_bytes=max_bytes, seconds=seconds))
 
 

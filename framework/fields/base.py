@@ -28,6 +28,8 @@ class Field(nn.Module, ABC):
     """Size of points that `density` needs."""
     optimised: Optimised | None = None
     """Optimiser settings of its parameters; if None, the model's."""
+    unbounded: bool = False
+    """True if it covers all of space, contracted around a box."""
     runs_on_kernels: bool = False
     """True if compiled kernels do most of its work; torch's own operations then use one CPU thread."""
 

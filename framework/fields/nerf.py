@@ -53,6 +53,7 @@ class NeRFField(Field):
         appearance: Appearance | None = None,
     ) -> None:
         super().__init__()
+        self.unbounded = contracted is not None
         self.register_buffer("contracted", None if contracted is None else contracted.clone())
         self.position_frequencies = position_frequencies
         self.direction_frequencies = direction_frequencies

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -15,8 +16,9 @@ from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import OctreeLight, error_bound
-from nerfloom.kernels.octree.packed import trace_packed
-from nerfloom.kernels.octree.walk import leaf_at
+from nerfloom.kernels.octree.packed import CODES, trace_packed
+from nerfloom.kernels.octree.walk import leaf_at, smallest_cells
+from nerfloom.octrees.coarser import with_levels
 from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import RendersRays
 from nerfloom.rendering.outputs import Output
@@ -89,7 +91,7 @@ class DrawsOctree(RendersRays):
         """Return the density (N,) at `points`, in 1/length."""
         leaf = leaf_at(self.layout, points.positions)
         met, density = leaf >= 0, torch.zeros(len(leaf), device=leaf.device)
-        density[met] = self.depths(leaf[met]) / self.layout.cell
+        density[met] = self.depths(leaf[met]) / self.layout.edges_of(leaf[met], density.dtype)
         return density
 
     @property
@@ -109,7 +111,10 @@ class DrawsOctree(RendersRays):
         with self.rendering():
             for some in pixels.reshape(-1).split(max(self.rays_at_once // per_pixel, 1)):
                 rays = view.camera.pixel_rays(some, self.scene.near, self.scene.far, None, offsets)
-                rendered = self.render(replace(rays, camera_indices=None), background)
+                radii = rays.pixel_radii
+                if radii is not None:  # that of parallel rays does not grow with the distance
+                    radii = None if view.camera.model == "orthographic" else radii / per_pixel**0.5
+                rendered = self.render(replace(rays, camera_indices=None, pixel_radii=radii), background)
                 parts.append(rendered.to_pixels(per_pixel, self.outputs))
         size = tuple(pixels.shape)
         return Picture(
@@ -125,6 +130,8 @@ class DrawsOctree(RendersRays):
 
 class DrawnOctree(DrawsOctree):
     """A renderable of an octree that does not change.
+
+    Pictures from afar use coarser levels, which are derived when the first such picture is drawn.
 
     Args:
         octree: the octree, on the device that renders it.
@@ -145,7 +152,8 @@ class DrawnOctree(DrawsOctree):
 
     def depths(self, leaves: Tensor | None = None) -> Tensor:
         packed = self.octree.leaves
-        return packed.table[(packed.codes if leaves is None else packed.codes[leaves]).long()]
+        chosen = torch.arange(len(packed.codes), device=self.device) if leaves is None else leaves
+        return packed.table[packed.codes[chosen].long() + CODES * self.layout.level_of(chosen)]
 
     def coefficients(self) -> Tensor:
         return self.octree.leaves.coefficients()
@@ -155,4 +163,27 @@ class DrawnOctree(DrawsOctree):
         return max(self._largest, 1.0)
 
     def light(self, rays: Rays, background: Tensor, stop: float) -> OctreeLight:
-        return trace_packed(self.layout, self.octree.leaves, rays, background, stop)
+        octree = self._from_afar(rays)
+        if octree is None:
+            octree, rays = self.octree, replace(rays, pixel_radii=None)
+        return trace_packed(octree.layout, octree.leaves, rays, background, stop)
+
+    @cached_property
+    def _with_levels(self) -> Octree:
+        return with_levels(self.octree)
+
+    def _from_afar(self, rays: Rays) -> Octree | None:
+        """Return the octree with the levels that rays may need; None if no pixel is wide in its smallest box.
+
+        In boxes around it, cells and the width of pixels grow alike.
+        """
+        smallest = smallest_cells(rays)
+        if smallest is None or not len(rays):
+            return None
+        low, high = rays.origins.aminmax(dim=0)
+        first, last = self.layout.box
+        edge = float(smallest.amax() * torch.maximum(high - first, last - low).norm())
+        if not edge > self.layout.cell:
+            return None
+        levels = self._with_levels.layout.levels
+        return self._with_levels.finest(max(1 + sum(level.cell < edge for level in levels), len(self.layout.levels)))

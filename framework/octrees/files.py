@@ -3,9 +3,11 @@
     version                1
     size                   (3,) bricks along each axis
     origin, cell           corner of the first cell, and a cell's edge, scene units
-    places                 (B, 3) uint16 coordinates of the bricks, in ascending order
+    bricks                 (V,) number of bricks with leaves in each of V boxes; each box has the same centre, twice the
+                           edges and as many cells as the one before, whose inside it leaves out
+    places                 (B, 3) uint16 coordinates of the bricks, box by box, in ascending order
     masks                  (B, 8) uint64 leaves of each octant (`kernels/octree/layout.py`)
-    codes, table           (L,) uint8 and (256,): the optical depth of a cell's edge is table[code]
+    codes, table           (L,) uint8 and (256 V,): the optical depth of a cell's edge is the table's of box and code
     colors                 (3 K, L) uint8, by coefficient, which compresses better than by leaf
     scales, offsets        (3 K,) coefficient = scale * byte + offset
     transform, scale       the input's frame to the scene's: scale * (transform @ x)
@@ -32,9 +34,9 @@ from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, one_line
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import MAX_COORDINATE, MAX_SIZE
-from nerfloom.kernels.octree.layout import BRICK, MAX_BRICKS, OctreeLayout, cells_of
+from nerfloom.kernels.octree.layout import BRICK, MAX_BRICKS, MAX_LEVELS, OctreeLayout, cells_of
 from nerfloom.kernels.octree.light import MAX_DEGREE
-from nerfloom.kernels.octree.packed import PackedLeaves
+from nerfloom.kernels.octree.packed import CODES, PackedLeaves
 from nerfloom.octrees.octree import Octree
 
 SUFFIX = ".octree"
@@ -49,7 +51,7 @@ MAX_RATIO = 300
 """Maximum size of the arrays, relative to the file. Real files have less than 10, and a small damaged one must not
 fill the memory."""
 NAMES = (
-    "version", "size", "origin", "cell", "places", "masks", "codes", "table", "colors", "scales", "offsets",
+    "version", "size", "origin", "cell", "bricks", "places", "masks", "codes", "table", "colors", "scales", "offsets",
     "transform", "scale", "near", "far", "alpha", "image_size",
 )  # fmt: skip
 """Names of the arrays."""
@@ -76,8 +78,9 @@ def write_octree(file: Path, octree: Octree) -> None:
         "size": np.array(layout.size, np.int64),
         "origin": layout.origin.numpy(),
         "cell": layout.cell,
-        "places": layout.places().numpy().astype(np.uint16),
-        "masks": layout.masks.numpy().view(np.uint64),
+        "bricks": np.array([len(level.masks) for level in layout.levels], np.int64),
+        "places": torch.cat([level.places() for level in layout.levels]).numpy().astype(np.uint16),
+        "masks": torch.cat([level.masks for level in layout.levels]).numpy().view(np.uint64),
         "codes": leaves.codes.numpy(),
         "table": leaves.table.numpy(),
         "colors": np.ascontiguousarray(leaves.colors.numpy().T),
@@ -129,7 +132,7 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
 
 def _octree(arrays: dict[str, np.ndarray]) -> Octree:
     layout = _layout(arrays)
-    leaves = _leaves(arrays, layout.num_leaves)
+    leaves = _leaves(arrays, layout)
     transform = _floats(arrays, "transform", (3, 4), np.float64)
     rotation = transform[:, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or not np.linalg.det(rotation) > 0:
@@ -152,27 +155,35 @@ def _layout(arrays: dict[str, np.ndarray]) -> OctreeLayout:
     size = tuple(int(count) for count in _integers(arrays, "size", (3,), 1, MAX_SIDE))
     cell = _number(arrays, "cell", 1e-9, MAX_COORDINATE)
     origin = _floats(arrays, "origin", (3,), np.float32)
-    if max(size) * BRICK * cell > MAX_COORDINATE or math.prod(size) > MAX_BRICKS:
+    boxes, count = len(arrays["bricks"]), len(arrays["places"])
+    bricks = _integers(arrays, "bricks", (boxes,), 0, count).tolist()
+    if not 1 <= boxes <= MAX_LEVELS or sum(bricks) != count:
+        raise ValueError(f"it has {count:,} bricks, and {sum(bricks):,} in {boxes} boxes")
+    if max(size) * BRICK * cell * 2**boxes > MAX_COORDINATE or math.prod(size) > MAX_BRICKS:
         raise ValueError("its box is too large")
-    count = len(arrays["places"])
     places = torch.from_numpy(_integers(arrays, "places", (count, 3), 0, MAX_SIDE - 1).astype(np.int64))
     masks = _typed(arrays, "masks", (count, 8), np.uint64)
     # Before cells are listed: a brick of 64 bytes may claim 512 of them.
     leaves, codes = int.from_bytes(masks.tobytes(), "little").bit_count(), arrays["codes"].shape
     if codes != (leaves,):
         raise ValueError(f"its masks have {leaves:,} leaves, and its array 'codes' has shape {codes}")
-    cells = cells_of(places, torch.from_numpy(masks.view(np.int64)))
-    layout, rows = OctreeLayout.build(torch.from_numpy(origin), cell, size, cells)
-    if not torch.equal(rows, torch.arange(len(cells))):
-        raise ValueError("its bricks are not in order")
-    return layout
+    levels, corner = list[OctreeLayout](), torch.from_numpy(origin)
+    parts = places.split(bricks), torch.from_numpy(masks.view(np.int64)).split(bricks)
+    for some, theirs in zip(*parts, strict=True):
+        cells = cells_of(some, theirs)
+        level, rows = OctreeLayout.build(corner, cell, size, cells)
+        if not torch.equal(rows, torch.arange(len(cells))):
+            raise ValueError("its bricks are not in order")
+        levels.append(level)
+        corner, cell = level.around(), 2 * cell
+    return levels[0].within(levels[1:])
 
 
-def _leaves(arrays: dict[str, np.ndarray], count: int) -> PackedLeaves:
-    width = len(arrays["scales"])
+def _leaves(arrays: dict[str, np.ndarray], layout: OctreeLayout) -> PackedLeaves:
+    width, count = len(arrays["scales"]), layout.num_leaves
     if width not in [3 * (degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)]:
         raise ValueError(f"its leaves have {width} coefficients")
-    table = _floats(arrays, "table", (256,), np.float32)
+    table = _floats(arrays, "table", (CODES * len(layout.levels),), np.float32)
     if (table < 0).any():
         raise ValueError("its table has negative densities")
     colors = _typed(arrays, "colors", (width, count), np.uint8)

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.scene import Scene
 from nerfloom.kernels.octree.layout import OctreeLayout
-from nerfloom.kernels.octree.packed import PackedLeaves
+from nerfloom.kernels.octree.packed import CODES, PackedLeaves
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,19 @@ class Octree:
         Args:
             kept: (N,) int64 indices of the leaves that are kept, each once.
         """
-        layout, leaves = self.layout, self.leaves
-        layout, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, layout.cells()[kept])
-        kept = kept[rows]
-        return replace(
-            self, layout=layout, leaves=replace(leaves, codes=leaves.codes[kept], colors=leaves.colors[kept])
+        layout, rows = self.layout.part(kept)
+        leaves = replace(self.leaves, codes=self.leaves.codes[rows], colors=self.leaves.colors[rows])
+        return replace(self, layout=layout, leaves=leaves)
+
+    def finest(self, count: int) -> Octree:
+        """Return the octree with at most `count` levels, the finest ones."""
+        levels, leaves = self.layout.levels[:count], self.leaves
+        layout = levels[0].within(levels[1:])
+        kept = layout.num_leaves
+        leaves = replace(
+            leaves, codes=leaves.codes[:kept], table=leaves.table[: CODES * len(levels)], colors=leaves.colors[:kept]
         )
+        return replace(self, layout=layout, leaves=leaves)
 
     @property
     def scene(self) -> Scene:
@@ -77,4 +84,5 @@ class Octree:
             has_alpha=self.has_alpha,
             moving=False,
             image_size=self.image_size,
+            unbounded=self.layout.coarser is not None,
         )

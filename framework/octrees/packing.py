@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfloom.kernels.octree.packed import PackedLeaves
+from nerfloom.kernels.octree.packed import CODES, PackedLeaves
 
 MAX_DEPTH = 100.0
 """Maximum stored optical depth of a cell's edge; exp(-100) is 0 in every picture."""
@@ -44,11 +44,7 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
         The leaves, and what they have lost.
     """
     steps = 2**bits - 1
-    share = depths.clamp(0, MAX_DEPTH) / (1 + depths.clamp(0, MAX_DEPTH))
-    largest = float(share.max()) if len(share) else 0.0
-    codes = (share * (steps / max(largest, 1e-6))).round().clamp(max=steps).to(torch.uint8)
-    values = torch.arange(256, dtype=torch.float32, device=depths.device).clamp(max=steps) * (largest / steps)
-    table = values / (1 - values)
+    codes, table = packed_depths(depths, bits)
     low, high = _range(coefficients)
     scales = (high - low).clamp(min=1e-6) / steps
     colors = ((coefficients - low) / scales).round().clamp(0, steps).to(torch.uint8)
@@ -58,6 +54,21 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
     opacity = (torch.exp(-depths) - torch.exp(-leaves.depths())).square().mean().sqrt()
     color = (leaves.coefficients() - coefficients).square().mean().sqrt()
     return leaves, Rounding(float(opacity), 0.2821 * float(color))
+
+
+def packed_depths(depths: Tensor, bits: int = 8) -> tuple[Tensor, Tensor]:
+    """Return the codes (L,) uint8 of optical depths, and the table (256,) of the depths that codes stand for.
+
+    Args:
+        depths: (L,) optical depth of a cell's edge.
+        bits: number of bits of a code, at most 8.
+    """
+    steps = 2**bits - 1
+    share = depths.clamp(0, MAX_DEPTH) / (1 + depths.clamp(0, MAX_DEPTH))
+    largest = float(share.max()) if len(share) else 0.0
+    codes = (share * (steps / max(largest, 1e-6))).round().clamp(max=steps).to(torch.uint8)
+    values = torch.arange(CODES, dtype=torch.float32, device=depths.device).clamp(max=steps) * (largest / steps)
+    return codes, values / (1 - values)
 
 
 def _range(coefficients: Tensor) -> tuple[Tensor, Tensor]:

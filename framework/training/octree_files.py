@@ -48,7 +48,7 @@ def load_octree(file: Path, data: Path | None, data_format: DataFormat | None, d
             )
         scene = scene_of(parsed, source.config)
     device = choose_device(machine)
-    if device.type != "cpu":
+    if device.type not in ("cpu", "cuda"):
         say(f"octrees have no kernels for {device.type} yet: rays take PyTorch's own operations, which are slow")
     model = DrawnOctree(octree.to(device), scene.to(device))
     return Loaded(model, octree.placement, METHOD, file, file, source=source).scaled(read_scale(file))

@@ -11,17 +11,28 @@ from torch import Tensor, nn
 
 import nerfloom
 from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
+from nerfloom.evaluation.metrics import psnr
 from nerfloom.export.bake import Baking, bake
-from nerfloom.export.octree_cells import MatterSearch
+from nerfloom.export.octree_cells import OPAQUE, MatterSearch
 from nerfloom.export.octree_colors import fitted
+from nerfloom.export.page_scenes import octree_page
+from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
+from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
-from nerfloom.octrees.files import read_octree
+from nerfloom.kernels.octree.light import raw_of
+from nerfloom.kernels.octree.weights import raise_weights
+from nerfloom.octrees.drawn import DrawnOctree
+from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.octrees.grid import Grid
 from nerfloom.ray_model import RayModel
+from nerfloom.registry import load_method
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.testing.ball import RADIUS as BALL_RADIUS
+from nerfloom.testing.scenes import ball_under_a_sky
 from tests.cli.helpers import TINY_NGP, called
 
 RADIUS, SIGMA = 0.4, 50.0
@@ -84,6 +95,84 @@ def test_octants_are_those_that_an_occupied_cell_overlaps() -> None:
     low, high = Skipping.scene.box.double()
     found = MatterSearch(Skipping(occupancy)).octants(Grid.of(low, high, 16))
     assert found.tolist() == [[x // 16, y // 16, z // 16] for x, y, z in sorted(cells)]
+
+
+class World(Ball):
+    """The ball and a larger one, centred five units away: in the third and the fourth of boxes around one another."""
+
+    def __init__(self, has_alpha: bool) -> None:
+        super().__init__()
+        self.scene = replace(Skipping.scene, unbounded=True, has_alpha=has_alpha, far=1000.0)
+
+    def density(self, points: Points) -> Tensor:
+        away = (points.positions - torch.tensor([5.0, 0.0, 0.0])).norm(dim=-1) < 2
+        return super().density(points) + SIGMA * away.float()
+
+
+def test_boxes_around_one_another_hold_the_matter_once() -> None:
+    search = MatterSearch(World(has_alpha=True))
+    grids = search.grids(32)
+    assert [grid.cell for grid in grids] == [2 / 32, 4 / 32, 8 / 32, 16 / 32]
+    layout, depths = search.layout(grids)
+    edges = layout.edges_of(torch.arange(layout.num_leaves), torch.float32)
+    torch.testing.assert_close(depths, SIGMA * edges)
+    assert float(edges.pow(3).sum()) == pytest.approx(4 / 3 * np.pi * (RADIUS**3 + 2**3), rel=0.1)
+    for number, level in enumerate(layout.levels):
+        farthest = level.within([]).centers().abs().amax(-1)
+        assert bool((farthest < 2.0**number).all())
+        assert number == 0 or bool((farthest > 2.0 ** (number - 1)).all())
+
+
+def test_no_ray_leaves_an_unbounded_scene_without_alpha() -> None:
+    torch.manual_seed(0)
+    search = MatterSearch(World(has_alpha=False))
+    layout, depths = search.layout(search.grids(32))
+    assert int((depths == OPAQUE).sum()) == 32**3 - 30**3
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    rays = Rays(torch.rand(500, 3) * 2 - 1, directions)
+    opacity = raise_weights(layout, raw_of(depths)[:, None], rays, torch.zeros(len(depths)))
+    torch.testing.assert_close(opacity, torch.ones(500))
+
+
+class Painted(Field):
+    """A ball with the colours of `ball_under_a_sky`, and its sky."""
+
+    unbounded = True
+
+    def density(self, points: Points) -> tuple[Tensor, Tensor]:
+        return SIGMA * (points.positions.norm(dim=-1) < BALL_RADIUS).float(), points.positions
+
+    def color(self, features: Tensor, directions: Tensor, camera_indices: Tensor | None = None) -> Tensor:
+        distance = features.norm(dim=-1, keepdim=True)
+        return 0.5 + 0.4 * torch.where(distance < 1, features / distance.clamp(min=1e-6), directions)
+
+
+@pytest.mark.medium
+def test_a_capture_is_baked_without_holes(tmp_path: Path) -> None:
+    dataset, method = ball_under_a_sky(), load_method("nerfacto")
+    model = replace(method, field=lambda config, scene: Painted()).build(method.config, dataset.scene).eval()
+    loaded = SimpleNamespace(
+        model=model,
+        method="painted",
+        run=SimpleNamespace(config=SimpleNamespace(machine=SimpleNamespace(seed=0))),
+        dataset=lambda split: dataset,
+        input_placement=Placement.of(torch.eye(3, 4), 1.0),
+    )
+    truth = torch.stack([dataset.image(index) for index in range(len(dataset))]) / 255
+    found = []
+    for seconds in (0.0, 1.0):
+        octree = bake(loaded, Baking(resolution=32, degree=1, seconds=seconds))
+        write_octree(tmp_path / "x.octree", octree)
+        drawn = DrawnOctree(read_octree(tmp_path / "x.octree"), dataset.scene)
+        assert len(octree.layout.levels) == 4
+        pictures = [drawn.render_view(dataset.view(index), torch.zeros(3)) for index in range(len(dataset))]
+        assert min(float(picture.accumulation.min()) for picture in pictures) > 0.99
+        found.append(psnr(torch.stack([picture.rgb for picture in pictures]), truth))
+    print(f"PSNR {found[0]:.1f} dB, and {found[1]:.1f} dB after learning")
+    assert found[0] > 18  # a grey picture has 12 dB
+    assert found[1] > found[0] - 0.5
+    with pytest.raises(ConfigError, match="--kind gaussians"):
+        octree_page(loaded, octree, dataset.cameras, None, torch.eye(3), 30.0, ())
 
 
 class FromImages(RayModel):

@@ -52,8 +52,8 @@ from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.geometry.rays import Rays
 from nerfloom.geometry.regions import Box, read_region, write_region
-from nerfloom.kernels.octree.packed import trace_packed
 from nerfloom.levels.files import read_levels
+from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import read_octree, write_octree
 from nerfloom.processing import aria, bundler, metashape, opensfm, polycam, realitycapture, record3d
 from nerfloom.processing.capture import Capture
@@ -242,8 +242,9 @@ def read_octrees(folder: Path, scratch: Path) -> None:
         count = 50
         directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
         rays = Rays(torch.randn(count, 3), directions, fars=torch.full((count,), 100.0))
-        light = trace_packed(octree.layout, octree.leaves, rays, torch.ones(3))
-        require(bool(light.opacity.isfinite().all()), "light that is not finite")
+        for some in (rays, replace(rays, pixel_radii=torch.rand(count))):  # the second need coarser levels
+            light = DrawnOctree(octree, octree.scene).light(some, torch.ones(3), 0.0)
+            require(bool(light.opacity.isfinite().all()), "light that is not finite")
 
 
 def write_levels(folder: Path) -> None:

@@ -1,5 +1,7 @@
 """Octrees about which everything is known."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -46,3 +48,20 @@ def grains(degree: int, share: float = 0.4) -> Octree:
     placement = Placement.of(torch.eye(3, 4), 0.25)
     leaves, _ = packed(depths, coefficients.view(len(rows), -1))
     return Octree(layout, leaves, placement, 0.1, 10.0, True, 200)
+
+
+def boxes(degree: int = 1) -> Octree:
+    """The ball in the smallest of three boxes; grains of all densities and colours in the others."""
+    torch.manual_seed(degree)
+    inner = ball(degree)
+    levels, cells = [inner.layout], torch.cartesian_prod(*[torch.arange(32)] * 3)
+    around = cells[~((cells >= 8) & (cells < 24)).all(-1)]
+    for _ in range(2):
+        some = around[torch.rand(len(around)) < 0.05]
+        levels.append(OctreeLayout.build(levels[-1].around(), 2 * levels[-1].cell, (4, 4, 4), some)[0])
+    layout = levels[0].within(levels[1:])
+    count = layout.num_leaves - inner.layout.num_leaves
+    depths = torch.cat([inner.leaves.depths(), torch.exp(torch.randn(count))])
+    colors = 0.3 * torch.randn(count, 3 * (degree + 1) ** 2)
+    leaves, _ = packed(depths, torch.cat([inner.leaves.coefficients(), colors]))
+    return replace(inner, layout=layout, leaves=replace(leaves, table=leaves.table.repeat(3)))

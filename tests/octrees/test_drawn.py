@@ -21,7 +21,7 @@ from nerfloom.octrees.files import write_octree
 from nerfloom.octrees.packing import packed
 from nerfloom.registry import load_dataparser
 from tests.cli.helpers import called
-from tests.octrees.balls import CELL, RADIUS, ball
+from tests.octrees.balls import CELL, RADIUS, ball, boxes
 
 
 def front() -> Cameras:
@@ -57,6 +57,16 @@ def test_density_is_that_of_the_leaf() -> None:
     positions = torch.tensor([[0.0, 0, 0], [0.3, 0.1, 0], [0.7, 0, 0], [9.0, 0, 0], [torch.nan, 0, 0]])
     found = model.density(Points(positions))
     torch.testing.assert_close(found, torch.tensor([2 / CELL, 2 / CELL, 0, 0, 0]), rtol=1e-4, atol=0)
+
+
+def test_density_in_boxes_around_one_another() -> None:
+    """Each leaf's depth is that of its own edge."""
+    octree = boxes()
+    layout, model = octree.layout, DrawnOctree(octree, octree.scene)
+    edges = torch.repeat_interleave(
+        torch.tensor([CELL, 2 * CELL, 4 * CELL]), torch.tensor(layout.firsts_of_levels).diff()
+    )
+    torch.testing.assert_close(model.density(Points(layout.centers())), octree.leaves.depths() / edges)
 
 
 def test_an_octree_without_leaves_has_no_density() -> None:

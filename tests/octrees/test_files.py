@@ -11,7 +11,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.octrees.files import NAMES, read_octree, write_octree
 from nerfloom.octrees.packing import MAX_DEPTH, packed
-from tests.octrees.balls import ball
+from tests.octrees.balls import ball, boxes
 
 
 def arrays_of(file: Path) -> dict[str, np.ndarray]:
@@ -33,6 +33,20 @@ def test_what_is_written_is_read(tmp_path: Path, degree: int) -> None:
     assert torch.equal(found.placement.transform, octree.placement.transform)
     assert found.placement.scale == 0.25
     torch.testing.assert_close(found.scene.box, torch.tensor([[-0.8] * 3, [0.8] * 3]))
+
+
+def test_boxes_around_one_another_are_written_and_read(tmp_path: Path) -> None:
+    octree = boxes()
+    write_octree(tmp_path / "x.octree", octree)
+    found = read_octree(tmp_path / "x.octree")
+    assert len(found.layout.levels) == 3
+    assert found.scene.unbounded
+    for one, two in zip(octree.layout.levels, found.layout.levels, strict=True):
+        assert one.cell == two.cell
+        for name in ("origin", "bricks", "masks", "firsts"):
+            assert torch.equal(getattr(one, name), getattr(two, name)), name
+    assert torch.equal(found.leaves.table, octree.leaves.table)
+    assert torch.equal(found.leaves.codes, octree.leaves.codes)
 
 
 def test_rounding_to_bytes_loses_what_it_says() -> None:
@@ -78,6 +92,10 @@ def test_damaged_and_hostile_files(tmp_path: Path) -> None:
     refused("coefficients", scales=good["scales"][:5])
     refused("not finite", scales=np.full(12, np.nan, np.float32))
     refused("negative", table=-good["table"] - 1)
+    refused("in 2 boxes", bricks=np.append(good["bricks"], 1))
+    refused("in 0 boxes", bricks=good["bricks"][:0])
+    refused("'table'", bricks=np.append(good["bricks"], 0))
+    refused("'bricks'", bricks=-good["bricks"])
     refused("'cell'", cell=np.nan)
     refused("'cell'", cell=-1.0)
     refused("size", size=np.array([0, 4, 4]))

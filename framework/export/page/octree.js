@@ -1,10 +1,11 @@
-// An octree whose leaves have density and colour, traced by WebGL 2: a ray a pixel, from leaf to leaf and over the largest
-// known empty block around it. It walks as framework/kernels/octree/walk.h does, and shades as trace.cpp; no ray needs a
-// stack.
+// An octree whose leaves have density and colour, traced by WebGL 2: a ray a pixel, or several from afar, from leaf to
+// leaf and over the largest known empty block around it. It walks as framework/kernels/octree/walk.h does, and shades as
+// trace.cpp; no ray needs a stack.
 
 const ROW = 2048; // texels in a row of a texture; every WebGL 2 has textures this wide
 const HEAD = 84; // bytes before the first array
 const CODES = 256; // densities
+const CELLS_PER_PIXEL = 3, MOST_RAYS = 4; // wider pixels get up to 4 x 4 rays: one would show one of many leaves
 
 /** Return the scene of a page: what it is made of, `follow` and `drawer`. */
 function sceneOf(raw, facts) {
@@ -101,6 +102,7 @@ uniform mat3 turn;                 // from the camera (x right, y down, z forwar
 uniform vec2 focal, center, size;  // pixels
 uniform float near, limit;         // where rays start; the transmittance at which they end
 uniform int most;                  // steps of a ray
+uniform int many;                  // rays along each side of a pixel
 uniform vec3 background;
 uniform vec3 scales[${terms}];
 uniform vec3 offsets[${terms}];
@@ -113,8 +115,8 @@ int ones(uint word) {
   return int((((x + (x >> 4u)) & 0x0f0f0f0fu) * 0x01010101u) >> 24u);
 }
 
-void main() {
-  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+// The light of the ray through a place of the picture, and the distance where it is half opaque, or -1.
+vec3 traced(vec2 pixel, out float surface) {
   vec3 d = normalize(turn * vec3((pixel - center) / focal, 1.0));
 ${constants}
   vec3 along = d + 2e-12 * vec3(lessThan(abs(d), vec3(1e-12)));  // no coordinate is 0
@@ -127,7 +129,8 @@ ${constants}
   float far = min(min(leave.x, leave.y), leave.z);
   ivec3 place = ivec3(clamp(floor(eye + t * along), vec3(0.0), vec3(last)));
   vec3 color = vec3(0.0);
-  float through = 1.0, surface = -1.0;
+  float through = 1.0;
+  surface = -1.0;
   for (int i = 0; i < most && t < far; i++) {
     // The block around the cell: all empty, or a leaf.
     ivec3 brick = place >> 3;
@@ -174,11 +177,21 @@ ${fetches}      float depth = texelFetch(depths, ivec2(int(t0[0] & 255u), 0), 0)
     place = next;
     t = reach;
   }
+  return color + through * background;
+}
+
+void main() {
+  vec2 middle = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  vec3 light = vec3(0.0);
+  float surface = -1.0;
+  for (int i = 0; i < many * many; i++) {
+    light += traced(middle + (vec2(i % many, i / many) + 0.5) / float(many) - 0.5, surface);
+  }
   if (picking) {
     uint word = floatBitsToUint(surface);
     drawn = vec4(float(word & 255u), float((word >> 8u) & 255u), float((word >> 16u) & 255u), float(word >> 24u)) / 255.0;
   } else {
-    drawn = vec4(clamp(color + through * background, 0.0, 1.0), 1.0);
+    drawn = vec4(clamp(light / float(many * many), 0.0, 1.0), 1.0);
   }
 }`;
 }
@@ -215,7 +228,10 @@ function drawer(gl, octree, { near }) {
     gl.bindVertexArray(whole);
     ["bricks", "octants", "leaves", "depths"].forEach((name, unit) => gl.uniform1i(uniforms[name], unit));
     gl.uniform3iv(uniforms.extent, octree.extent);
-    gl.uniform3fv(uniforms.eye, turned(camera.eye).map((value, k) => (value - octree.origin[k]) / octree.cell));
+    const eye = turned(camera.eye).map((value, k) => (value - octree.origin[k]) / octree.cell);
+    const away = Math.hypot(...eye.map((value, k) => value - 4 * octree.extent[k])) / camera.fx;
+    gl.uniform3fv(uniforms.eye, eye);
+    gl.uniform1i(uniforms.many, picking ? 1 : Math.min(Math.max(Math.ceil(away / CELLS_PER_PIXEL), 1), MOST_RAYS));
     gl.uniformMatrix3fv(uniforms.turn, false, axes.flat());
     gl.uniform2f(uniforms.focal, camera.fx, camera.fy);
     gl.uniform2f(uniforms.center, camera.cx, camera.cy);

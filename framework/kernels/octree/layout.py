@@ -4,13 +4,18 @@ All leaves are cubes of one size, the cells of a grid over a box. Of the octree'
 cells, their octants of 4^3, and cells. A dense grid of bricks says where they are and, in empty space, how far away the
 nearest one is, so that a ray passes it in few steps. An octant is a bit set of its cells, as in Laine and Karras 2010,
 "Efficient sparse voxel octrees", and the leaves of an octant follow each other.
+
+A grid may have coarser ones around it, each with cells of twice the edge. They show what lies outside of its box, and
+what a ray meets where its pixel is much wider than a cell (`walk.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import accumulate
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,8 +29,25 @@ MAX_DISTANCE = 16
 """Maximum recorded distance to a brick, in bricks."""
 MAX_BRICKS = 2**24
 """Maximum number of bricks in the box, empty ones included."""
+MAX_LEVELS = 24
+"""Maximum number of grids around one another, as in `walk.h`."""
 BRICKS_AT_ONCE = 2**12
 """Number of bricks whose cells are listed together; each takes some kilobytes meanwhile."""
+
+
+class Tables(NamedTuple):
+    """The arrays of a layout of V levels, level after level, for kernels that cannot take an array of pointers."""
+
+    frames: Tensor
+    """(V, 4) float32 corner of the first cell and a cell's edge, scene units."""
+    numbers: Tensor
+    """(V, 6) int64 bricks along each axis, and where the level begins in `bricks`, in `masks` and among leaves."""
+    bricks: Tensor
+    """(X Y Z + ...) int32, as in the layouts; indices count the level's own bricks."""
+    masks: Tensor
+    """(B, 8) int64."""
+    firsts: Tensor
+    """(B, 8) int32; indices count the level's own leaves."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +64,11 @@ class OctreeLayout:
     """(B, 8) int64 leaves of each octant, bit x + 4 y + 16 z for cell (x, y, z) of octant x + 2 y + 4 z."""
     firsts: Tensor
     """(B, 8) int32 index of the first leaf of each octant."""
-    num_leaves: int
-    """Number of leaves."""
+    own_leaves: int
+    """Number of leaves, without those of coarser grids."""
+    coarser: OctreeLayout | None = None
+    """The grid with cells of twice the edge, whose box contains this one's; None if there is none. Leaves are numbered
+    grid by grid, those of the finest first."""
 
     @classmethod
     def build(cls, origin: Tensor, cell: float, size: Sequence[int], cells: Tensor) -> tuple[OctreeLayout, Tensor]:
@@ -92,6 +117,56 @@ class OctreeLayout:
             len(key),
         ), rows
 
+    def within(self, coarser: Sequence[OctreeLayout]) -> OctreeLayout:
+        """Return the grid with other grids around it.
+
+        Args:
+            coarser: the grids, each with cells of twice the edge of the one before; their own `coarser` is replaced.
+        """
+        return replace(self, coarser=coarser[0].within(coarser[1:]) if coarser else None)
+
+    def part(self, kept: Tensor) -> tuple[OctreeLayout, Tensor]:
+        """Return the layout with some of its leaves, and the index (K,) that each of them has here.
+
+        Args:
+            kept: (K,) int64 indices of the leaves that are kept, each once.
+        """
+        found, rows, firsts = list[OctreeLayout](), list[Tensor](), self.firsts_of_levels
+        for level, first, end in zip(self.levels, firsts, firsts[1:], strict=False):
+            own = kept[(kept >= first) & (kept < end)]
+            layout, order = OctreeLayout.build(level.origin, level.cell, level.size, level.cells()[own - first])
+            found.append(layout)
+            rows.append(own[order])
+        return found[0].within(found[1:]), torch.cat(rows)
+
+    def around(self) -> Tensor:
+        """Return the corner (3,) of a box with the same centre and twice the edges, scene units."""
+        return self.origin - self.cell * BRICK / 2 * torch.tensor(self.size, device=self.origin.device)
+
+    @property
+    def num_leaves(self) -> int:
+        """Number of leaves of all levels."""
+        return self.firsts_of_levels[-1]
+
+    @property
+    def levels(self) -> list[OctreeLayout]:
+        """The grid itself and the coarser ones, finest first."""
+        return [self, *([] if self.coarser is None else self.coarser.levels)]
+
+    @property
+    def firsts_of_levels(self) -> list[int]:
+        """Index of the first leaf of each grid in `levels`, and the number of all leaves."""
+        return [0, *accumulate(level.own_leaves for level in self.levels)]
+
+    def level_of(self, leaves: Tensor) -> Tensor:
+        """Return the index (N,) int64 in `levels` of the grid of each of some `leaves` (N,) int64."""
+        ends = torch.tensor(self.firsts_of_levels[1:], device=leaves.device)
+        return torch.bucketize(leaves, ends, right=True)
+
+    def edges_of(self, leaves: Tensor, kind: torch.dtype) -> Tensor:
+        """Return the edge (N,) of each of some `leaves` (N,) int64, scene units, in a float type `kind`."""
+        return self.cell * (1 << self.level_of(leaves)).to(kind)
+
     @property
     def size(self) -> tuple[int, int, int]:
         """Number of bricks along each axis."""
@@ -111,27 +186,53 @@ class OctreeLayout:
         return torch.empty_like(places).index_copy_(0, index, places)
 
     def cells(self) -> Tensor:
-        """Return the coordinates (L, 3) int64 of the leaves, in cells."""
+        """Return the coordinates (L, 3) int64 of the grid's own leaves, in cells."""
         return cells_of(self.places(), self.masks)
 
     def centers(self) -> Tensor:
-        """Return the centres (L, 3) of the leaves, scene units."""
-        return self.origin + self.cell * (self.cells() + 0.5)
+        """Return the centres (L, 3) of the leaves of all levels, scene units."""
+        return torch.cat([level.origin + level.cell * (level.cells() + 0.5) for level in self.levels])
 
     def to(self, device: torch.device | str) -> OctreeLayout:
         """Return the layout on `device`."""
         moved = (values.to(device) for values in (self.origin, self.bricks, self.masks, self.firsts))
         origin, bricks, masks, firsts = moved
-        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.num_leaves)
+        coarser = None if self.coarser is None else self.coarser.to(device)
+        return OctreeLayout(origin, self.cell, bricks, masks, firsts, self.own_leaves, coarser)
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The arrays of all levels, level after level."""
+        levels, device = self.levels, self.origin.device
+        frames = torch.stack([torch.cat([level.origin, level.origin.new_tensor([level.cell])]) for level in levels])
+        bricks, masks, firsts = (
+            torch.cat([getattr(level, name).view(shape) for level in levels])
+            if len(levels) > 1
+            else getattr(self, name)
+            for name, shape in (("bricks", (-1,)), ("masks", (-1, 8)), ("firsts", (-1, 8)))
+        )
+        begins = zip(
+            accumulate((level.bricks.numel() for level in levels), initial=0),
+            accumulate((len(level.masks) for level in levels), initial=0),
+            self.firsts_of_levels,
+            strict=True,
+        )
+        rows = [[*level.size, *row] for level, row in zip(levels, begins, strict=False)]
+        return Tables(frames, torch.tensor(rows, device=device), bricks, masks, firsts)
 
     def arguments(self) -> tuple[Any, ...]:
         """Check the layout's arguments of compiled functions and return them."""
-        count = (len(self.masks), 8)
+        levels = self.levels
         return (
-            native.pointer(self.origin, "the origin", (3,)), self.cell, native.integers(self.size),
-            native.pointer(self.bricks, "the bricks", self.size, torch.int32),
-            native.pointer(self.masks, "the masks", count, torch.int64),
-            native.pointer(self.firsts, "the octants", count, torch.int32),
+            len(levels), self.cell,
+            native.pointers([native.pointer(level.origin, "the origin", (3,)) for level in levels]),
+            native.integers(tuple(count for level in levels for count in level.size)),
+            native.pointers([native.pointer(level.bricks, "the bricks", level.size, torch.int32) for level in levels]),
+            native.pointers([native.pointer(level.masks, "the masks", (len(level.masks), 8), torch.int64)
+                             for level in levels]),
+            native.pointers([native.pointer(level.firsts, "the octants", (len(level.masks), 8), torch.int32)
+                             for level in levels]),
+            native.integers(tuple(self.firsts_of_levels)),
         )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ from nerfloom.kernels.octree.walk import leaf_samples
 
 MAX_DEGREE = 3
 """Maximum degree of the harmonics."""
-LAYOUT, RAYS = "pfpppp", "ppppq"
+LAYOUT, RAYS = "ifpppppp", "ppppq"
 """Types of the arguments of compiled functions that describe an octree, and rays."""
 
 
@@ -73,6 +73,7 @@ def light_of(
     background: Tensor,
     stop: float,
     peaks: Tensor | None = None,
+    smallest: Tensor | None = None,
 ) -> OctreeLight:
     """Compute the light of rays in PyTorch, with the walk of `walk.py` and autograd's gradient.
 
@@ -84,9 +85,10 @@ def light_of(
         background: (R, 3) colour of the background.
         stop: transmittance below which a ray ends.
         peaks: (L,) largest weight of each leaf so far, raised in place; None for none.
+        smallest: (R,) smallest edge of cells, per unit of distance, as in `leaf_samples`.
     """
-    samples, leaves = leaf_samples(layout, rays)
-    tau = depths[leaves] * samples.deltas / layout.cell
+    samples, leaves = leaf_samples(layout, rays, smallest)
+    tau = depths[leaves] * samples.deltas / layout.edges_of(leaves, samples.deltas.dtype)
     through = torch.exp(-exclusive_sum(tau, samples))
     weights = through * -torch.expm1(-tau)
     weights = torch.where(through >= stop, weights, torch.zeros_like(weights))
@@ -119,8 +121,9 @@ def check_leaves(layout: OctreeLayout, raw: Tensor, coefficients: Tensor) -> Non
     Raises:
         ValueError: if there are not L of each, or K is not 1, 4, 9 or 16.
     """
-    if len(raw) != layout.num_leaves or len(coefficients) != layout.num_leaves:
-        raise ValueError(f"there are {layout.num_leaves} leaves, and values of {len(raw)} and {len(coefficients)}")
+    count = layout.num_leaves
+    if len(raw) != count or len(coefficients) != count:
+        raise ValueError(f"there are {count} leaves, and values of {len(raw)} and {len(coefficients)}")
     if coefficients.shape[1] not in [3 * (degree + 1) ** 2 for degree in range(MAX_DEGREE + 1)]:
         raise ValueError(f"leaves have {coefficients.shape[1]} coefficients; they must have 3, 12, 27 or 48")
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import (
     LAYOUT,
@@ -21,8 +21,12 @@ from nerfloom.kernels.octree.light import (
     outputs_of,
     ray_arguments,
 )
+from nerfloom.kernels.octree.walk import smallest_cells
+from nerfloom.kernels.triton_backend import later
 
-_trace_packed = native.Function("octree_trace_packed", LAYOUT + "pppppi" + RAYS + "pfpppppi")
+_trace_packed = native.Function("octree_trace_packed", LAYOUT + "pppppi" + RAYS + "ppfpppppi")
+CODES = 256
+"""Number of codes of a level."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +34,9 @@ class PackedLeaves:
     """Leaves in bytes."""
 
     codes: Tensor
-    """(L,) uint8 index into `table`."""
+    """(L,) uint8 index into the part of `table` for the leaf's level."""
     table: Tensor
-    """(256,) float32 optical depth of a cell's edge, of each code."""
+    """(256 V,) float32 optical depth of a cell's edge, of each code, for each of V levels."""
     colors: Tensor
     """(L, 3 K) uint8 coefficients of K harmonics, channel by channel."""
     scales: Tensor
@@ -40,9 +44,13 @@ class PackedLeaves:
     offsets: Tensor
     """(3 K,) float32."""
 
-    def depths(self) -> Tensor:
-        """Return the optical depth (L,) of a cell's edge, of each leaf."""
-        return self.table[self.codes.long()]
+    def depths(self, level: Tensor | int = 0) -> Tensor:
+        """Return the optical depth (L,) of a cell's edge, of each leaf.
+
+        Args:
+            level: (L,) int64 level of each leaf (`OctreeLayout.level_of`), or the level of all.
+        """
+        return self.table[self.codes.long() + CODES * level]
 
     def coefficients(self) -> Tensor:
         """Return the coefficients (L, 3 K) of the leaves."""
@@ -61,7 +69,7 @@ def trace_packed(
     Args:
         layout: where the L leaves are.
         leaves: their values.
-        rays: the rays.
+        rays: the rays. With `pixel_radii`, coarser levels show what is small in a pixel (`smallest_cells`).
         background: (R, 3) or (3,) colour of the background.
         stop: transmittance below which a ray ends; see `error_bound`.
     """
@@ -78,7 +86,9 @@ def trace_packed_reference(
     `layout`, `leaves`, `rays`, `background` and `stop` are as in `trace_packed`.
     """
     kind = rays.origins.dtype
-    return light_of(layout, leaves.depths().to(kind), leaves.coefficients().to(kind), rays, background, stop)
+    level = layout.level_of(torch.arange(len(leaves.codes), device=leaves.codes.device))
+    values = leaves.depths(level).to(kind), leaves.coefficients().to(kind)
+    return light_of(layout, *values, rays, background, stop, smallest=smallest_cells(rays))
 
 
 TRACE_PACKED: Operation[..., OctreeLight] = Operation("trace_packed", trace_packed_reference)
@@ -88,15 +98,19 @@ TRACE_PACKED: Operation[..., OctreeLight] = Operation("trace_packed", trace_pack
 def _packed(
     layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
 ) -> OctreeLight:
-    rays, background = contiguous(rays), background.contiguous()
+    smallest, rays, background = smallest_cells(rays), contiguous(rays), background.contiguous()
     out, addresses = outputs_of(rays)
     count, values = leaves.colors.shape
     _trace_packed(
         *layout.arguments(), native.pointer(leaves.codes, "codes", (count,), torch.uint8),
-        native.pointer(leaves.table, "the table", (256,)),
+        native.pointer(leaves.table, "the table", (CODES * len(layout.levels),)),
         native.pointer(leaves.colors, "colours", (count, values), torch.uint8),
         native.pointer(leaves.scales, "scales", (values,)), native.pointer(leaves.offsets, "offsets", (values,)),
-        values, *ray_arguments(rays), native.pointer(background, "the background", (len(rays), 3)), stop, *addresses,
-        native.threads(),
+        values, *ray_arguments(rays),
+        None if smallest is None else native.pointer(smallest, "smallest edges", (len(rays),)),
+        native.pointer(background, "the background", (len(rays), 3)), stop, *addresses, native.threads(),
     )  # fmt: skip
     return out
+
+
+TRACE_PACKED.implementation(TRITON, order=0)(later("octree.trace_triton", "trace_packed"))

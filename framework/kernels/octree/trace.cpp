@@ -17,7 +17,7 @@ struct Raw {
     static constexpr float NONE = -1e9f;  // the value where there is no leaf
     const float *raw, *colors;
     int values;
-    float value(int32_t leaf) const { return raw[leaf]; }
+    float value(int32_t leaf, int32_t) const { return raw[leaf]; }
     static Floats depth(Floats x) {
         const Floats low = exponential(smaller(splat(1), x) - 1.0f);  // NaN stays NaN
         return x > 1.0f ? x : low;
@@ -30,13 +30,13 @@ struct Raw {
     float decoded(int, float sum, float) const { return sum; }
 };
 
-// Leaves of bytes: a table of optical depths; a coefficient is scale * byte + offset.
+// Leaves of bytes: a table of optical depths for each level; a coefficient is scale * byte + offset.
 struct Packed {
     static constexpr float NONE = 0;
     const uint8_t *codes, *colors;
     const float *table, *scales, *offsets;
     int values;
-    float value(int32_t leaf) const { return table[codes[leaf]]; }
+    float value(int32_t leaf, int32_t level) const { return table[256 * level + codes[leaf]]; }
     static Floats depth(Floats x) { return x; }
     const uint8_t* row(int32_t leaf) const { return colors + int64_t(leaf) * values; }
     void expect(int32_t leaf) const { octree::fetch(codes + leaf), octree::fetch(row(leaf), values); }
@@ -48,11 +48,12 @@ struct Step {
     alignas(64) float edge[LANES], length[LANES], weight[LANES], left[LANES];
 
     template <typename Leaves>
-    Step(const Leaves& leaves, const int32_t* leaf, Floats t0, Floats t1, float per_cell, float* through, float limit,
-         int32_t* ends) {
+    Step(const Leaves& leaves, const octree::Passage& met, float* through, float limit, int32_t* ends) {
         alignas(64) float value[LANES];
-        for (int lane = 0; lane < LANES; lane++) value[lane] = leaf[lane] < 0 ? Leaves::NONE : leaves.value(leaf[lane]);
-        const Floats of_edge = Leaves::depth(load(value)), cells = (t1 - t0) * per_cell, before = load(through);
+        for (int lane = 0; lane < LANES; lane++)
+            value[lane] = met.leaf[lane] < 0 ? Leaves::NONE : leaves.value(met.leaf[lane], met.level[lane]);
+        const Floats of_edge = Leaves::depth(load(value)), before = load(through);
+        const Floats cells = (load(met.to) - load(met.from)) * load(met.per_cell);
         const Floats share = before * opacity_of(of_edge * cells), after = before - share;
         store(edge, of_edge), store(length, cells), store(weight, share), store(left, before), store(through, after);
         const Ints over = after < splat(limit);
@@ -78,7 +79,7 @@ struct Shade {
     const Leaves& leaves;
     const octree::Beams& beams;
     const Results& out;
-    float per_cell, limit;
+    float limit;
     alignas(64) float sums[LANES][N];
     alignas(64) float through[LANES], moment[LANES], median[LANES];
     int32_t visits[LANES];
@@ -89,20 +90,20 @@ struct Shade {
         through[lane] = 1, moment[lane] = 0, median[lane] = -1, visits[lane] = 0;
     }
 
-    void meet(const int32_t* leaf, const float* t0, const float* t1, int32_t* ends) {
-        const Floats begin = load(t0), end = load(t1);
-        const Step step(leaves, leaf, begin, end, per_cell, through, limit, ends);
-        store(moment, load(moment) + load(step.weight) * 0.5f * (begin + end));
+    void meet(const octree::Passage& met, int32_t* ends) {
+        const Step step(leaves, met, through, limit, ends);
+        store(moment, load(moment) + load(step.weight) * 0.5f * (load(met.from) + load(met.to)));
         for (int lane = 0; lane < LANES; lane++) {
-            if (leaf[lane] < 0) continue;
+            if (met.leaf[lane] < 0) continue;
             visits[lane]++;
             const float weight = step.weight[lane];
-            const auto* row = leaves.row(leaf[lane]);
+            const auto* row = leaves.row(met.leaf[lane]);
             float* to = sums[lane];
             for (int k = 0; k < N; k++) to[k] += weight * float(row[k]);
             if (median[lane] < 0 && through[lane] <= 0.5f) {
                 const float depth = step.edge[lane] * step.length[lane];
-                median[lane] = t0[lane] + (t1[lane] - t0[lane]) * (std::log(2 * step.left[lane]) / depth);
+                const float length = met.to[lane] - met.from[lane];
+                median[lane] = met.from[lane] + length * (std::log(2 * step.left[lane]) / depth);
             }
         }
     }
@@ -126,7 +127,7 @@ template <typename Leaves, int N>
 void shade(const octree::Layout& layout, const octree::Beams& beams, const Leaves& leaves, const Results& out,
            int64_t rays, float limit, int threads) {
     for_ranges(threads, rays, RAYS, [&](int64_t begin, int64_t end) {
-        Shade<Leaves, N> light{leaves, beams, out, 1 / layout.cell, limit, {}, {}, {}, {}, {}};
+        Shade<Leaves, N> light{leaves, beams, out, limit, {}, {}, {}, {}, {}};
         octree::Walk<Shade<Leaves, N>>(layout, beams, light).run(begin, end);
     });
 }
@@ -155,7 +156,7 @@ struct Record {
         float edge, length, weight;
     };
     const Raw& leaves;
-    float per_cell, limit;
+    float limit;
     std::vector<Part> met[LANES];
     alignas(64) float through[LANES];
     std::vector<std::vector<Part>>& rays;
@@ -163,11 +164,11 @@ struct Record {
 
     void expect(int32_t leaf) const { leaves.expect(leaf); }
     void start(int lane, int64_t) { met[lane].clear(), through[lane] = 1; }
-    void meet(const int32_t* leaf, const float* t0, const float* t1, int32_t* ends) {
-        const Step step(leaves, leaf, load(t0), load(t1), per_cell, through, limit, ends);
+    void meet(const octree::Passage& passage, int32_t* ends) {
+        const Step step(leaves, passage, through, limit, ends);
         for (int lane = 0; lane < LANES; lane++)
-            if (leaf[lane] >= 0)
-                met[lane].push_back({leaf[lane], step.edge[lane], step.length[lane], step.weight[lane]});
+            if (passage.leaf[lane] >= 0)
+                met[lane].push_back({passage.leaf[lane], step.edge[lane], step.length[lane], step.weight[lane]});
     }
     void finish(int lane, int64_t r) { rays[size_t(r - first)].swap(met[lane]); }
 };
@@ -236,30 +237,36 @@ int64_t give_rows(const std::vector<std::vector<Visit>>& chunks, int64_t leaves,
 
 }  // namespace
 
+// The first eight arguments of the functions below describe an octree of some levels, finest first: edge of the finest
+// cells, then origin, size, bricks, masks and octants of each level, and the index of its first leaf (walk.h).
+
 // Colour over the background, opacity, sum of weight * t, median t, and number of leaves of R rays. `values` colours a
 // leaf.
-EXPORT int octree_trace(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
-                        const int64_t* masks, const int32_t* firsts, const float* raw, const float* colors, int values,
+EXPORT int octree_trace(int levels, float cell, const float* const* origins_of, const int64_t* sizes,
+                        const int32_t* const* bricks, const int64_t* const* masks, const int32_t* const* firsts,
+                        const int64_t* leaves_of, const float* raw, const float* colors, int values,
                         const float* origins, const float* directions, const float* nears, const float* fars,
                         int64_t rays, const float* background, float limit, float* color, float* opacity,
                         float* moment, float* median, int32_t* visits, int threads) {
     return guarded([&] {
-        const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
-        shade_any(layout, {origins, directions, nears, fars}, Raw{raw, colors, values},
+        const octree::Layout layout(levels, cell, origins_of, sizes, bricks, masks, firsts, leaves_of);
+        shade_any(layout, {origins, directions, nears, fars, nullptr}, Raw{raw, colors, values},
                   {background, color, opacity, moment, median, visits}, rays, limit, threads);
     });
 }
 
-// As octree_trace, of leaves of bytes.
-EXPORT int octree_trace_packed(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
-                               const int64_t* masks, const int32_t* firsts, const uint8_t* codes, const float* table,
+// As octree_trace, of leaves of bytes. smallest (R): smallest edge of cells per unit of distance; null for none.
+EXPORT int octree_trace_packed(int levels, float cell, const float* const* origins_of, const int64_t* sizes,
+                               const int32_t* const* bricks, const int64_t* const* masks, const int32_t* const* firsts,
+                               const int64_t* leaves_of, const uint8_t* codes, const float* table,
                                const uint8_t* colors, const float* scales, const float* offsets, int values,
                                const float* origins, const float* directions, const float* nears, const float* fars,
-                               int64_t rays, const float* background, float limit, float* color, float* opacity,
-                               float* moment, float* median, int32_t* visits, int threads) {
+                               int64_t rays, const float* smallest, const float* background, float limit, float* color,
+                               float* opacity, float* moment, float* median, int32_t* visits, int threads) {
     return guarded([&] {
-        const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
-        shade_any(layout, {origins, directions, nears, fars}, Packed{codes, colors, table, scales, offsets, values},
+        const octree::Layout layout(levels, cell, origins_of, sizes, bricks, masks, firsts, leaves_of);
+        shade_any(layout, {origins, directions, nears, fars, smallest},
+                  Packed{codes, colors, table, scales, offsets, values},
                   {background, color, opacity, moment, median, visits}, rays, limit, threads);
     });
 }
@@ -268,16 +275,17 @@ EXPORT int octree_trace_packed(const float* origin, float cell, const int64_t* s
 // on their number. With `touched`, gradients have a row for each leaf that a ray has visited, which it lists; their
 // number is `rows_used`. Without, they have a row for each leaf, and are added to. `peaks` (L) is raised to each leaf's
 // largest weight on the rays. grad_opacity and peaks may be null.
-EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
-                                 const int64_t* masks, const int32_t* firsts, const float* raw, const float* colors,
-                                 int values, int64_t leaves, const float* origins, const float* directions,
-                                 const float* nears, const float* fars, int64_t rays, const float* background,
-                                 float limit, const float* grad_color, const float* grad_opacity, float* grad_raw,
-                                 float* grad_colors, int32_t* touched, float* peaks, int threads,
-                                 int64_t* rows_used) {
+EXPORT int octree_trace_backward(int levels, float cell, const float* const* origins_of, const int64_t* sizes,
+                                 const int32_t* const* bricks, const int64_t* const* masks,
+                                 const int32_t* const* firsts, const int64_t* leaves_of, const float* raw,
+                                 const float* colors, int values, int64_t leaves, const float* origins,
+                                 const float* directions, const float* nears, const float* fars, int64_t rays,
+                                 const float* background, float limit, const float* grad_color,
+                                 const float* grad_opacity, float* grad_raw, float* grad_colors, int32_t* touched,
+                                 float* peaks, int threads, int64_t* rows_used) {
     return guarded([&] {
-        const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
-        const octree::Beams beams{origins, directions, nears, fars};
+        const octree::Layout layout(levels, cell, origins_of, sizes, bricks, masks, firsts, leaves_of);
+        const octree::Beams beams{origins, directions, nears, fars, nullptr};
         const Raw known{raw, colors, values};
         const Incoming incoming{grad_color, grad_opacity, background};
         const int basis = values / 3;
@@ -285,7 +293,7 @@ EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t*
         std::vector<std::vector<Visit>> chunks(size_t((rays + RAYS - 1) / RAYS));
         for_ranges(threads, rays, RAYS, [&](int64_t begin, int64_t end) {
             std::vector<std::vector<Record::Part>> met(size_t(end - begin));
-            Record record{known, 1 / cell, limit, {}, {}, met, begin};
+            Record record{known, limit, {}, {}, met, begin};
             octree::Walk<Record>(layout, beams, record).run(begin, end);
             auto& visits = chunks[size_t(begin / RAYS)];
             for (int64_t r = begin; r < end; r++) {
@@ -333,19 +341,19 @@ EXPORT int octree_trace_backward(const float* origin, float cell, const int64_t*
 }
 
 // The opacity of R rays, and the largest weight of each leaf on them, where it is larger than before.
-EXPORT int octree_weights(const float* origin, float cell, const int64_t* size, const int32_t* bricks,
-                          const int64_t* masks, const int32_t* firsts, const float* raw, int64_t leaves,
-                          const float* origins, const float* directions, const float* nears,
-                          const float* fars, int64_t rays, float limit, float* weights, float* opacity,
-                          int threads) {
+EXPORT int octree_weights(int levels, float cell, const float* const* origins_of, const int64_t* sizes,
+                          const int32_t* const* bricks, const int64_t* const* masks, const int32_t* const* firsts,
+                          const int64_t* leaves_of, const float* raw, int64_t leaves, const float* origins,
+                          const float* directions, const float* nears, const float* fars, int64_t rays, float limit,
+                          float* weights, float* opacity, int threads) {
     return guarded([&] {
-        const octree::Layout layout{origin, cell, size, bricks, masks, firsts};
-        const octree::Beams beams{origins, directions, nears, fars};
+        const octree::Layout layout(levels, cell, origins_of, sizes, bricks, masks, firsts, leaves_of);
+        const octree::Beams beams{origins, directions, nears, fars, nullptr};
         const Raw known{raw, nullptr, 0};
         std::vector<std::vector<std::pair<int32_t, float>>> chunks(size_t((rays + RAYS - 1) / RAYS));
         for_ranges(threads, rays, RAYS, [&](int64_t begin, int64_t end) {
             std::vector<std::vector<Record::Part>> met(size_t(end - begin));
-            Record record{known, 1 / cell, limit, {}, {}, met, begin};
+            Record record{known, limit, {}, {}, met, begin};
             octree::Walk<Record>(layout, beams, record).run(begin, end);
             auto& found = chunks[size_t(begin / RAYS)];
             for (int64_t r = begin; r < end; r++) {

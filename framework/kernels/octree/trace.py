@@ -11,7 +11,7 @@ from torch import Tensor
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.adam.row_gradient import RowGradient
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import (
     LAYOUT,
@@ -24,6 +24,7 @@ from nerfloom.kernels.octree.light import (
     outputs_of,
     ray_arguments,
 )
+from nerfloom.kernels.triton_backend import later
 
 _trace = native.Function("octree_trace", LAYOUT + "ppi" + RAYS + "pfpppppi")
 _backward: Callable[..., int] = native.Function("octree_trace_backward", LAYOUT + "ppiq" + RAYS + "pfppppppi", "q")
@@ -132,3 +133,6 @@ def _compiled(
         placeholder = torch.zeros(1, requires_grad=True)
     rest = layout, contiguous(rays), background.contiguous(), stop, deferred, peaks
     return OctreeLight(*_Trace.apply(*inputs, placeholder, *rest))
+
+
+TRACE_OCTREE.implementation(TRITON, differentiable=2)(later("octree.trace_triton", "trace_octree"))

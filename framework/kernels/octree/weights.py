@@ -8,10 +8,11 @@ from torch import Tensor
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.compositing.density import exclusive_sum, ray_sum
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import LAYOUT, RAYS, contiguous, depths_of, ray_arguments
 from nerfloom.kernels.octree.walk import leaf_samples
+from nerfloom.kernels.triton_backend import later
 
 _weights = native.Function("octree_weights", LAYOUT + "pq" + RAYS + "fppi")
 
@@ -35,7 +36,7 @@ def raise_weights_reference(
 ) -> Tensor:
     """Compute `raise_weights` in PyTorch; `layout`, `raw`, `rays`, `weights` and `stop` are as there."""
     samples, leaves = leaf_samples(layout, rays)
-    tau = depths_of(raw[leaves, 0]) * samples.deltas / layout.cell
+    tau = depths_of(raw[leaves, 0]) * samples.deltas / layout.edges_of(leaves, samples.deltas.dtype)
     through = torch.exp(-exclusive_sum(tau, samples))
     found = torch.where(through >= stop, through * -torch.expm1(-tau), torch.zeros_like(tau))
     weights.scatter_reduce_(0, leaves, found.to(weights), "amax")
@@ -54,3 +55,6 @@ def _raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tenso
         native.threads(),
     )  # fmt: skip
     return opacity
+
+
+RAISE_WEIGHTS.implementation(TRITON, order=0)(later("octree.trace_triton", "raise_weights"))

@@ -28,6 +28,9 @@ from nerfloom.kernels.histograms import intervals_triton
 from nerfloom.kernels.images import ssim_triton
 from nerfloom.kernels.march import fixed_slots, fixed_slots_triton, waves_triton
 from nerfloom.kernels.march.fixed_slots import share_out
+from nerfloom.kernels.octree import trace_triton
+from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.packed import CODES, PackedLeaves
 from nerfloom.kernels.splats import blend_triton, project_triton, tiles_triton
 from nerfloom.kernels.splats.project import SplatCamera, project_reference
 from nerfloom.kernels.splats.tiles import tile_lists_reference
@@ -107,6 +110,7 @@ def compile_all() -> None:
         back(ssim_triton.photometric_loss(learned(13, 15, 3), torch.rand(13, 15, 3), 0.2, weights))
     gaussians()
     marching()
+    octrees()
 
 
 def gaussians() -> None:
@@ -144,6 +148,25 @@ def marching() -> None:
     with patch.object(fixed_slots, "share_out", lambda counts, capacity: nothing(capacity)):  # nothing was counted
         filled = fixed_slots_triton.fill(random_rays(33), occupancy(8, 0.5), 0.1, 30, torch.rand(33), (0, 512))
     fixed_slots_triton.reach(filled.placed, torch.rand(512), 4.6, 30)
+
+
+def octrees() -> None:
+    """Of one level and of two, with and without a choice by the width of pixels."""
+    rays, leaves = random_rays(33), torch.tensor([[1, 2, 3], [4, 5, 6]])
+    inner, _ = OctreeLayout.build(torch.zeros(3), 0.1, (1, 1, 1), leaves)
+    outer, _ = OctreeLayout.build(inner.around(), 0.2, (1, 1, 1), leaves)
+    for layout in (inner, inner.within([outer])):
+        count, peaks = layout.num_leaves, torch.rand(layout.num_leaves)
+        for width in (3, 12, 27, 48):
+            back(*trace_triton.trace_octree(layout, learned(count, 1), learned(count, width), rays, torch.rand(33, 3)))
+        trace_triton.trace_octree(
+            layout, torch.rand(count, 1), torch.rand(count, 3), rays, torch.rand(33, 3), 0.1, None, peaks
+        )
+        codes, colors = torch.zeros(count, dtype=torch.uint8), torch.zeros(count, 12, dtype=torch.uint8)
+        packed = PackedLeaves(codes, torch.rand(CODES * len(layout.levels)), colors, torch.rand(12), torch.rand(12))
+        for radii in (None, torch.rand(33)):
+            trace_triton.trace_packed(layout, packed, replace(rays, pixel_radii=radii), torch.rand(33, 3))
+        trace_triton.raise_weights(layout, torch.rand(count, 1), rays, peaks)
 
 
 if __name__ == "__main__":

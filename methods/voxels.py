@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfloom import ConfigError, Dataset, Decision, Loss, Method, PixelBatch, RowChange, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
@@ -22,13 +22,14 @@ from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.device import HostValue, relative_speed
 from nerfloom.base.processes import add_up
-from nerfloom.geometry.bounds import box_around_cells
 from nerfloom.kernels.adam.row_gradient import table_rows
 from nerfloom.kernels.encodings.spherical_harmonics import CONSTANT
-from nerfloom.kernels.octree.layout import BRICK, OctreeLayout
+from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.losses.leaf_variation import leaf_variation
 from nerfloom.octree_model import OctreeConfig, OctreeModel
+from nerfloom.octrees.growth import moments, split, visible
+from nerfloom.octrees.hull import Hull
 
 MAX_RESOLUTION = 2048
 """Maximum number of cells along an axis."""
@@ -118,104 +119,6 @@ def first_cells(cells: int, num_splits: int) -> int:
     return max(cells >> num_splits, 1)
 
 
-def moments(num_splits: int) -> list[tuple[float, bool]]:
-    """Return when leaves change: spent shares of the budget, each with whether leaves are split or only dropped.
-
-    Each size of leaves lasts twice as long as the one before. Leaves are dropped in the middle and at the end of this
-    time, except at the end of training.
-
-    Args:
-        num_splits: number of splits.
-    """
-    found, total = list[tuple[float, bool]](), 2 ** (num_splits + 1) - 1
-    for level in range(num_splits + 1):
-        begin, length = (2**level - 1) / total, 2**level / total
-        found += [(begin + length / 2, False), (begin + length, True)]
-    return found[:-1]
-
-
-def visible(peaks: Tensor, least: float, most: int) -> Tensor:
-    """Return the leaves (K,) int64 that stay, in ascending order.
-
-    A ray over colours in [0, 1] changes by at most the sum of the weights that the dropped leaves have on it.
-
-    Args:
-        peaks: (L,) largest weight of each leaf on training rays.
-        least: smallest weight of a leaf that stays. If no leaf has it, nothing is known yet, and all qualify.
-        most: maximum number of leaves; those with the largest weights stay.
-    """
-    kept = (peaks >= least).nonzero()[:, 0]
-    kept = kept if len(kept) else torch.arange(len(peaks), device=peaks.device)
-    return kept if len(kept) <= most else kept[peaks[kept].topk(most).indices].sort().values
-
-
-def split(layout: OctreeLayout, cells: Tensor) -> tuple[OctreeLayout, Tensor]:
-    """Return the layout whose leaves are the eighths of some cells.
-
-    Args:
-        layout: the grid of the cells.
-        cells: (K, 3) int64 coordinates of the cells.
-
-    Returns:
-        The layout of 8 K leaves, and the index (8 K,) in `cells` of the cell that each leaf is a part of.
-    """
-    offsets = torch.cartesian_prod(*[torch.arange(2, device=cells.device)] * 3)
-    parts = (2 * cells[:, None] + offsets).reshape(-1, 3)
-    size = [2 * count for count in layout.size]
-    finer, rows = OctreeLayout.build(layout.origin, layout.cell / 2, size, parts)
-    return finer, rows // len(offsets)
-
-
-def overlapped(inside: Tensor, box: Tensor, origin: Tensor, cell: float, counts: Sequence[int]) -> Tensor:
-    """Return the cells (X, Y, Z) bool of a grid that overlap some cells of another grid.
-
-    Args:
-        inside: (n, n, n) bool, True for these cells.
-        box: (2, 3) corners of their grid.
-        origin: (3,) corner of the first cell of the other grid.
-        cell: edge of its cells.
-        counts: number of its cells along each axis.
-    """
-    found = inside.long()
-    for axis, count in enumerate(counts):
-        edge = float(box[1, axis] - box[0, axis]) / len(inside)
-        begins = float(origin[axis] - box[0, axis]) / edge + cell / edge * torch.arange(count, device=box.device)
-        # Faces that two cells share, up to rounding, are no overlap.
-        first = (begins + 1e-3).floor().long().clamp(0, len(inside))
-        last = (begins + cell / edge - 1e-3).ceil().long().clamp(0, len(inside))
-        sums = torch.cat([torch.zeros_like(found.narrow(axis, 0, 1)), found.cumsum(axis)], axis)
-        found = sums.index_select(axis, last) - sums.index_select(axis, first)
-    return found > 0
-
-
-class Hull(nn.Module):
-    """A grid over the box, where cells that images show to be empty are marked (`nerfloom.samplers.base.Carved`).
-
-    Args:
-        box: (2, 3) corners of the box, scene units.
-        resolution: number of cells along each axis.
-    """
-
-    box: Tensor
-    carved: Tensor
-    levels = slices = 1
-
-    def __init__(self, box: Tensor, resolution: int) -> None:
-        super().__init__()
-        self.resolution = resolution
-        self.register_buffer("box", box.clone())
-        self.register_buffer("carved", torch.zeros(resolution**3, dtype=torch.bool))
-
-    @property
-    def inside(self) -> Tensor:
-        """Cells (n, n, n) bool that are not marked, indexed by x, y and z."""
-        return (~self.carved).view(self.resolution, self.resolution, self.resolution)
-
-    def carve(self, hull: Tensor) -> None:
-        """Mark all cells outside `hull`, (n^3,) bool, as empty."""
-        self.carved.copy_(~hull)
-
-
 class Voxels(OctreeModel[VoxelsConfig]):
     """An octree with leaves that become smaller and fewer during training.
 
@@ -262,15 +165,9 @@ class Voxels(OctreeModel[VoxelsConfig]):
     @torch.no_grad()
     def _begin(self, cells: int) -> None:
         """Set grey fog in a grid with a number of `cells` along the longest edge."""
-        inside, box = self.hull.inside, self.hull.box
-        around = box_around_cells(inside, box)
-        low, high = box if around is None else around
-        edge = float((high - low).max() / cells)  # rounded to float32, as in a checkpoint
-        size = [max(math.ceil(length / (BRICK * edge) - 1e-4), 1) for length in (high - low).tolist()]
-        places = overlapped(inside, box, low, edge, [BRICK * count for count in size]).nonzero()
-        layout, _ = OctreeLayout.build(low, edge, size, places)
-        raw = raw_of(box.new_full((layout.num_leaves, 1), FOG / cells))
-        coefficients = box.new_zeros(layout.num_leaves, 3, (self.config.degree + 1) ** 2)
+        layout = self.hull.leaves(cells)
+        raw = raw_of(layout.origin.new_full((layout.num_leaves, 1), FOG / cells))
+        coefficients = layout.origin.new_zeros(layout.num_leaves, 3, (self.config.degree + 1) ** 2)
         coefficients[..., 0] = 0.5 / CONSTANT
         self.set_octree(layout, raw, coefficients.flatten(1))
 

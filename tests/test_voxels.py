@@ -25,8 +25,11 @@ from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.kernels.octree.walk import leaf_at
 from nerfloom.kernels.octree.weights import raise_weights
 from nerfloom.losses.leaf_variation import SMOOTH, leaf_variation
-from nerfloom.methods.voxels import METHOD, Voxels, moments, overlapped, split, visible
+from nerfloom.methods.voxels import METHOD, Voxels
 from nerfloom.octrees.drawn import DrawnOctree
+from nerfloom.octrees.grid import Grid
+from nerfloom.octrees.growth import moments, split, visible
+from nerfloom.octrees.hull import Hull, overlapped
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.optim import Adam, make_optimizer
@@ -111,8 +114,7 @@ def test_a_cube() -> None:
     first = model.layout
     inside = 0.499 * (2 * torch.rand(2000, 3) - 1)
     assert bool((leaf_at(first, inside) >= 0).all())
-    assert first.num_leaves < 16**3
-    assert first.cell * 16 < 1.9  # the box has edges of 2
+    assert first.num_leaves < 16**3 / 2
     assert list(trainer.steps())
     model.eval()
     assert int(model.changes) == 3
@@ -230,16 +232,29 @@ def test_cells_that_overlap_others() -> None:
     torch.manual_seed(1)
     box = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 2.0, 1.0]])
     inside = torch.rand(6, 6, 6) < 0.05
-    origin, cell, counts = torch.tensor([-1.2, -1.7, 0.05]), 0.23, (11, 16, 4)
-    found = overlapped(inside, box, origin, cell, counts)
+    grid = Grid(torch.tensor([-1.2, -1.7, 0.05]), 0.23, (1, 2, 1))
+    found, cell = overlapped(inside, box, grid), grid.cell
     edges = (box[1] - box[0]) / 6
-    low = origin + cell * torch.cartesian_prod(*[torch.arange(count) for count in counts])
+    low = grid.positions(torch.cartesian_prod(*[torch.arange(count) for count in found.shape]))
     truth = torch.zeros(len(low), dtype=torch.bool)
     for place in inside.nonzero():
         begin = box[0] + place * edges
         truth |= ((low < begin + edges - 1e-4) & (low + cell > begin + 1e-4)).all(-1)
     assert 0 < int(truth.sum()) < len(truth)
     assert torch.equal(found.view(-1), truth)
+
+
+def test_the_first_leaves_are_in_the_smallest_box_around_the_hull() -> None:
+    hull = Hull(torch.tensor([[-1.0, -2.0, 0.0], [1.0, 2.0, 1.0]]), 8)
+    kept = torch.zeros(8, 8, 8, dtype=torch.bool)
+    kept[2:4, 1:7, 5] = kept[4, 6, 4] = True
+    hull.carve(kept.view(-1))
+    layout = hull.leaves(12)
+    assert layout.origin.tolist() == [-0.5, -1.5, 0.5]
+    assert layout.cell == 3 / 12  # from y = -1.5 to 1.5
+    assert layout.size == (1, 2, 1)
+    truth = [[x, y, 0] for x in (0, 1) for y in range(12)] + [[2, 10, 0], [2, 11, 0]]
+    assert sorted(layout.cells().tolist()) == truth
 
 
 def test_the_total_variation_of_leaves() -> None:

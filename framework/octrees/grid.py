@@ -16,7 +16,7 @@ class Grid:
     """A grid of cubic cells, of whole bricks along each axis."""
 
     origin: Tensor
-    """(3,) float64 corner of the first cell, scene units."""
+    """(3,) corner of the first cell, scene units; float64 where the device has it."""
     cell: float
     """Edge of a cell, scene units."""
     size: tuple[int, int, int]
@@ -29,7 +29,7 @@ class Grid:
         """Construct the grid of a box.
 
         Args:
-            low, high: (3,) float64 corners.
+            low, high: (3,) corners, scene units; float64 where the device has it.
             resolution: cells along the longest edge.
         """
         cell = float((high - low).max()) / resolution

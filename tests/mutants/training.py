@@ -35,6 +35,8 @@ MUTANTS = {
     "nerfloom.methods.voxels": [
         Mutant("split-doubles-depth", "Voxels.after_step", "self.depths(A) / 2", "self.depths(A)",
             "each split of voxels makes the scene twice as dense", "test_voxels.py::test_a_split_keeps_the_picture"),
+    ],
+    "nerfloom.octrees.growth": [
         Mutant("unseen-leaves-stay", "visible", "A >= B", "A >= 0", "voxels that no image shows are never dropped",
             "test_voxels.py::test_what_stays"),
     ],

@@ -21,7 +21,7 @@ from nerfloom.export.bake import Baking, bake
 from nerfloom.export.levels_page import levels_page
 from nerfloom.export.page_closeness import closeness
 from nerfloom.export.page_scenes import BEYOND_THE_BOX, ScenePage, gaussian_page, octree_page
-from nerfloom.export.settings import PageKind, WebSettings
+from nerfloom.export.settings import WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
     PICTURE,

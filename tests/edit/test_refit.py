@@ -27,14 +27,14 @@ def error(found: Edited, whole: Edited) -> float:
 def test_what_is_left_looks_more_like_all_of_them(tmp_path: Path) -> None:
     """In a frame that steps have moved, too. Nothing else of the Gaussians changes its place by much."""
     whole = edit.scale(edit.move(ball_in_capture(tmp_path), (3.0, 0.0, -2.0)), 0.2)
-    fewer, refitted = edit.reduce_to(whole, 150), edit.reduce_to(whole, 150, refit_steps=150)
+    fewer, refitted = edit.reduce_to(whole, 150), edit.reduce_to(whole, 150, refit_steps=500)
     assert len(refitted) == len(fewer) == 150
     before, after = error(fewer, whole), error(refitted, whole)
     print(f"mean squared difference of pictures: {before:.4f} before, {after:.4f} after")
-    assert after < 0.8 * before
+    assert after < 0.7 * before
     moved = (refitted.gaussians.means - fewer.gaussians.means).norm(dim=-1)
     assert float(moved.max()) < 0.2 * 0.5  # the ball's radius
-    again = edit.reduce_to(whole, 150, refit_steps=150)
+    again = edit.reduce_to(whole, 150, refit_steps=500)
     assert torch.equal(again.gaussians.means, refitted.gaussians.means)
 
 

@@ -101,7 +101,7 @@ MUTANTS = {
             "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
     ],
     "nerfloom.edit.drop": [
-        Mutant("floaters-however-opaque", "drop_floaters", "A & (seen.opacity_in_front <= max_opacity)", "A",
+        Mutant("floaters-however-opaque", "floating", "A & (seen.opacity_in_front <= max_opacity)", "A",
             "what is seen before other things is dropped, even if it is opaque",
             "edit/test_drop.py::test_floaters_of_a_capture_are_dropped"),
         Mutant("background-isolated", "drop_isolated", "torch.maximum(sizes, A)", "A",

@@ -197,7 +197,8 @@ def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: P
 
 
 MOTION = """<script>
-const wait = setInterval(() => {
+const settled = () => new Promise((done) => setTimeout(done, 50)); // browsers may ask for permission first
+const wait = setInterval(async () => {
   const state = document.documentElement.dataset;
   if (state.state !== "ready") return;
   clearInterval(wait);
@@ -207,9 +208,11 @@ const wait = setInterval(() => {
   const seen = [state.eye];
   turn(200, 90); // not yet
   document.getElementById("motion").click();
+  await settled();
   turn(10, 90); turn(40, 90);
   seen.push(state.eye);
   document.getElementById("motion").click();
+  await settled();
   turn(90, 90);
   seen.push(state.eye);
   state.seen = seen.join("|");

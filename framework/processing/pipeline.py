@@ -80,14 +80,18 @@ def process(state: Reconstruction, folder: Path, sources: list[Path], masks: Pat
         seconds=state.seconds,
     )
     _keep(work, output / "colmap", final)
-    seconds = {stage: round(value, 2) for stage, value in summary.seconds.items()}
-    (output / "colmap" / "summary.json").write_text(json.dumps({**asdict(summary), "seconds": seconds}, indent=2))
+    _write_summary(summary, output / "colmap" / "summary.json")
     write_json(output / FINISHED, transforms.content(frames, transforms.Z_UP, transforms.POINTS, {}))
     if flags.mask_moving:
         _mask_moving(state)
     for line in lines(summary):
         say(line)
     say(ready(output))
+
+
+def _write_summary(summary: Summary, file: Path) -> None:
+    seconds = {stage: round(value, 2) for stage, value in summary.seconds.items()}
+    file.write_text(json.dumps({**asdict(summary), "seconds": seconds}, indent=2))
 
 
 def _mask_moving(state: Reconstruction) -> None:

@@ -55,10 +55,10 @@ NOT_LEARNT = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "grad
 class VoxelsConfig(
     OctreeConfig,
     max_num_iterations=20_000,
-    learning_rate=0.05,
+    learning_rate=0.025,
     lr_schedule="hold-exponential",
     lr_final=0.05,
-    density_rate=3.0,
+    density_rate=16.0,
     samples_per_batch=2**17,
 ):
     """Settings of voxels."""

@@ -74,7 +74,7 @@ def test_colours_by_the_viewing_direction_have_no_such_part(kind: str) -> None:
 
 
 def test_an_appearance_changes_reflected_light() -> None:
-    trainer = trainer_of("nerfacto", appearance_embedding_dim=4)
+    trainer = trainer_of("nerfacto", appearance="vector", appearance_embedding_dim=4)
     field = trainer.model.field
     assert isinstance(field, EncodedField)
     assert field.appearance is not None

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.cameras.rigid_motion import RIGID_MOTIONS
+from nerfloom.kernels import native
 from nerfloom.kernels.compositing.density import bounded_sum, segmented_sum
 from nerfloom.kernels.dispatch import FEW_OPERATIONS, Operation
 from nerfloom.kernels.encodings.spherical_harmonics import SPHERICAL_HARMONICS
@@ -24,6 +25,7 @@ from nerfloom.kernels.splats import blend
 from nerfloom.kernels.splats.blend import BLEND, CHANNELS, blend_reference
 from nerfloom.kernels.splats.project import PROJECT, Record, SplatCamera, project_reference
 from nerfloom.kernels.splats.tiles import TILES, TileLists, tile_lists_reference
+from nerfloom.kernels.surfaces.distance import DISTANCE_NETWORK
 from tests.kernels.test_march import occupancy, random_rays
 
 GRID = HashGridLayout.build(num_levels=4, base_resolution=4, max_resolution=40, log2_table_size=9)
@@ -64,6 +66,20 @@ def test_a_hash_grid(held: int, monkeypatch: pytest.MonkeyPatch) -> None:
     forms = few(HASH_GRID), HASH_GRID.reference.run
     same(*(derived(lambda x, t, run=run: run(x, t, GRID, None), positions, table) for run in forms))
     assert few(HASH_GRID)(positions[:0], table, GRID, None).shape == (0, 8)
+
+
+def test_a_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its gradient too, and the gradients of both, also without the compiled grid."""
+    torch.manual_seed(0)
+    positions = torch.cat([torch.rand(60, 3, dtype=torch.float64), EDGES])
+    shapes = (GRID.num_entries, 2), (6, 8), (3, 6)
+    given = positions, *(torch.randn(shape, dtype=torch.float64) for shape in shapes)
+    truth = derived(lambda *of: DISTANCE_NETWORK.reference.run(*of, GRID, None), *given)
+    for available in (True, False):
+        monkeypatch.setattr(native, "available", lambda available=available: available)
+        same(derived(lambda *of: few(DISTANCE_NETWORK)(*of, GRID, None), *given), truth)
+    with torch.no_grad():
+        assert torch.equal(few(DISTANCE_NETWORK)(*given, GRID, None).isnan(), truth[0].isnan())
 
 
 @pytest.mark.parametrize("count", [1, 6])

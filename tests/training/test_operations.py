@@ -25,8 +25,8 @@ BOUNDS = {
     "mip-nerf-360": (1270, 0),
     "zip-nerf": (1160, 0),
     "nerf-plus-plus": (1360, 0),
-    "neus": (2810, 0.3),
-    "volsdf": (2760, 0.3),
+    "neus": (1240, 0.3),
+    "volsdf": (1190, 0.3),
 }
 """Operations and waits of a step: what was counted when this was written, and a tenth more operations, in which
 torch's releases may differ. Marched samples take a fixed number of slots, so that only updates of the occupancy grid,

@@ -18,13 +18,14 @@ derivative, which is 0 along the axes and jumps at the faces of cells.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from nerfloom.kernels import native, result_cache
-from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation, derivatives
 from nerfloom.kernels.grids.hash_grid import LOOK_UP, hash_grid, hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
@@ -39,10 +40,22 @@ def distance_network_reference(
 
     `positions`, `table`, `first`, `second`, `layout` and the result are as in `distance_network`.
     """
+    return _with_gradient(hash_grid_reference, positions, table, first, second, layout)
+
+
+def _with_gradient(
+    look_up: Callable[[Tensor, Tensor, HashGridLayout], Tensor],
+    positions: Tensor,
+    table: Tensor,
+    first: Tensor,
+    second: Tensor,
+    layout: HashGridLayout,
+) -> Tensor:
+    """Compute `distance_network` by autograd through a form of the grid that has the derivatives that are needed."""
     learns = torch.is_grad_enabled()
     with torch.enable_grad():
         positions = positions if positions.requires_grad else positions.detach().requires_grad_()
-        out = torch.relu(hash_grid_reference(positions, table, layout) @ first.t()) @ second.t()
+        out = torch.relu(look_up(positions, table, layout) @ first.t()) @ second.t()
         (gradient,) = torch.autograd.grad(out[:, 0].sum(), positions, create_graph=learns)
     result = torch.cat([out, gradient], dim=-1)
     return result if learns else result.detach()
@@ -125,6 +138,19 @@ DISTANCE_NETWORK = Operation("distance_network", _reference)
 _forward = native.Function("distance_network_forward", "pqpippipipipi")
 _backward = native.Function("distance_network_backward", "ppqpippipipipppi")
 DISTANCE_NETWORK.implementation(TRITON, fits=_fits)(later("surfaces.distance_triton", "distance_network"))
+
+
+@DISTANCE_NETWORK.implementation(FEW_OPERATIONS, types=None, order=torch.inf)
+def _few_operations(
+    positions: Tensor,
+    table: Tensor,
+    first: Tensor,
+    second: Tensor,
+    layout: HashGridLayout,
+    deferred: TableGradient | None,
+) -> Tensor:
+    with derivatives(2):  # a loss on the gradient of the distance has those of the grid of order 2
+        return _with_gradient(hash_grid, positions, table, first, second, layout)
 
 
 @DISTANCE_NETWORK.implementation(CPP, fits=_fits)

@@ -24,7 +24,7 @@ from nerfloom.geometry.points import Points
 from nerfloom.kernels.color import to_srgb
 from nerfloom.kernels.encodings.integrated_directional import MAX_BANDS, directional_encoding, num_features
 from nerfloom.kernels.grids.downweighting import level_weights
-from nerfloom.kernels.math import at_least_float32, normalize_above
+from nerfloom.kernels.math import at_least_float32, safe_normalize
 
 NORMALS, PROPERTIES = slice(1, 4), slice(4, None)
 """Columns of the features of a density's field. The first column is the log-density, or the input of softplus, which
@@ -40,10 +40,6 @@ DIFFUSE_BIAS, ROUGHNESS_BIAS = -3.0, -1.0
 """Added before the activation functions. Roughness starts at a medium value, and diffuse colours start so dim that
 reflections learn first. With the paper's -log 3 on a hash grid, diffuse colours learnt everything and reflections
 vanished."""
-SHORTEST = 0.1
-"""Length of a predicted vector below which the normal is shorter than 1. Features of a hash grid start near 0, so that
-with exact normalisation the first gradients of normals would be thousands of times those of density and colour. Adam
-divides later ones by the root of their mean square, which an entry forgets only after hundreds of updates."""
 ENVIRONMENT_LEVELS = 0
 """Levels of the hash grid over reflected directions (`Environment`); 0 for none."""
 COARSEST, FINEST, LOG2_ENVIRONMENT = 8, 128, 15
@@ -88,7 +84,7 @@ class Light(NamedTuple):
     roughness: Tensor
     """(N,) inverse concentration of the reflected directions."""
     normals: Tensor
-    """(N, 3) unit normals; predicted ones are shorter where they are not yet learnt."""
+    """(N, 3) unit normals."""
 
     @property
     def rgb(self) -> Tensor:
@@ -115,9 +111,7 @@ class HasDensityNormals(Protocol):
     """A field that predicts normals, or may do so, and computes those of its density, which they should equal."""
 
     def density_normals(self, points: Points) -> Tensor:
-        """Return the outward normals (N, 3) of the density, with a gradient.
-
-        They are unit vectors, or shorter where the density is nearly constant.
+        """Return the outward unit normals (N, 3) of the density, with a gradient; 0 where its gradient is 0.
 
         Args:
             points: N points.
@@ -125,12 +119,12 @@ class HasDensityNormals(Protocol):
 
 
 def predicted_normals(features: Tensor) -> Tensor:
-    """Return the predicted normals (N, 3) of points, of length 1 or less.
+    """Return the predicted unit normals (N, 3) of points; 0 for a vector of length 0.
 
     Args:
         features: (N, F) features of a density's field.
     """
-    return normalize_above(at_least_float32(features[:, NORMALS]), SHORTEST)
+    return safe_normalize(at_least_float32(features[:, NORMALS]))
 
 
 class Environment(nn.Module):
@@ -218,7 +212,7 @@ class Reflection(nn.Module):
 
         Args:
             properties: (N, 7 + B) properties of the surfaces, before their activation functions, and the bottleneck.
-            normals: (N, 3) unit normals, or shorter vectors. The length 0 leaves the viewing direction unchanged.
+            normals: (N, 3) unit normals, or 0, which leaves the viewing direction unchanged.
             directions: (N, 3) unit viewing directions.
             more: (N, M) further features.
         """

@@ -14,7 +14,7 @@ from nerfloom.fields.directional import Light, Reflection
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.contraction import contract_to_unit
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
-from nerfloom.kernels.math import at_least_float32, normalize_above
+from nerfloom.kernels.math import at_least_float32, safe_normalize
 from nerfloom.kernels.traced.colors import GridColor
 from nerfloom.kernels.traced.trace import GridDensity
 
@@ -23,8 +23,6 @@ NUM_FEATURES = 16
 TAP_DISTANCE = 1 / 512
 """Distance along each axis from a point to the four positions of `EncodedField.density_normals`, in shortest edges of
 the box."""
-FLAT = 0.1
-"""Difference of the log-density over these positions below which a normal is shorter than 1."""
 
 
 class BoxField(Field):
@@ -226,7 +224,7 @@ class EncodedField(BoxField):
         """
         around = (points.positions.detach()[:, None] + self.taps).view(-1, 3)
         logs = at_least_float32(self.density_head.first(self.encoded(Points(around)))).view(-1, len(self.taps), 1)
-        return -normalize_above((logs * self.taps.sign()).sum(1), FLAT)
+        return -safe_normalize((logs * self.taps.sign()).sum(1))
 
     def _harmonics(self, directions: Tensor) -> Tensor:
         opening, levels = self.direction_opening, self.direction_levels

@@ -68,8 +68,7 @@ def normal_difference(predicted: Tensor, normals: Tensor) -> Tensor:
 
     Args:
         predicted: (N, 3) predicted unit normals.
-        normals: (N, 3) unit normals of the density; 0 or short where it is constant, so that the difference counts
-            less.
+        normals: (N, 3) unit normals of the density; 0 where it is constant, where nothing is compared.
     """
     return normals.square().sum(-1) * (1 - (predicted * normals).sum(-1))
 

@@ -75,7 +75,7 @@ class ReflectiveNetworks(Field):
         return self.reflection.of_density(features, directions)
 
     def density_normals(self, points: Points) -> Tensor:
-        """Return the normals of the density, as `HasDensityNormals` does; 0 where its gradient is 0."""
+        """Return the normals of the density, as `HasDensityNormals` does."""
         with torch.enable_grad(), derivatives(2):
             points = replace(points, positions=points.positions.detach().requires_grad_())
             outputs = at_least_float32(self.network(self.encoding(points)))

@@ -99,19 +99,6 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
     return (scaled / at_least(squared, 1.0).sqrt()).masked_fill(squared < 1, 0)
 
 
-def normalize_above(v: Tensor, least: float) -> Tensor:
-    """Return v / max(|v|, least) along the last dimension: a vector shorter than `least` stays shorter than 1.
-
-    The gradient is at most 1 / least. That of `safe_normalize` is 1 / |v|, which is huge for outputs of a network that
-    starts near 0.
-
-    Args:
-        v: (..., D) vectors with components below 1e19, whose squares are finite in float32.
-        least: length of the shortest vectors that become unit vectors; more than 0.
-    """
-    return v * at_least(v.square().sum(-1, keepdim=True), least**2).rsqrt()
-
-
 def cross_matrix(v: Tensor) -> Tensor:
     """Return the matrices (..., 3, 3) whose product with a vector w is the cross product `v` x w, for `v` (..., 3)."""
     x, y, z = v.unbind(-1)

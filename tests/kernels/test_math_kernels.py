@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerfloom.kernels.math import cross_matrix, normalize_above, safe_normalize, truncated_exp
+from nerfloom.kernels.math import cross_matrix, safe_normalize, truncated_exp
 
 
 @pytest.mark.parametrize("x", [-1e30, -100.0, 0.0, 3.0, 14.9])
@@ -40,15 +40,6 @@ def test_safe_normalize() -> None:
     assert v.grad is not None
     assert bool(torch.isfinite(v.grad).all())
     assert torch.autograd.gradcheck(safe_normalize, torch.randn(4, 3, dtype=torch.float64, requires_grad=True))
-
-
-def test_short_vectors_stay_shorter_than_1() -> None:
-    v = torch.tensor([[3.0, 0, 4], [0, 0.06, 0.08], [0, 0, -0.02], [0, 0, 0]], dtype=torch.float64)
-    expected = torch.tensor([[0.6, 0, 0.8], [0, 0.6, 0.8], [0, 0, -0.2], [0, 0, 0]], dtype=torch.float64)
-    torch.testing.assert_close(normalize_above(v, 0.1), expected)
-    v[1] *= 1.1  # not where the slope jumps
-    assert torch.autograd.gradcheck(lambda v: normalize_above(v, 0.1), v.requires_grad_())
-    assert bool(normalize_above(torch.tensor([[torch.nan, 0, 1]]), 0.1).isnan().all())
 
 
 def test_cross_matrix_is_the_cross_product() -> None:

@@ -197,7 +197,11 @@ def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: P
 
 
 MOTION = """<script>
-const settled = () => new Promise((done) => setTimeout(done, 50)); // browsers may ask for permission first
+const pressed = async (on) => { // browsers may ask for permission first
+  while (document.getElementById("motion").getAttribute("aria-pressed") !== on) {
+    await new Promise((done) => setTimeout(done, 10));
+  }
+};
 const wait = setInterval(async () => {
   const state = document.documentElement.dataset;
   if (state.state !== "ready") return;
@@ -208,11 +212,11 @@ const wait = setInterval(async () => {
   const seen = [state.eye];
   turn(200, 90); // not yet
   document.getElementById("motion").click();
-  await settled();
+  await pressed("true");
   turn(10, 90); turn(40, 90);
   seen.push(state.eye);
   document.getElementById("motion").click();
-  await settled();
+  await pressed("false");
   turn(90, 90);
   seen.push(state.eye);
   state.seen = seen.join("|");

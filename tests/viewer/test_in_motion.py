@@ -52,7 +52,7 @@ def test_the_file_moves_and_the_run_rests(output: str) -> None:
     layout = replace(octree.layout, origin=2 * octree.layout.origin, cell=2 * octree.layout.cell)
     large = replace(other, layout=layout, placement=Placement.of(torch.eye(3, 4), 0.5), far=20.0)
     pictures, queue = list[np.ndarray](), RenderQueue(opened(octree), quick=opened(large))
-    queue.add(1, Browser(lambda image, quality: pictures.append(image)))
+    queue.add(1, Browser(lambda image, quality: pictures.append(image.copy())))
     firsts = []
     for request in (at(0.0, output), at(0.2, output)):
         firsts.append(first_of(queue, pictures, request))

@@ -19,7 +19,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.registry import load_method
 from nerfloom.renderable import RendersRays
 from nerfloom.rendering.rendered import Picture, Rendered
-from nerfloom.stress.variants import with_distractors
+from nerfloom.stress.variants import chosen, with_distractors
 from nerfloom.testing.ball import trace
 from nerfloom.testing.scenes import ball_in_a_box, moving_ball
 from nerfloom.training import trainer as trainer_module
@@ -186,7 +186,8 @@ def over_white(dataset: Dataset) -> Tensor:
 
 @pytest.mark.medium
 def test_discs_are_found_by_a_field_that_shows_what_is_behind_them() -> None:
-    clean = ball_in_a_box(96)
+    """With three images from each camera. Four of eight see a place, and discs often cover nearly all of these."""
+    clean = chosen(ball_in_a_box(96), [*range(8)] * 3)
     dataset = with_distractors(clean, 0.2)
     changed = (over_white(dataset) - over_white(clean)).abs().amax(-1)
     found = {}
@@ -205,8 +206,8 @@ def test_discs_are_found_by_a_field_that_shows_what_is_behind_them() -> None:
     recall = float(found["discs"][changed > 0.2].float().mean())
     precision = float((changed[found["discs"]] > 0.02).float().mean())
     print(f"{recall:.0%} of the discs found, {precision:.0%} of what is left out are discs")
-    assert recall > 0.85
-    assert precision > 0.3
+    assert recall > 0.95
+    assert precision > 0.5
 
 
 @pytest.mark.slow

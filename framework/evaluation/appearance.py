@@ -6,7 +6,7 @@ optimised on the image's left half with all other parameters fixed, and metrics 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
@@ -24,8 +24,8 @@ from nerfloom.losses.functions import mean_squared_error
 from nerfloom.renderable import HasAppearance, Renderable, RendersRays, training_poses
 from nerfloom.samplers.proposal import half_edge
 
-STEPS, PIXELS, RATE = 60, 1024, 0.05
-"""Steps of Adam, pixels per step, and learning rate for fitting an appearance vector."""
+STEPS, PIXELS = 30, 2048
+"""Maximum number of steps of L-BFGS for fitting an appearance vector, and of pixels that it is fitted to."""
 MAX_CANDIDATES = 32
 """Maximum number of training images' vectors tried as the initial vector."""
 
@@ -143,41 +143,31 @@ def fit_appearance(
     appearance = appearance_of(model)
     if appearance is None:
         return None
-    if start is None:
-        start = _closest(model, appearance, dataset, pixels, background)
-    vector = start.detach().clone().requires_grad_()
-    if len(pixels):
+    mean = appearance.of_images().detach().mean(0)
+    if not len(pixels):
+        return appearance.of_any_view(mean if start is None else start)
+    with model.rendering(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
         if isinstance(model, RendersRays):
-            _fit(model, appearance, dataset, pixels, vector, background)
+            error = _error_of_rays(model, dataset, pixels, background)
+            start = _closest(appearance, error) if start is None else start
         else:
-            _fit_view(model, appearance, dataset, pixels, vector, background)
-    return appearance.of_any_view(vector.detach())
+            error = _error_of_view(model, dataset, pixels, background)
+        return _fit(appearance, error, mean if start is None else start)
 
 
 @torch.no_grad()
-def _closest(model: Renderable, appearance: Appearance, dataset: Dataset, pixels: Tensor, background: Tensor) -> Tensor:
-    """Return the vector (D,) that reproduces some of the pixels best: the mean, or a training image's.
+def _closest(appearance: Appearance, error: Callable[[], Tensor]) -> Tensor:
+    """Return the vector (D,) with the smallest error: the mean, or a training image's.
 
     The network learns the mean vector separately (`Appearance`), so vectors near the mean say little about the light of
     others, and a descent from there may end at a poor minimum.
     """
-    own = appearance.of_images()
-    mean = own.mean(0)
-    if not len(pixels) or not isinstance(model, RendersRays):
-        return mean
-    candidates = torch.cat([mean[None], _some(own, MAX_CANDIDATES)])
-    some = _some(pixels, PIXELS)
-    batch = gather_batch(dataset, some, background.repeat(len(some), 1))
-    rays, errors = replace(batch.rays, camera_indices=None), []
-    with model.rendering(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
-        for vector in candidates:
-            with appearance.shown(appearance.of_any_view(vector)):
-                errors.append(mean_squared_error(model.render(rays, batch.background).rgb, batch.rgb))
+    own, errors = appearance.of_images(), []
+    candidates = torch.cat([own.mean(0)[None], own[evenly_spaced(len(own), MAX_CANDIDATES).to(own.device)]])
+    for vector in candidates:
+        with appearance.shown(appearance.of_any_view(vector)):
+            errors.append(error())
     return candidates[torch.stack(errors).argmin()]
-
-
-def _some(rows: Tensor, most: int) -> Tensor:
-    return rows[evenly_spaced(len(rows), most).to(rows.device)]
 
 
 def _left_pixels(dataset: Dataset, index: int) -> Tensor:
@@ -188,34 +178,46 @@ def _left_pixels(dataset: Dataset, index: int) -> Tensor:
     return pixels.reshape(-1) if kept is None else pixels[kept[:, : width // 2]]
 
 
-def _fit(
-    model: RendersRays, appearance: Appearance, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor
-) -> None:
-    """Fit the vector of a model that casts rays, by some pixels a step."""
-    optimizer = torch.optim.Adam([vector], lr=RATE)
-    generator = torch.Generator().manual_seed(0)
-    with model.rendering(), torch.enable_grad(), torch.autocast(model.device.type, torch.bfloat16, enabled=False):
-        for _ in range(STEPS):
-            chosen = pixels[torch.randint(len(pixels), (PIXELS,), generator=generator).to(pixels.device)]
-            batch = gather_batch(dataset, chosen, background.repeat(len(chosen), 1))
-            with appearance.shown(appearance.of_any_view(vector)):
-                rendered = model.render(replace(batch.rays, camera_indices=None), batch.background)
-            (vector.grad,) = torch.autograd.grad(mean_squared_error(rendered.rgb, batch.rgb), [vector])
-            optimizer.step()
+def _error_of_rays(model: RendersRays, dataset: Dataset, pixels: Tensor, background: Tensor) -> Callable[[], Tensor]:
+    """Return a function that returns the squared error () of some pixels in the appearance shown.
+
+    They are drawn at random, once. Evenly spaced ones may be all in a few columns.
+    """
+    chosen = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:PIXELS]
+    some = pixels[chosen.to(pixels.device)]
+    batch = gather_batch(dataset, some, background.repeat(len(some), 1))
+    rays = replace(batch.rays, camera_indices=None)
+    return lambda: mean_squared_error(model.render(rays, batch.background).rgb, batch.rgb)
 
 
-def _fit_view(
-    model: Renderable, appearance: Appearance, dataset: Dataset, pixels: Tensor, vector: Tensor, background: Tensor
-) -> None:
-    """Fit the vector of a model that draws whole images, by pixels of one image."""
-    optimizer = torch.optim.Adam([vector], lr=RATE)
+def _error_of_view(model: Renderable, dataset: Dataset, pixels: Tensor, background: Tensor) -> Callable[[], Tensor]:
+    """Return a function that returns the squared error () of pixels of one image, drawn as a whole."""
     index = int(torch.searchsorted(dataset.cameras.offsets.to(pixels), pixels[0], right=True)) - 1
     pixels_there = pixels - dataset.cameras.offsets[index].to(pixels)
     view = dataset.view(index)
     true = gather_batch(dataset, pixels, background.repeat(len(pixels), 1)).rgb
-    with model.rendering(), torch.enable_grad():
-        for _ in range(STEPS):
-            with appearance.shown(appearance.of_any_view(vector)):
-                shown = model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there]
-            (vector.grad,) = torch.autograd.grad(mean_squared_error(shown, true), [vector])
-            optimizer.step()
+    return lambda: mean_squared_error(model.render_view(view, background).rgb.reshape(-1, 3)[pixels_there], true)
+
+
+@torch.enable_grad()
+def _fit(appearance: Appearance, error: Callable[[], Tensor], start: Tensor) -> Tensor:
+    """Return the vector (D,) with the smallest error and pull, found from a start (D,).
+
+    The appearance's first `size` parameters belong to an image; others are shared, and stay as they are. L-BFGS adapts
+    to parameters of any unit, and to those that depend on each other, such as the entries of an affine function.
+    """
+    own, shared = start.detach().split([appearance.size, len(start) - appearance.size])
+    own = own.clone().requires_grad_()
+    optimizer = torch.optim.LBFGS([own], max_iter=STEPS, line_search_fn="strong_wolfe")
+
+    def vector() -> Tensor:
+        return appearance.of_any_view(torch.cat([own, shared]))
+
+    def loss() -> Tensor:
+        with appearance.shown(vector()):
+            value = error() + appearance.pull(vector())
+        (own.grad,) = torch.autograd.grad(value, [own])
+        return value.detach()
+
+    optimizer.step(loss)
+    return vector().detach()

@@ -77,6 +77,10 @@ class Appearance(nn.Module):
         """Return the vector (D,) of evaluation: the one set by `shown`, or the mean without a gradient."""
         return self.of_images().detach().mean(0) if self._shown is None else self._shown
 
+    def pull(self, vector: Tensor) -> Tensor:
+        """Return the term () beside the squared error of colours in fits of `vector` (D,) to an image; here 0."""
+        return vector.new_zeros(())
+
     def of_any_view(self, vector: Tensor) -> Tensor:
         """Return a vector (D,) without what depends on the position in an image; here `vector` itself."""
         return vector

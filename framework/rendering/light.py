@@ -37,6 +37,9 @@ SMOOTHNESS = 2.0
 so that differences between them are half as large."""
 SQUARED = 0.1
 """Factor of the penalty beside a squared error of colours, which is smaller than an absolute one."""
+FITTED = 0.01
+"""Factor of the penalty beside a squared error in fits of one image. It is smaller than `SQUARED`, since the image's
+light may be far from that of the others: it decides what the image's pixels leave open."""
 LEAST_OPACITY = 1e-3
 """Opacity below which a colour is not divided by it."""
 
@@ -131,6 +134,9 @@ class Light(Appearance, ABC):
         away = self.away()
         return (PULL * away.square().sum(-1).mean() + away.mean(0).square().sum()) / self.cells
 
+    def pull(self, vector: Tensor) -> Tensor:
+        return FITTED * PULL * vector[: self.size].square().sum() / self.cells
+
     def _first(self, rgb: Tensor) -> Tensor:
         return torch.zeros(1, dtype=torch.int64, device=rgb.device)
 
@@ -218,6 +224,9 @@ class GridLight(Light):
 
     def penalty(self) -> Tensor:
         return super().penalty() + SMOOTHNESS * variation(self.vectors.view(-1, *GRID, AFFINE))
+
+    def pull(self, vector: Tensor) -> Tensor:
+        return super().pull(vector) + FITTED * SMOOTHNESS * variation(vector.view(1, *GRID, AFFINE))
 
     def of_any_view(self, vector: Tensor) -> Tensor:
         grid = vector.view(*GRID, AFFINE)

@@ -20,8 +20,8 @@ ROUGH_QUALITY, FINE_QUALITY = 70, 95
 RENEWAL = 1.0
 """Seconds after which a finished picture is redrawn if the model has changed."""
 Show = Callable[[np.ndarray, int], None]
-"""Function that sends a picture (H, W, 3) uint8 to the browser, as a JPEG of a given quality. The array changes with
-the next piece, so it must be encoded or copied before the function returns."""
+"""Function that sends a picture (H, W, 3) uint8 to the browser, as a JPEG of a given quality. It does not
+keep the array, which changes with the next piece."""
 
 
 @dataclass

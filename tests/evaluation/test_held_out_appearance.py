@@ -1,4 +1,4 @@
-"""Which training image lends its light to a held-out view."""
+"""Which training image lends its light to a held-out view, and a known light that half of an image tells."""
 
 from dataclasses import replace
 
@@ -7,10 +7,18 @@ import torch
 from torch import Tensor
 
 from nerfloom import ConfigError, Scene
+from nerfloom.base.config import AppearanceConfig
 from nerfloom.cameras.view import View
-from nerfloom.evaluation.appearance import held_out_appearance, nearest_camera
+from nerfloom.data.pixels.batch import gather_batch
+from nerfloom.evaluation.appearance import fit_appearance, held_out_appearance, nearest_camera
 from nerfloom.fields.appearance import Appearance
-from nerfloom.testing.ball import cameras_at
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.color import to_linear, to_srgb
+from nerfloom.renderable import RendersRays
+from nerfloom.rendering.light import make_light
+from nerfloom.rendering.rendered import Picture, Rendered
+from nerfloom.testing.ball import cameras_at, trace
+from nerfloom.testing.scenes import ball_in_a_box
 
 POSITIONS = torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-4.0, 0, 1], [0.0, -4, 1]])
 
@@ -65,3 +73,54 @@ def test_a_view_has_the_light_of_the_nearest_image() -> None:
         with held_out_appearance(lit, lit, index, torch.zeros(3)):  # type: ignore[arg-type]
             assert lit.appearance(None, 1)[0].tolist() == [2 * index, 2 * index + 1]
     torch.testing.assert_close(lit.appearance(None, 1)[0], torch.tensor([3.0, 4.0]))
+
+
+class LitBall(RendersRays):
+    """The ball of `ball_in_a_box`, in closed form and in a light."""
+
+    def __init__(self, kind: str, scene: Scene) -> None:
+        light = make_light(AppearanceConfig(appearance=kind), scene)  # type: ignore[arg-type]
+        assert light is not None
+        self.scene, self.appearance = scene, light
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cpu")
+
+    @property
+    def rays_at_once(self) -> int:
+        return 5000
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        normals, hits = trace(rays.origins, rays.directions)
+        rgb = torch.where(hits[:, None], 0.5 + 0.4 * normals.clamp(-1, 1), background)
+        lit = self.appearance.lit(rgb, hits.float(), background)
+        return Rendered(lit, rays.fars, rays.fars, hits.float(), 0)
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        raise AssertionError
+
+
+@pytest.mark.parametrize("kind", ["affine", "tone", "grid"])
+def test_half_of_an_image_tells_a_known_light(kind: str) -> None:
+    """The colours of the ball's right half are others, and are right too. What cameras share stays as it is."""
+    still, behind = ball_in_a_box(40), torch.zeros(3)
+    gains, colors = torch.tensor([0.5, 0.4, 0.45]), still.pixels[:, :3].float() / 255
+    dark = to_srgb(gains**2.2 * to_linear(colors)) if kind == "tone" else gains * colors
+    pixels = torch.cat([(255 * dark).round().to(torch.uint8), still.pixels[:, 3:]], -1)
+    dataset, model = replace(still, pixels=pixels), LitBall(kind, still.scene)
+    halves = dataset.cameras.image_pixels(2).view(40, 40).split(20, 1)
+
+    def off(vector: Tensor, half: Tensor) -> float:
+        batch = gather_batch(dataset, half.reshape(-1), behind.repeat(half.numel(), 1))
+        with model.appearance.shown(vector), torch.no_grad():
+            shown = model.render(replace(batch.rays, camera_indices=None), behind)
+        return float((shown.rgb - batch.rgb)[shown.accumulation > 0.5].square().mean().sqrt())
+
+    found = fit_appearance(model, dataset, halves[0].reshape(-1), behind)
+    assert found is not None
+    mean = model.appearance.of_images().detach().mean(0)
+    print([off(vector, half) for vector in (mean, found) for half in halves])
+    assert off(mean, halves[1]) > 0.2
+    assert off(found, halves[1]) < 0.02
+    assert torch.equal(found[model.appearance.size :], mean[model.appearance.size :])

@@ -1,4 +1,4 @@
-"""Arguments of functions from plain values, such as those of a YAML file."""
+"""Arguments of functions from plain values, such as the values of a YAML file."""
 
 from __future__ import annotations
 

@@ -191,12 +191,12 @@ class TrainConfig:
 AppearanceKind = Literal["none", "vector", "affine", "tone", "grid"]
 """How images of one scene differ in light, exposure and white balance."""
 HeldOutAppearance = Literal["mean", "half", "nearest"]
-"""What held-out images are evaluated with."""
+"""Appearance used to evaluate held-out images."""
 
 
 @dataclass(frozen=True)
 class RobustConfig(TrainConfig):
-    """Settings of a method whose loss of colours uses the weights of pixels."""
+    """Settings of a method with a colour loss that uses the weights of pixels."""
 
     RANGES: ClassVar[dict[str, Range]] = {"robust_factor": (1, 1e6)}
     """Allowed ranges."""
@@ -239,7 +239,7 @@ class AppearanceConfig(TrainConfig):
 
 @dataclass(frozen=True)
 class VectorConfig(AppearanceConfig):
-    """Settings of a method whose colour network can take a vector of each image."""
+    """Settings of a method with a colour network that can take a vector of each image."""
 
     RANGES: ClassVar[dict[str, Range]] = {"appearance_embedding_dim": (1, 2**10)}
     """Allowed ranges."""

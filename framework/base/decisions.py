@@ -1,4 +1,4 @@
-"""Decisions on settings whose values depend on the data."""
+"""Decisions on settings that depend on the data."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ MAX_MESSAGE_LENGTH = 2000
 class NerfloomError(ValueError):
     """Base class of the errors that the command line prints as one line, without a traceback.
 
-    Line breaks and control characters of `message` are escaped, and what exceeds `MAX_MESSAGE_LENGTH` is cut off.
+    Line breaks and control characters of `message` are escaped, and the end beyond `MAX_MESSAGE_LENGTH` is cut off.
     """
 
     def __init__(self, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Answers to nerfstudio's flags, subcommands and configs: what to use here."""
+"""Answers to nerfstudio's flags, subcommands and configs: the equivalents here."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ _MESH = "use 'marching-cubes' (methods with density) or 'tsdf' (all methods) for
 KINDS = {
     "poisson": _MESH,
 }
-"""Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent -> what to use instead."""
+"""Subcommand of nerfstudio's ns-export or ns-process-data without an equivalent -> advice."""
 
 
 RENDERING = {

@@ -72,7 +72,7 @@ class RowChange:
 
 @runtime_checkable
 class DefersGradient(Protocol, metaclass=SeesRegistered):
-    """A module with a table whose gradient is accumulated by the optimiser instead of autograd."""
+    """A module with a table; the optimiser accumulates its gradient instead of autograd."""
 
     table: nn.Parameter
     """(E, F) the table."""

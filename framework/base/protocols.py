@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 
 class SeesRegistered(type(Protocol)):  # type: ignore[misc]
-    """Metaclass of runtime-checkable protocols whose attributes may be registered in a torch module.
+    """Metaclass of runtime-checkable protocols with attributes that a torch module may register.
 
     A module looks up registered attributes in `__getattr__`. Since Python 3.12, `isinstance` does not call
     `__getattr__` for a protocol's attributes, and would reject a module with the right buffers.

@@ -70,8 +70,8 @@ class CameraPath:
     poses: Tensor
     """(F, 3, 4) camera-to-scene, float64, OpenGL axes."""
     fovs: Tensor
-    """(F,) vertical field of view, degrees, float64; not used if equirectangular. The focal length of a fisheye in
-    pixels per radian is that of a perspective camera in pixels per tangent."""
+    """(F,) vertical field of view, degrees, float64; not used if equirectangular. A fisheye's focal length in pixels
+    per radian equals a perspective camera's in pixels per tangent."""
     seconds: float
     """Duration."""
     times: Tensor | None = None
@@ -111,7 +111,7 @@ class CameraPath:
         Args:
             width: width of the images, pixels; None to keep it, or the aspect ratio if `height` is given.
             height: height of the images, pixels; None likewise.
-            fov: vertical field of view of all frames, degrees; None for those of the path.
+            fov: vertical field of view of all frames, degrees; None to keep the path's.
         """
         new_width, new_height = size_of((self.width, self.height), width, height)
         fovs = self.fovs if fov is None else torch.full_like(self.fovs, fov)
@@ -343,7 +343,7 @@ def _rigid(value: Any, where: str) -> Tensor:
 
 
 def _keyframes(content: dict[str, Any], camera_type: str, file: Path) -> tuple[Keyframe, ...]:
-    """Return the keyframes; none for files of nerfstudio's first viewer, whose matrices are text."""
+    """Return the keyframes; none for files of nerfstudio's first viewer, which store matrices as text."""
     given = content.get("keyframes")
     given = [] if given is None else _list(content, "keyframes", file)
     if len(given) > MAX_FRAMES:

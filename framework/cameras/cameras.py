@@ -225,7 +225,8 @@ class Cameras:
             subpixels: (K, 2) positions in a pixel, in columns and rows from its centre.
 
         Returns:
-            P * K rays, those of a pixel consecutive, with a gradient for poses and intrinsics that require one.
+            P * K rays, with the K rays of a pixel consecutive, and a gradient for poses and intrinsics that require
+            one.
 
         Raises:
             IndexError: if a number exceeds the number of pixels.
@@ -270,7 +271,7 @@ class Cameras:
 
 @lru_cache(maxsize=16)
 def subpixels(count: int, device: torch.device | None = None) -> Tensor:
-    """Return the positions in a pixel whose colours are averaged: columns and rows (count, 2) from its centre.
+    """Return the positions in a pixel where colours are averaged: columns and rows (count, 2) from its centre.
 
     For count = n^2, the positions form a square grid, rotated so that no two share a row or a column. Edges close to
     horizontal or vertical, where aliasing is most visible, then have count + 1 levels instead of n + 1. For n = 2 it is
@@ -377,7 +378,7 @@ def check_pose(pose: Tensor, where: str) -> None:
     """Refuse a camera `pose`, (3, 4) or (4, 4), that is not a finite rigid motion, named `where` in the message.
 
     Raises:
-        DataError: with `where` and what is wrong.
+        DataError: with `where` and the fault.
     """
     if pose.shape not in ((4, 4), (3, 4)):
         raise DataError(f"{where}: the pose has shape {tuple(pose.shape)}; a 4x4 matrix is needed")

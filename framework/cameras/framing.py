@@ -25,7 +25,7 @@ def perspective(poses: Tensor, width: int, height: int, fov: Tensor | float) -> 
 
 
 def size_of(size: tuple[int, int], width: int | None, height: int | None) -> tuple[int, int]:
-    """Return (width, height) `size` resized to `width` and `height`; what is None keeps the aspect ratio."""
+    """Return (width, height) `size` resized to `width` and `height`; None for one of them keeps the aspect ratio."""
     before_width, before_height = size
     if width is None:
         width = before_width if height is None else max(round(before_width * height / before_height), 1)
@@ -39,10 +39,10 @@ def framed(cameras: Cameras, width: int | None = None, height: int | None = None
     images show much that the first ones did not. With `fov`, cameras become pinhole cameras.
 
     Args:
-        cameras: M cameras whose images have one size.
+        cameras: M cameras with images of one size.
         width: width of the images, pixels; None to keep it, or the aspect ratio if `height` is given.
         height: height of the images, pixels; None likewise.
-        fov: vertical field of view, degrees; None for that of the cameras.
+        fov: vertical field of view, degrees; None to keep the cameras'.
 
     Raises:
         ConfigError: if a panorama was to have another aspect ratio.

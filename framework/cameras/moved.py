@@ -11,7 +11,7 @@ from nerfloom.cameras.cameras import Cameras
 
 
 def moved_cameras(cameras: Cameras, rotation: Tensor, scale: float, shift: Tensor) -> Cameras:
-    """Return cameras that see in another scene what they see in theirs, on the same device.
+    """Return cameras moved to another scene by a similarity, so that they see the same there, on the same device.
 
     Poses are computed in float64, since a scene may be far from its origin.
 

@@ -69,7 +69,7 @@ class Ndc:
 
 @dataclass(frozen=True)
 class NdcCameras(Cameras):
-    """Cameras whose rays are in normalised device coordinates; near and far are distances there."""
+    """Cameras with rays in normalised device coordinates; near and far are distances there."""
 
     ndc: Ndc | None = None
     """The coordinates; None for rays in the scene's frame."""

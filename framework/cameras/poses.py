@@ -39,7 +39,7 @@ class Placement:
 
     transform: Tensor
     """(3, 4) float64 rigid transform on the CPU, applied before `scale`. Its rotation may be rounded to float32, as
-    nerfstudio's is: the inverse is that of the matrix as it is, not its transpose."""
+    nerfstudio's is, so the matrix is inverted rather than transposed."""
     scale: float
     """Scene units per unit of the input."""
 
@@ -251,7 +251,7 @@ def enlargement(poses: Tensor, spreads: Tensor) -> float:
 
 
 def _principal_axes(points: Tensor, up: Tensor) -> Tensor:
-    """Return the rotation (3, 3) whose rows are the axes of most to least spread, the last turned towards `up`."""
+    """Return the rotation (3, 3) with the axes of most to least spread as rows, the last turned towards `up`."""
     centred = points - points.mean(0)
     axes = torch.linalg.eigh(centred.T @ centred).eigenvectors.flip(-1).T
     if bool(torch.dot(axes[2], up) < 0):

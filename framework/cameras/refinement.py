@@ -26,8 +26,8 @@ POSE_REASONS = {
 class PoseRefinement(nn.Module):
     """A small rigid motion for each training camera, in the scene's frame; initially the identity.
 
-    The data give poses, and the scene is learnt as the moved cameras see it. So the moved poses are those in the
-    scene's frame.
+    The data give poses, and the scene is learnt as the moved cameras see it. So the moved poses are in the scene's
+    frame.
 
     Args:
         count: number of cameras.
@@ -76,8 +76,8 @@ class PoseRefinement(nn.Module):
 
         Args:
             poses: (M, 3, 4) given poses, on any device.
-            training: whether they are those of all training cameras, in their order. Other poses follow those of
-                nearby training cameras. So do poses of training cameras if some of them are missing.
+            training: whether they are the poses of all training cameras, in their order. Other poses follow nearby
+                training cameras. So do poses of training cameras if some of them are missing.
         """
         here = poses.to(self.tangents)
         if training and len(here) == len(self.tangents):

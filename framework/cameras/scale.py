@@ -77,7 +77,7 @@ def scale_file(path: Path) -> Path:
 
 
 def read_scale(path: Path) -> Scale:
-    """Read the scale kept for `path`, a run's folder or a file; that of the input if there is none.
+    """Read the scale kept for `path`, a run's folder or a file; the input's scale if there is none.
 
     Raises:
         DataError: if the scale cannot be read or used.

@@ -8,7 +8,7 @@ from torch import Tensor
 from nerfloom.geometry.alignment import nearest_rotations
 
 NEIGHBOURS = 3
-"""Number of neighbouring cameras whose poses are averaged into an unobserved view."""
+"""Number of neighbouring cameras; an unobserved view averages their poses."""
 REACH = 1.25
 """Size of the triangle that positions are drawn from, relative to the triangle of the three cameras."""
 
@@ -16,7 +16,7 @@ REACH = 1.25
 def unseen_poses(poses: Tensor, near: Tensor) -> Tensor:
     """Return random poses, each between and around a given camera and its two nearest neighbours.
 
-    The position is uniformly distributed over a triangle, `REACH` times as large as the one of the three cameras. The
+    The position is uniformly distributed over the triangle of the three cameras, enlarged by `REACH`. The
     rotation is the closest to the mean of their rotations, with the same weights.
 
     Args:

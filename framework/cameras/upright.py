@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 MIN_TURN = 0.15
-"""Minimum difference of second moments of the column axes, in their plane minus across it: that of an 80 degree arc."""
+"""Minimum difference of second moments of the column axes, in their plane minus across it, as of an 80 degree arc."""
 MIN_CLARITY_RATIO = 2.0
-"""Minimum ratio of clarity of the plane of the column axes to that of the row axes."""
+"""Minimum clarity of the plane of the column axes, relative to the clarity of the plane of the row axes."""
 MIN_WIDTH = 0.25
 """Minimum spread of the camera positions along their second principal direction, relative to the first."""
 MIN_DOWNWARD = 0.1
@@ -19,9 +19,9 @@ def sideways_up(poses: Tensor) -> Tensor | None:
     """Return the up direction of photographs that lie on their side; None if they stand upright or it is unclear.
 
     A camera that moves around an object turns about the vertical axis. The horizontal image axis then stays in one
-    plane, however high or low the camera looks. That axis is the row axis (x) of upright images, and the column axis
-    (y) of images that lie on their side. The result is None unless the plane of y is twice as clear as that of x, and
-    the cameras stand around something. For cameras in a line, looking up and down turns y in a plane too.
+    plane, however high or low the camera looks. This is the row axis (x) of upright images, and the column axis
+    (y) of images that lie on their side. The result is None unless the plane of y is twice as clear as the plane of x,
+    and the cameras stand around something. For cameras in a line, looking up and down turns y in a plane too.
 
     Up is the normal of this plane, on the side that makes the cameras look down. If they look neither up nor down, up
     is the left of the image, as in a phone's photographs stored in sensor orientation.

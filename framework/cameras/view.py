@@ -26,7 +26,7 @@ class View:
     scene: int | None = None
     """Index of the scene if the images show several; None for the only one or the first."""
     image: int | None = None
-    """Index of a training image, to show also what only that image contains; None: what all images share."""
+    """Index of a training image, to show its own content too; None: only the content that all images share."""
 
     @classmethod
     def of(cls, cameras: Cameras, index: int, times: Tensor | None = None, stride: int = 1) -> View:

@@ -21,7 +21,7 @@ UNTESTED_RADIUS = 0.99
 
 @torch.no_grad()
 def unreachable_pixels(cameras: Cameras) -> Tensor:
-    """Return the pixels (K,) int64 whose centre has no ray, counted over all images.
+    """Return the pixels (K,) int64 with no ray through their centre, counted over all images.
 
     Rays computed for such pixels are finite but wrong. Only positions beyond a radius that is known to be safe are
     tested, usually none. Cameras with equal intrinsics are tested once.

@@ -52,7 +52,7 @@ def read_taken(paths: Sequence[Path]) -> tuple[Taken, ...]:
     """Read how photographs were taken from the EXIF of their files; unknown for files without or with damaged EXIF.
 
     Args:
-        paths: image files, of which some may be missing.
+        paths: image files; some may be missing.
     """
     with ThreadPoolExecutor() as pool:
         return tuple(pool.map(_read_exif, paths))

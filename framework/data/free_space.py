@@ -31,7 +31,7 @@ MAX_SEEN_SHARE = 0.1
 
 @torch.no_grad()
 def clear_distances(cameras: Cameras, known: SparseDepth | None, near: float, far: float) -> Tensor:
-    """Return the distance (M,) from each camera that its image shows to be empty, as far as is known.
+    """Return the length (M,) of the space in front of each camera that is known to be empty.
 
     Args:
         cameras: M training cameras.

@@ -28,7 +28,7 @@ REDUCED = (1, 2, 4, 8)
 MAX_FILES = 200_000
 """Maximum number of files below a folder that are searched."""
 COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
-"""Beginnings of names of folders whose files accompany images under the same names, in lower case."""
+"""Beginnings of names of folders with files that accompany images under the same names, in lower case."""
 MAX_FOLDERS = 100
 """Maximum number of folders searched for one image."""
 MAX_NAMED = 3

@@ -18,7 +18,7 @@ from nerfloom.data.image_files import Content, unreadable
 T = TypeVar("T")
 
 ENDING = "_normal.png"
-"""End of a normal image's name, after that of its image without the suffix."""
+"""End of a normal image's name, after the name of its image without the suffix."""
 
 
 def normals_beside(images: Sequence[Path]) -> tuple[Path | None, ...] | None:
@@ -34,7 +34,7 @@ def read_normals(path: Path, width: int, height: int) -> Tensor:
     Each pixel takes the nearest value, because normals must not be interpolated across edges.
 
     Args:
-        path: an image whose red, green and blue are (normal + 1) / 2.
+        path: an image with (normal + 1) / 2 as red, green and blue.
         width, height: size of the image, pixels.
 
     Returns:

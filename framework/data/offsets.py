@@ -1,4 +1,4 @@
-"""Offsets of files whose coordinates are relative to a local origin, because float32 is too coarse for the input's.
+"""Offsets of files that store coordinates relative to a local origin, because float32 is too coarse for the input's.
 
 A file NAME of this kind has a file NAME.offset.json beside it, with `offset`, three numbers. A position in the file
 plus the offset is the position in the input's frame. A file without an offset is in the input's frame.

@@ -106,7 +106,7 @@ class ParsedScene:
 
 
 class DataParser(ABC):
-    """A data format. Subclasses are frozen dataclasses whose fields are the format's flags.
+    """A data format. Subclasses are frozen dataclasses with the format's flags as fields.
 
     A format that places a scene by all of its cameras should have the flag `placement: Path | None`: the
     dataparser_transforms.json of a run, to use that run's placement. A trained run passes its own placement if its

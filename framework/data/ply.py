@@ -61,8 +61,8 @@ class PlyHeader:
     """The header of a PLY file."""
 
     elements: dict[str, PlyElement]
-    """Elements by name, as far as their place in the file is known: up to the first with lists or, in ascii, the first
-    with rows."""
+    """Elements with a known place in the file, by name: all up to the first with lists or, in ascii, the first with
+    rows."""
     first: str
     """Name of the first element; empty if there is none."""
     comments: list[str]
@@ -70,7 +70,7 @@ class PlyHeader:
 
 
 def read_points(file: Path) -> Tensor:
-    """Read the vertices (K, 3) float64 of a PLY `file`; those that are not finite are left out, and counted.
+    """Read the vertices (K, 3) float64 of a PLY `file`; vertices that are not finite are left out, and counted.
 
     Raises:
         DataError: if the file cannot be read, is not a PLY file, lacks positions or is truncated.
@@ -181,7 +181,7 @@ def _count(words: list[str]) -> int:
 def _placed(
     file: Path, order: str, described: list[tuple[str, int, list[tuple[str, str]]]], start: int
 ) -> dict[str, PlyElement]:
-    """Return the elements, by name, for which the place in the file is known."""
+    """Return the elements with a known place in the file, by name."""
     elements: dict[str, PlyElement] = {}
     for name, count, columns in described:
         wrong = [column for column, kind in columns if not kind]

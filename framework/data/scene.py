@@ -57,7 +57,7 @@ class Scene:
     image_pixels: int | None = None
     """Mean number of pixels of a training image; None if unknown."""
     num_sparse_depths: int = 0
-    """Number of pixels of the images whose distance is known from a reconstruction's points."""
+    """Number of pixels with a known distance, from a reconstruction's points."""
     num_times: int = 0
     """Number of distinct times of the training images; 0 if they have none."""
     num_scenes: int = 1
@@ -72,7 +72,7 @@ class Scene:
         """Construct a scene from `facts` read from a file: the fields' values by name.
 
         Raises:
-            ValueError: if the values are not those of a scene.
+            ValueError: if the values do not describe a scene.
         """
         scene = checked(cls, facts)
         box, poses, count = scene.box, scene.camera_to_worlds, scene.num_cameras

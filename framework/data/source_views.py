@@ -16,7 +16,7 @@ def images_of(dataset: Dataset, scene: int | None) -> Tensor:
 
     Returns:
         The source images of the scene; all of its images if none is declared, and no images for an unknown scene.
-        Images whose pose is not finite are left out, because they would spoil everything rendered from them.
+        Images with a pose that is not finite are left out, because they would spoil everything rendered from them.
     """
     found = dataset.cameras.camera_to_worlds.isfinite().flatten(1).all(-1).cpu()
     if dataset.scene_indices is not None:
@@ -27,7 +27,7 @@ def images_of(dataset: Dataset, scene: int | None) -> Tensor:
 
 
 def other_images(dataset: Dataset, images: Tensor, pose: Tensor) -> Tensor:
-    """Return `images` (K,), on the CPU, without those of the given pose `pose` (3, 4) in `dataset`."""
+    """Return `images` (K,), on the CPU, without the images at `pose` (3, 4) in `dataset`."""
     same = (dataset.cameras.camera_to_worlds == pose).flatten(1).all(-1).cpu()
     return images[~same[images]]
 

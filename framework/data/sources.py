@@ -51,11 +51,11 @@ class Request:
 
 
 KEYPOINTS = 1 / 8
-"""Fraction of a batch's pixels drawn from those with a sparse depth."""
+"""Fraction of a batch that is drawn from the pixels with a sparse depth."""
 POINTS_UNTIL = 0.5
-"""Fraction of the budget during which they are drawn; afterwards colours alone determine the surfaces."""
+"""Duration of this drawing, as a fraction of the budget; afterwards colours alone determine the surfaces."""
 SCOUTED_ALONG = 24
-"""Number of tiles along an image's longer side with `--robust scout`, whose errors are those of a finished field."""
+"""Number of tiles along an image's longer side with `--robust scout`, which compares images with a finished field."""
 
 
 class BatchSource(ABC):
@@ -106,7 +106,7 @@ class PixelSource(BatchSource):
         dataset: the images. Pixels in a file are read ahead of the steps that use them.
         background: background of transparent pixels.
         seed: seed of the run.
-        keypoints: fraction of the pixels drawn from those with a sparse depth, if there are any.
+        keypoints: fraction of a batch that is drawn from the pixels with a sparse depth, if there are any.
         clear: (M,) distances from cameras that images show to be empty; None if they are not used.
         num_images: number of images that the pixels of a step come from; None for all.
         contradicted: tiles that do not count; None if all do.

@@ -39,7 +39,7 @@ def sparse_depth(sightings: Sightings, cameras: Cameras) -> SparseDepth:
     """Return the pixels where images see sparse points, from the points' projections, lens included.
 
     If a pixel shows several points, the one with the best-known distance is used. A point's distance along the ray of
-    its pixel's centre is that of the nearest position on the ray.
+    its pixel's centre is the distance of the nearest position on the ray.
 
     Args:
         sightings: points seen in the cameras' images; points outside an image or behind its camera are left out.

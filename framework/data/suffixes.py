@@ -5,7 +5,7 @@ from __future__ import annotations
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".jp2", ".jfif")
 """Suffixes of image files."""
 HEIF_SUFFIXES = (".heic", ".heif")
-"""Suffixes of images for which Pillow needs the package pillow-heif."""
+"""Suffixes of images that Pillow reads only with the package pillow-heif."""
 UNREAD_SUFFIXES = (
     ".jxl",
     ".gif",

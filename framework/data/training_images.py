@@ -27,7 +27,7 @@ def evenly_spread(total: int, count: int) -> list[int]:
 
 
 def chosen_images(parsed: ParsedScene, most: int | None, indices: Sequence[int]) -> ParsedScene:
-    """Return a scene with some of its images; all else, such as the placement, remains that of all images.
+    """Return a scene with some of its images; all else, such as the placement, still comes from all images.
 
     Args:
         parsed: the images of the training split, in the order of the data format.

@@ -42,7 +42,7 @@ class OpenLevels(nn.Module):
     Args:
         num_levels: number of levels.
         first: number of levels that are open at the start.
-        until: fraction of the training budget after which all levels are open.
+        until: fraction of the training budget until all levels are open.
     """
 
     opened: Tensor
@@ -71,16 +71,15 @@ class OpenLevels(nn.Module):
         return self._opened.of(self.opened) >= self.num_levels
 
     def completed(self, features: Tensor, width: int, last: int | None = None) -> Tensor:
-        """Pad the features of the open levels to those of all levels.
+        """Pad the features of the open levels with zeros to the width of all levels.
 
         Args:
-            features: (N, E) features, ending with those of the last open level.
+            features: (N, E) features, ending with the last open level.
             width: number of features of the complete encoding.
             last: number of features of the last open level; `width` over the number of levels if None.
 
         Returns:
-            (N, width) features. Those of the last open level are multiplied by its factor; those of closed levels are
-            0.
+            (N, width) features. The last open level is multiplied by its factor; closed levels are 0.
         """
         share = self._opened.of(self.opened) - (self.count - 1)
         if self.count and share < 1:

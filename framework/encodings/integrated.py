@@ -24,7 +24,7 @@ class IntegratedEncoding(nn.Module):
         num_frequencies: number L of frequencies.
         deviation: standard deviation assumed for points without a size, scene units.
         contracted: whether all of space is contracted into the ball of radius 2 around the box.
-        directions: (K, 3) unit directions along which waves run; the three axes if None.
+        directions: (K, 3) unit directions of the waves; the three axes if None.
     """
 
     box: Tensor

@@ -61,7 +61,7 @@ class MultisampledHashGrid(HashGrid):
 
 
 class _Decayed(torch.autograd.Function):
-    """Identity, whose gradient also includes that of half the sum of squares times a rate."""
+    """Identity; its gradient includes the gradient of half the sum of squares times a rate."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, rate: float) -> Tensor:

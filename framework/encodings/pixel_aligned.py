@@ -61,7 +61,7 @@ class SourceViews:
 
 
 class ImageEncoder(nn.Module):
-    """A small convolutional network from images to feature maps: a pyramid whose levels are concatenated.
+    """A small convolutional network from images to feature maps: a pyramid with concatenated levels.
 
     Each level has half the resolution of the one before. PixelNeRF (Yu et al. 2021), section 4.1, concatenates the
     levels of a ResNet pretrained on ImageNet; here each level has two convolutions, trained from scratch. Levels are

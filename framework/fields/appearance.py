@@ -26,10 +26,10 @@ class Appearance(nn.Module):
     Args:
         size: number D of features of a vector.
         count: number of images.
-        optimised: settings of the optimiser; those of the containing module if None.
+        optimised: settings of the optimiser; the containing module's if None.
         mean_share: probability that an image has the mean vector in a training step.
-        held_out: what held-out images are evaluated with: the mean vector, one that is fitted to the left half of each,
-            and judged on its right half, or that of the nearest training image.
+        held_out: vector of a held-out image in evaluation: the mean vector, the nearest training image's vector, or one
+            that is fitted to the image's left half and judged on its right half.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Appearance(nn.Module):
         return vector.new_zeros(())
 
     def of_any_view(self, vector: Tensor) -> Tensor:
-        """Return a vector (D,) without what depends on the position in an image; here `vector` itself."""
+        """Return a vector (D,) without any dependence on the position in an image; here `vector` itself."""
         return vector
 
     @contextmanager

@@ -75,7 +75,7 @@ class HasAlpha(Protocol):
 
 @runtime_checkable
 class HasGridDensity(Protocol):
-    """A field whose density may be a small network on a hash grid, which is traced in one call."""
+    """A field that one compiled call traces if its density is a small network on a hash grid."""
 
     def grid_density(self) -> GridDensity | None:
         """Return the density as `kernels.traced.trace` computes it; None to evaluate `Field.density` instead."""
@@ -83,7 +83,7 @@ class HasGridDensity(Protocol):
 
 @runtime_checkable
 class HasGridColor(HasGridDensity, Protocol):
-    """A field whose density and colour may be small networks on a hash grid, traced and learnt in one compiled call."""
+    """A field that one compiled call traces and trains if density and colour are small networks on a hash grid."""
 
     def grid_color(self) -> GridColor | None:
         """Return the colour for `nerfloom.kernels.traced.colors`; None to evaluate `Field.color` instead."""
@@ -134,7 +134,7 @@ class MLP(nn.Sequential):
         return mlp(inputs, weights, self.activation, biases)
 
     def density(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the density (N,), and the output (N, D_out), whose first feature is the log-density.
+        """Return the density (N,), and the output (N, D_out); its first feature is the log-density.
 
         The network must have no activation function at its output.
 

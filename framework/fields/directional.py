@@ -45,7 +45,7 @@ ENVIRONMENT_LEVELS = 0
 COARSEST, FINEST, LOG2_ENVIRONMENT = 8, 128, 15
 """Cells along an axis at the first and last level of that grid, and log2 of the number of entries of a level."""
 SMALLEST_ROUGHNESS = 1e-8
-"""Roughness below which `Environment` is as sharp as it can be."""
+"""Roughness with the sharpest possible `Environment`; lower roughness looks the same."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class PredictedNormalsConfig(TrainConfig):
     RANGES: ClassVar[dict[str, Range]] = {"normal_loss_mult": AT_LEAST_0, "orientation_loss_mult": AT_LEAST_0}
     """Allowed range of each numeric setting."""
     normal_loss_mult: float = 3e-3
-    """Weight of the difference between the predicted normals of reflected directions and those of the density."""
+    """Weight of the difference between predicted normals and the density's normals."""
     orientation_loss_mult: float = 0.1
     """Weight of the penalty on predicted normals that face away from the camera."""
 
@@ -108,7 +108,7 @@ class HasLight(Protocol):
 
 @runtime_checkable
 class HasDensityNormals(Protocol):
-    """A field that predicts normals, or may do so, and computes those of its density, which they should equal."""
+    """A field that computes the normals of its density, and may predict normals that should equal them."""
 
     def density_normals(self, points: Points) -> Tensor:
         """Return the outward unit normals (N, 3) of the density, with a gradient; 0 where its gradient is 0.
@@ -162,8 +162,8 @@ class Reflection(nn.Module):
 
     Args:
         network: from `num_inputs` features to specular light (N, 3) in [0, 1]. The features are the encoded reflected
-            direction, the cosine between normal and viewing direction, 1, those of the environment, the bottleneck, and
-            further ones.
+            direction, the cosine between normal and viewing direction, 1, features of the environment, the bottleneck,
+            and further ones.
         bottleneck: number B of features of the bottleneck.
         bands: number of bands of the directional encoding.
         environment: further features of the reflected direction; None for none.
@@ -179,7 +179,7 @@ class Reflection(nn.Module):
 
     @staticmethod
     def num_inputs(bottleneck: int, bands: int = MAX_BANDS) -> int:
-        """Return the number of features that the network takes, without those of the environment and further ones.
+        """Return the number of features that the network takes, without environment and further features.
 
         Args:
             bottleneck: number of features of the bottleneck.
@@ -195,7 +195,7 @@ class Reflection(nn.Module):
             width: features of a hidden layer.
             bottleneck: number of features of the bottleneck.
             bands: number of bands of the directional encoding.
-            more: number of further features of each point, such as those of an image's appearance.
+            more: number of further features of each point, such as an image's appearance.
 
         Raises:
             ConfigError: if the bottleneck has no feature.

@@ -30,7 +30,7 @@ from nerfloom.kernels.surfaces.signed_distance import SignedDistance, signed_dis
 from nerfloom.kernels.table_memory import require
 
 ROUNDING = 1e-3
-"""Radius within which the first ball is rounded off at its centre, in radii; a distance has no gradient there."""
+"""Radius of the rounding at the centre of the first ball, where a distance has no gradient; in radii of the ball."""
 FIRST_WEIGHTS = 1e-2
 """Size of the first weights of the distance's output; the field starts as a ball with a little noise."""
 SHARP = 100.0
@@ -40,7 +40,7 @@ FITTED, RIDGE = 2_048, 1e-4
 NUM_FEATURES, DEPTH = 15, 8
 """Number of features that the small network has for the colour, and of hidden layers of the large network."""
 AT_ONCE = 2**14
-"""Number of positions at once, without gradients of parameters, whose hidden layers are in memory together."""
+"""Number of positions evaluated at once without gradients of parameters: their hidden layers must fit into memory."""
 
 
 class Shape(NamedTuple):
@@ -95,7 +95,7 @@ class Distance(nn.Module, ABC):
     def samples(
         self, positions: Tensor, sharpness: Tensor, intervals: Intervals | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return what stops light at samples, and the inputs of their colour (`surface_samples`).
+        """Return the density or opacity of samples, and the inputs of their colour (`surface_samples`).
 
         Args:
             positions: (N, 3) scene coordinates of the samples.
@@ -128,7 +128,7 @@ class GridDistance(Distance):
         self.register_buffer("scale", 1 / edges, persistent=False)
         self.register_buffer("shift", -box[0] / edges, persistent=False)
         self.register_buffer("floor", torch.tensor(NO_FLOOR))
-        if grid.deferred is not None:  # gradients of this table are those of features and of their derivatives
+        if grid.deferred is not None:  # gradients of this table come from features and from their derivatives
             grid.deferred = TableGradient(LOOK_UP, grid.layout)
         self.grid, self.radius = grid, radius * self.size
         self.first = nn.Parameter(torch.empty(width, grid.num_features))
@@ -198,8 +198,8 @@ class GridDistance(Distance):
 class NetworkDistance(Distance):
     """The network of IDR (Yariv et al. 2020), NeuS and VolSDF: softplus, a skip connection, and a ball to start from.
 
-    The first weights are those of SAL (Atzmon and Lipman 2020), by which a network of endless width is the distance of
-    a ball. One of 256 features is off by a seventh of the radius, which differs from direction to direction. So the
+    The first weights follow SAL (Atzmon and Lipman 2020): a network of infinite width is then the distance to a ball.
+    One of 256 features is off by a seventh of the radius, which differs from direction to direction. So the
     weights of the output are then fitted to the ball by least squares. Halfway through the hidden layers, the encoded
     position is concatenated again.
 
@@ -270,7 +270,7 @@ class NetworkDistance(Distance):
 
     def _shape(self, positions: Tensor, learns: bool) -> Shape:
         """Return the shape at positions, with gradients of the parameters if the network `learns`."""
-        # Not in bfloat16, in which distances near the surface have no digits.
+        # Not in bfloat16, which has too few digits for distances near the surface.
         with torch.enable_grad(), torch.autocast(positions.device.type, enabled=False):
             places = (positions.to(self.output.weight.dtype) - self.centre) / self.size
             places = places if places.requires_grad else places.requires_grad_()

@@ -54,7 +54,7 @@ class IntegratedField(Field):
         encoding: encoding of points with their size.
         width: features of a hidden layer (256 in Mip-NeRF, 1024 in mip-NeRF 360).
         depth: hidden layers before density and features.
-        skip: number of hidden layers after which the encoding is concatenated again.
+        skip: number of hidden layers before the encoding is concatenated again.
         direction_frequencies: number of frequencies of the encoded directions.
     """
 

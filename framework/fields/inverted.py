@@ -10,7 +10,7 @@ from nerfloom.fields.encoded import EncodedField
 
 
 class InvertedField(EncodedField):
-    """A field whose positions are points (N, 4) of the inverted sphere: a direction of length 1, and 1/r.
+    """A field of points (N, 4) of the inverted sphere: a direction of length 1, and 1/r.
 
     The grid needs no fourth axis, because the points form a three-dimensional shell. They are mapped as by contraction
     (mip-NeRF 360, Barron et al. 2022, equation 10), to (2 - 1/r) times the direction, between the spheres of radius 1

@@ -21,7 +21,7 @@ class NeRFField(Field):
     Args:
         width: features of a hidden layer; the colour layer has half as many.
         depth: hidden layers before density and features.
-        skip: number of hidden layers after which the encoded position is concatenated again.
+        skip: number of hidden layers before the encoded position is concatenated again.
         position_frequencies: number L of frequencies of the encoded positions (10 in the paper).
         direction_frequencies: number L of frequencies of the encoded directions (4 in the paper).
         time_frequencies: number L of frequencies of the encoded times, a further input: T-NeRF (Pumarola et al. 2021,

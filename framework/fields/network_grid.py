@@ -92,9 +92,9 @@ def _initial(widths: tuple[int, ...]) -> Tensor:
 
 
 class NetworkGrid(Field):
-    """A field in which each cell of a grid has a small network of its own, which encodes positions in this cell.
+    """A field with one small network for each cell of a grid; each network encodes positions in its cell.
 
-    The viewing direction enters before the last hidden layer, so that the layers before it are those of the density.
+    The viewing direction enters before the last hidden layer, so that the layers before it compute the density.
 
     Args:
         box: (2, 3) corners of the box, scene units.

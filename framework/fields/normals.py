@@ -64,7 +64,7 @@ class NormalHead(nn.Module):
 
 
 def normal_difference(predicted: Tensor, normals: Tensor) -> Tensor:
-    """Return the difference (N,) of predicted normals from those of the density: Ref-NeRF, equation 10.
+    """Return the difference (N,) of predicted normals from the density's normals: Ref-NeRF, equation 10.
 
     Args:
         predicted: (N, 3) predicted unit normals.

@@ -15,7 +15,7 @@ from nerfloom.kernels.table_memory import require
 
 
 class ResidualBlock(nn.Module):
-    """Two layers whose output is added to their input; initially the identity.
+    """Two layers with a residual connection; initially the identity.
 
     Args:
         width: number of features.

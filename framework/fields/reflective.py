@@ -26,7 +26,7 @@ class SkippingNetwork(nn.Module):
         inputs: number of features of the input.
         width: features of a hidden layer.
         depth: number of hidden layers.
-        skip: number of hidden layers after which the input is concatenated again.
+        skip: number of hidden layers before the input is concatenated again.
         outputs: number of features of the output.
         activation: activation function of the output.
     """

@@ -14,11 +14,11 @@ from nerfloom.kernels.grids.multisamples import ball_deviations, frustum_balls, 
 
 
 class SizedGrid(BoxField):
-    """A field on a hash grid whose features are weighted by the size of points.
+    """A field on a hash grid that weights features by the size of points.
 
     Zip-NeRF (Barron et al. 2023), section 3.1. Unlike there, a frustum is looked up at its mean only, and its size is
-    that of the ball with the same volume. This is a mixin, constructed like the field class beside it; the encoding is
-    a `MultisampledHashGrid`.
+    the size of a ball with the same volume. This is a mixin, constructed like the field class beside it; the encoding
+    is a `MultisampledHashGrid`.
     """
 
     footprint: ClassVar[Footprint] = "frustum"

@@ -206,7 +206,7 @@ class SurfaceField(Field):
 
 
 class NeuSField(SurfaceField):
-    """A field whose intervals have the opacity of NeuS, equation 13; its sharpness is an `AnnealedSharpness`."""
+    """A field with the opacity of NeuS, equation 13, for intervals; its sharpness is an `AnnealedSharpness`."""
 
     sharpness: AnnealedSharpness
 

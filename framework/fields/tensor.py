@@ -27,7 +27,7 @@ code has -10. With that, thin structures do not appear within a minute: the grad
 
 
 class TensorField(Field):
-    """A field whose density is a sum of components (section 4.3).
+    """A field with a sum of components as density (section 4.3).
 
     Colour has its own components; a linear basis and a small network turn them into RGB.
 

@@ -74,7 +74,7 @@ class TransientHead(nn.Module):
 
     @contextmanager
     def shown(self, image: int) -> Iterator[None]:
-        """Give rays of no training image those of the training image `image`, within a `with` block."""
+        """Give rays of no training image the vectors of the training image `image`, within a `with` block."""
         self._shown, previous = image, self._shown
         try:
             yield

@@ -116,8 +116,8 @@ def contract_gaussians(means: Tensor, roots: Tensor) -> tuple[Tensor, Tensor]:
     """Contract Gaussians by the derivative of the contraction at their means: mip-NeRF 360, equations 8 and 9.
 
     The derivative at x outside the unit ball is 1 / |x|^2 along x, and (2 - 1 / |x|) / |x| across it. It acts on roots
-    of covariances rather than on covariances: so no variance can become negative, and far Gaussians, whose variances
-    differ by 20 orders of magnitude, keep their precision.
+    of covariances rather than on covariances. So no variance can become negative, and far Gaussians keep their
+    precision, although their variances differ by 20 orders of magnitude.
 
     Args:
         means: (N, 3) means.

@@ -55,7 +55,7 @@ def find_floor(
         max_tilt: maximum angle between `up` and the floor's normal, degrees.
         tolerance: maximum distance of the floor's points from it; None for 1 % of the points' spread.
         seed: seed of the random planes.
-        above: (M, 3) positions above the floor, such as those of cameras; None for none.
+        above: (M, 3) positions above the floor, such as the cameras; None for none.
     """
     if len(points) < 3:
         return None

@@ -10,9 +10,9 @@ for fisheye, it is the angle to the optical axis times the unit vector from the 
     N = 1 + k1 q + k2 q^2 + k3 q^3 + k7 q^4,  D = 1 + k4 q + k5 q^2 + k6 q^3
 
 (OpenCV's rational model; Kannala and Brandt 2006). The map is the gradient of a scalar function, so its Jacobian is
-symmetric; on a disk where the Jacobian is positive definite, the map is one to one. The largest such disk, whose radius
-is the lens's `reach`, is the domain where each position has one ray, and a Newton iteration that stays in it cannot
-find a wrong root. Beyond the reach, polynomials fitted to a lens are meaningless: they fold the image over.
+symmetric; on a disk where the Jacobian is positive definite, the map is one to one. The lens's `reach` is the radius of
+the largest such disk. Each position in this disk has one ray, and a Newton iteration that stays in the disk cannot find
+a wrong root. Beyond the reach, polynomials fitted to a lens are meaningless: they fold the image over.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def undistort(u: Tensor, v: Tensor, lenses: Distortion) -> tuple[Tensor, Tensor,
 
 
 def iterations_needed(u: Tensor, v: Tensor, lenses: Distortion) -> int:
-    """Return the iterations after which `undistort` finds no more positions `u, v` (R,) of R `lenses`, plus one."""
+    """Return the iterations that `undistort` needs for positions `u, v` (R,) of R `lenses`, plus one."""
     found = undistort(u, v, lenses)[2]
     for count in range(1, MAX_ITERATIONS):
         if bool((undistort(u, v, replace(lenses, iterations=count))[2] | ~found).all()):

@@ -1,7 +1,7 @@
 """Values within limits, with a slope of 1 up to the limits themselves.
 
-torch's own clamp has that slope at a limit up to version 2.13, and 0 from 2.14 on. That matters where values lie on a
-limit: positions on the faces of a box, and vectors along an axis, whose scaled length is 1.
+torch's own clamp has that slope at a limit up to version 2.13, and 0 from 2.14 on. The slope matters for values on a
+limit: positions on the faces of a box, and vectors along an axis, which have the scaled length 1.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ class Pattern(NamedTuple):
 def hashed_pattern(frustums: Frustums) -> Pattern:
     """Return pseudo-random rotations for training; half of the patterns are mirrored.
 
-    They are a hash of both ends of a frustum, which are random themselves, so that those of the same frustum are the
-    same again: what a march has evaluated in waves need not be evaluated another time (`kernels.result_cache`).
+    The rotation is a hash of both ends of a frustum, which are random themselves. Equal frustums have equal rotations,
+    so values that a march has computed in waves are not computed again (`kernels.result_cache`).
 
     Args:
         frustums: N frustums.

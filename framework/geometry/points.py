@@ -181,7 +181,7 @@ def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[T
 
 
 def frames(axes: Tensor) -> Tensor:
-    """Return rotations (N, 3, 3) whose first columns are `axes` (N, 3), unit vectors.
+    """Return rotations (N, 3, 3) with the unit vectors `axes` (N, 3) as their first columns.
 
     Duff et al. 2017, "Building an orthonormal basis, revisited": the other columns are exact to rounding for all axes,
     without square roots.

@@ -131,7 +131,7 @@ class Samples:
     early_stop: float = 0.0
     """Transmittance below which rays were ended: the maximum error of a colour channel. 0 if none were."""
     coarse: CoarseLevel | None = None
-    """The coarse level from whose weights the samples were drawn, if it is rendered too."""
+    """The coarse level, if it is rendered too; the samples were drawn from its weights."""
     edges: Tensor | None = None
     """(R, S + 1) ends of the intervals in normalised distance, from samplers that use it."""
     proposals: tuple[Histogram, ...] = ()

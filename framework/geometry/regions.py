@@ -51,7 +51,7 @@ class Box:
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise ConfigError(
-                f"the box from {self.low} to {self.high} is empty: each of low must be below that of high"
+                f"the box from {self.low} to {self.high} is empty: each value of low must be below the value of high"
             )
         for row, first in enumerate(self.axes):
             for column, second in enumerate(self.axes):
@@ -195,7 +195,7 @@ def inside_all(points: Tensor, regions: Sequence[Region]) -> Tensor:
 
 
 def bounds_of_all(regions: Sequence[Region]) -> tuple[Vector, Vector]:
-    """Return the minimum and the maximum corner of a box that holds what is in all of some regions.
+    """Return the minimum and the maximum corner of a box around the intersection of some regions.
 
     Args:
         regions: at least one.

@@ -6,9 +6,9 @@ the centre, d its unit direction and s = 1/r, the ray's point beyond m at distan
 
     (x', y', z') = s m + sqrt(1 - s^2 |m|^2) d
 
-The paper instead rotates the point where the ray leaves the unit sphere by the angle asin |m| - asin (s |m|). That
-is the same point, but the rotation has no axis if the ray passes through the centre. The formula here has no division,
-and at s = 0 it gives the direction of the ray.
+The paper instead rotates the point where the ray leaves the unit sphere by the angle asin |m| - asin (s |m|). The
+result is the same point, but the rotation has no axis if the ray passes through the centre. The formula here has no
+division, and at s = 0 it gives the direction of the ray.
 
 A sphere is a tensor (4,): its centre and its radius, scene units.
 """

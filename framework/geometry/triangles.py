@@ -36,7 +36,7 @@ def draw_on_triangles(corners: Tensor, count: int, seed: int = 0) -> tuple[Tenso
     random = torch.rand(3, count, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     places = (torch.arange(count) + random[0]) / count * ends[-1]
     faces = torch.searchsorted(ends, places, right=True).clamp(max=len(ends) - 1)
-    # A square root makes the distance from the first corner as frequent as the triangle is wide there.
+    # The square root makes the density of distances from the first corner proportional to the triangle's width there.
     away = random[1].sqrt()
     return faces, torch.stack([1 - away, away * (1 - random[2]), away * random[2]], dim=-1)
 

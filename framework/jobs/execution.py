@@ -54,7 +54,7 @@ def execute(
         while process.poll() is None and not stopped.wait(LOOK_EVERY):
             look()
     finally:
-        with suppress(BrokenPipeError):  # closing writes again what could not be written
+        with suppress(BrokenPipeError):  # closing writes the buffered rest again
             process.stdin.close()
         process.wait()
     said = process.stdout.read().decode(errors="replace").strip()

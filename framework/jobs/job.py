@@ -44,11 +44,11 @@ class Job:
 
     Args:
         title: name of the job in messages.
-        description: what it does, such as its budget, for the message at its start.
+        description: a short description, such as the budget, for the message at its start.
         steps: the commands.
         log: file for the output of the commands.
         finished: returns whether the job's files are complete; called where the jobs are launched.
-        resources: what the job needs of a machine.
+        resources: cores and GPUs that the job needs.
     """
 
     title: str
@@ -59,7 +59,7 @@ class Job:
     resources: Resources = Resources()
 
     def as_plain(self) -> dict[str, Any]:
-        """Return what another process needs to run the job, as plain data."""
+        """Return the job as plain data, from which another process can run it."""
         steps = [
             {
                 "command": list(step.command),

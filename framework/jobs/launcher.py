@@ -23,14 +23,14 @@ class Launcher(ABC):
     @property
     @abstractmethod
     def sharing(self) -> str | None:
-        """A sentence for reports on what else a job's machine did; None if jobs ran one after the other."""
+        """A sentence for reports on other work on a job's machine; None if jobs ran one after the other."""
 
     @abstractmethod
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
         """Run every unfinished job; failures are reported, and the other jobs continue.
 
         Args:
-            jobs: the jobs, in the order in which they start.
+            jobs: the jobs, in the order of their starts.
             on_finished: called in this thread with each job that is finished, at once.
 
         Returns:

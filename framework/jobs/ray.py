@@ -76,7 +76,7 @@ def _cluster(address: str | None) -> Iterator[Any]:
 
     from nerfloom.base.device import num_cores
 
-    # This process tells what happens; workers write files.
+    # This process prints all messages; workers write files.
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options |= {"num_cpus": num_cores(), "include_dashboard": False}

@@ -29,7 +29,7 @@ def normals_of_distances(distances: Tensor, directions: Tensor) -> Tensor:
 def normal_error(
     normals: Tensor, distances: Tensor, transmittance: Tensor, directions: Tensor, kept: Tensor | None = None
 ) -> Tensor:
-    """Return the mean error () of rendered normals against those of the rendered surface; 0 if no pixel counts.
+    """Return the mean error () of rendered normals against the rendered surface's normals; 0 if no pixel counts.
 
     The error of a pixel is sum_i w_i (1 - n_i . N). w_i and n_i are the weights and normals of the Gaussians in it, and
     N is the normal of the surface at the mean distances. A pixel counts if it and its four neighbours are kept and at

@@ -14,7 +14,7 @@ from nerfloom.base.decisions import Choice, Decision, fill
 from nerfloom.data.scene import Scene
 
 MAX_FEW, MAX_FEW_WITH_ALPHA = 12, 8
-"""Maximum number of training images that counts as few: in captures, and in images whose alpha marks empty space."""
+"""Maximum number of training images that counts as few: in captures, and in images with empty space marked by alpha."""
 OCCLUSION = 0.01
 """Weight of the optical depth near cameras, as in FreeNeRF's settings."""
 

@@ -109,7 +109,7 @@ def depth_error(weights: Tensor, samples: Samples, known: Tensor) -> Tensor:
 
 
 def matter_before(weights: Tensor, samples: Samples, clear: Tensor) -> Tensor:
-    """Return the mean optical depth () up to distances before which rays should be empty; 0 without rays.
+    """Return the mean optical depth () before the distances `clear`, where rays should be empty; 0 without rays.
 
     A ray's term is -log((1 - B + e) / (1 + e)): B is the fraction of light stopped before that distance, e is
     `WRONG_SHARE`. This is the optical depth with an upper bound, so that a wall seen in all images remains.
@@ -183,6 +183,6 @@ def density_before(samples: Samples, distance: float) -> Tensor:
         ValueError: if the samples have no density.
     """
     if samples.sigma is None:
-        raise ValueError("density_before() needs samples whose density is attached")
+        raise ValueError("density_before() needs samples with a density")
     lengths = (samples.t_ends.clamp(max=distance) - samples.t_starts).clamp(min=0)
     return (samples.sigma * lengths).sum() / max(samples.num_rays, 1)

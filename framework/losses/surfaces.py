@@ -31,8 +31,8 @@ TRIED = 1024
 BEHIND = 0.03
 """Thickness of space behind points of a reconstruction that counts as solid, in halves of the box's shortest edge."""
 ABSOLUTE = 0.1
-"""Factor of the absolute error of colours. That error is about ten times the squared error, so the weights of the other
-terms suit both."""
+"""Factor of the absolute error of colours. The absolute error is about ten times the squared error, so the weights of
+the other terms suit both."""
 
 
 class SurfaceColorError(ColorError):

@@ -170,4 +170,4 @@ class MatterNearCameras(LossTerm):
 
 
 FEW_IMAGES = (MatterNearCameras(),)
-"""Terms of methods whose settings include `FewImagesConfig`."""
+"""Terms of methods with settings that include `FewImagesConfig`."""

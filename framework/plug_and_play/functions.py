@@ -51,7 +51,7 @@ def as_density(sigma_fn: SigmaFunction) -> DensityFunction:
         sigma_fn: a `SigmaFunction`.
 
     Returns:
-        A function whose density is float64 if that of `sigma_fn` is, and float32 otherwise. It raises ValueError if
+        A function that returns float64 densities if `sigma_fn` does, and float32 otherwise. It raises ValueError if
         `sigma_fn` returns a shape other than (N,).
     """
 

@@ -118,7 +118,7 @@ def sample(
     bound, because a cell is classified by its density at a few positions.
 
     Args:
-        rays: R rays; without near and far ends, those of the grid's box are used. Samples have no gradient for rays.
+        rays: R rays; without near and far ends, the grid's box sets them. Samples have no gradient for rays.
         sigma_fn: density (positions (N, 3)) -> sigma (N,), or (positions, times (N,)) -> sigma (N,) for a moving scene.
             It is called without gradient, only to find the end of each ray. None for no early stop.
         grid: the occupied cells.

@@ -88,7 +88,7 @@ class SphereRenderer(Renderer):
             rays: the rays themselves.
             inside: the inside before a black background.
             background: (R, 3) or (3,) colour in [0, 1] behind everything.
-            chances: (R,) probabilities with which these rays were chosen; None for 1.
+            chances: (R,) probabilities of the choice of these rays; None for 1.
         """
         inverted = InvertedRays.of(rays, self.sphere)
         outside = self.behind.render(inverted, self._sampled(inverted), self.field, background)
@@ -98,7 +98,7 @@ class SphereRenderer(Renderer):
 
     @torch.no_grad()
     def _going_on(self, inside: Rendered) -> tuple[Tensor, Tensor | None] | None:
-        """Return the rays (K,) whose outside is shown, and their probabilities (K,) in training; None for all rays."""
+        """Return the rays (K,) that show the outside, and their probabilities (K,) in training; None for all rays."""
         bound, left = inside.error_bound, 1 - inside.accumulation
         if bound <= 0 or inside.coarse is not None:
             return None
@@ -111,7 +111,7 @@ class SphereRenderer(Renderer):
         return some, chances[some]
 
     def _sampled(self, rays: InvertedRays) -> Samples:
-        """Return samples of inverted rays; those of rays that end before the sphere are transparent."""
+        """Return samples of inverted rays; they are transparent on rays that end before the sphere."""
         samples = self.sampler.sample(rays, self.field, self.training)
         ends = torch.where(rays.fars > rays.nears, LAST_INTERVAL, rays.nears) if self.endless else rays.fars
         if samples.coarse is not None:
@@ -120,7 +120,7 @@ class SphereRenderer(Renderer):
 
 
 def _of_rays(inside: Rendered, some: Tensor) -> Rendered:
-    """Return the values of `some` (K,) of the rays, without further values; samples and weights are those of all."""
+    """Return the values of `some` (K,) of the rays, without further values; samples and weights of all rays stay."""
     parts = (inside.rgb, inside.depth, inside.median_depth, inside.accumulation)
     rgb, depth, median, opacity = (values.index_select(0, some) for values in parts)
     return replace(inside, rgb=rgb, depth=depth, median_depth=median, accumulation=opacity, extras={})
@@ -129,12 +129,12 @@ def _of_rays(inside: Rendered, some: Tensor) -> Rendered:
 def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Tensor], Tensor]) -> Rendered:
     """Composite R rays: the inside in front of the outside.
 
-    Samples, weights and further values are those of the inside.
+    Samples, weights and further values describe the inside.
 
     Args:
         inside: the inside before a black background.
         outside: the outside before the background, with the same number of samples on each ray.
-        distances: function from positions (R,) on the rays of `outside`, one each, to distances along those of
+        distances: function from positions (R,) on the rays of `outside`, one each, to distances along the rays of
             `inside`.
     """
     left = 1 - inside.accumulation
@@ -187,7 +187,7 @@ def background_renderer(
     Args:
         scene: properties of the whole scene, not of its foreground.
         make_field: creates a field for the outside, from settings and scene.
-        renderer: renders the inside; if None, that of `volume_renderer`.
+        renderer: renders the inside; if None, `volume_renderer`'s.
     """
     renderer = renderer or volume_renderer(config, scene)
     if config.background_model != "sphere":

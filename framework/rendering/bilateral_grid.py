@@ -1,7 +1,7 @@
 """Bilateral grids of affine functions of colours, which vary smoothly with position and brightness.
 
 Wang, Wang, Gong and Xue, "Bilateral Guided Radiance Field Processing", SIGGRAPH 2024 (arXiv:2406.00448), section 3; the
-grid is that of Chen, Paris and Durand 2007. An affine function is interpolated trilinearly at the pixel's position and
+grid is from Chen, Paris and Durand 2007. An affine function is interpolated trilinearly at the pixel's position and
 at the luminance of its colour. A penalty on the grid's total variation makes it smooth.
 """
 
@@ -93,6 +93,6 @@ def _centers(count: int, like: Tensor) -> Tensor:
 
 
 def _hats(positions: Tensor, count: int) -> Tensor:
-    """Return the weights (..., count) of all vertices at positions (...) in [0, 1], of which at most two are not 0."""
+    """Return the weights (..., count) of all vertices at positions (...) in [0, 1]; at most two are not 0."""
     vertices = torch.arange(count, dtype=positions.dtype, device=positions.device)
     return (1 - (positions.clamp(0, 1)[..., None] * (count - 1) - vertices).abs()).clamp(min=0)

@@ -1,4 +1,4 @@
-"""The light of images: functions that map the scene's rendered colours to what each image shows of them.
+"""The light of images: functions from the scene's rendered colours to the colours of each image.
 
 A function has parameters for each image, in a row of an `Appearance`, and a row of zeros changes nothing. It maps
 colours of surfaces, before they are composited over the background, so the background keeps its own colour.
@@ -28,10 +28,10 @@ GRID = (4, 8, 8)
 """Vertices of a bilateral grid: levels of luminance, rows and columns. Wang et al. 2024 have 8, 16 and 16; smaller
 grids learn from fewer pixels."""
 STOPS = 3.0
-"""Stops per unit of an exposure's parameter. A step of Adam then changes mid grey about as much as in affine
+"""Stops per unit of an exposure's parameter. A step of Adam then changes mid grey by a similar amount as in affine
 functions."""
 PULL = 1e-2
-"""Weight of the mean squared distance of parameters from those that change nothing, beside an absolute error."""
+"""Weight of the mean squared distance of parameters from the identity's, beside an absolute error."""
 SMOOTHNESS = 2.0
 """Weight of the total variation of bilateral grids. In Wang et al. 2024 it is 10, and neighbours are half as far apart,
 so that differences between them are half as large."""
@@ -39,9 +39,9 @@ SQUARED = 0.1
 """Factor of the penalty beside a squared error of colours, which is smaller than an absolute one."""
 FITTED = 0.01
 """Factor of the penalty beside a squared error in fits of one image. It is smaller than `SQUARED`, since the image's
-light may be far from that of the others: it decides what the image's pixels leave open."""
+light may be far from the others': it only decides where the image's pixels do not."""
 LEAST_OPACITY = 1e-3
-"""Opacity below which a colour is not divided by it."""
+"""Minimum opacity; a colour with less is not divided by its opacity."""
 
 
 def without_background(rgb: Tensor, opacity: Tensor, background: Tensor) -> Tensor:
@@ -122,7 +122,7 @@ class Light(Appearance, ABC):
         """
 
     def away(self) -> Tensor:
-        """Return the distance of each image's own parameters (M, D) from those that are expected: zeros here."""
+        """Return the distance of each image's own parameters (M, D) from the expected ones: zeros here."""
         return self.vectors
 
     def penalty(self) -> Tensor:
@@ -160,7 +160,7 @@ class AffineLight(Light):
 class ToneLight(Light):
     """Exposure and white balance of each image, and a tone curve of each camera (`rendering.tone`).
 
-    Exposures start from those that the images' files state. A vector holds exposure, white balance of red and of blue,
+    Exposures start from the values in the images' files. A vector holds exposure, white balance of red and of blue,
     in units of `STOPS`, and the logarithms of the curve's slopes.
 
     Args:

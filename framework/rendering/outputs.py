@@ -26,7 +26,7 @@ class Output:
     label: str = ""
     """Caption of its picture; the name if empty."""
     of_training: bool = False
-    """Whether it shows something of training images alone (`View.image`), such as what only one of them contains."""
+    """Whether it exists for training images alone (`View.image`), such as content that only one of them has."""
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -72,7 +72,7 @@ class Rendered:
 
         Args:
             rays_per_pixel: number of consecutive rays that form a pixel.
-            outputs: further outputs of the pixels; those that the rays lack are left out.
+            outputs: further outputs of the pixels; any that the rays lack are left out.
 
         Returns:
             R / rays_per_pixel pixels.

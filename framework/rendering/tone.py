@@ -6,7 +6,7 @@ Image i of camera k stores the scene's colour c, which is a display colour as we
 
 with the transfer function of sRGB, `encode`, and its inverse, `decode`. The exposure e_i is in stops, and white balance
 adds to it for red and blue. The curve g_k is monotone. This is the model of Debevec and Malik, "Recovering High Dynamic
-Range Radiance Maps from Photographs", SIGGRAPH 1997, equation 1, with a curve relative to that of sRGB.
+Range Radiance Maps from Photographs", SIGGRAPH 1997, equation 1, with a curve relative to sRGB's.
 """
 
 from __future__ import annotations

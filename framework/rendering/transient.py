@@ -1,4 +1,4 @@
-"""Volume rendering of a field and of what is transient: NeRF in the Wild (Martin-Brualla et al. 2021), section 4.2."""
+"""Volume rendering of a static and a transient field: NeRF in the Wild (Martin-Brualla et al. 2021), section 4.2."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TransientRenderer(VolumeRenderer):
     In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
     constant densities. The paper's equation 8 adds their opacities instead, which is the same for thin intervals.
 
-    Depth, opacity and weights are those of the static part. The uncertainty is composited by the transient density
+    Depth, opacity and weights describe the static part. The uncertainty is composited by the transient density
     alone (equation 11), so that it does not change the static part.
 
     Args:

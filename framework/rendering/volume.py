@@ -86,7 +86,7 @@ def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
 
 
 def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
-    """Return `samples` of `rays` with what `field` has there: density or alpha, and features; done ones unchanged."""
+    """Return `samples` of `rays` with density or alpha, and features, of `field`; evaluated samples are unchanged."""
     if samples.features is not None and (samples.sigma is not None or samples.alpha is not None):
         return samples
     points = sample_points(rays, samples, field.footprint)
@@ -114,7 +114,7 @@ def sample_values(
     """
     stopping = samples.sigma if samples.alpha is None else samples.alpha
     if stopping is None or samples.features is None:
-        raise ValueError("rendering needs samples whose density and features are attached")
+        raise ValueError("rendering needs samples with density and features")
     owners = samples.ray_indices
     cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
     rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)

@@ -36,7 +36,7 @@ class BackgroundConfig(SamplingConfig):
     the method's default if the scene may extend beyond the box, otherwise none."""
     sphere_around: Literal["cameras", "object"] = "cameras"
     """Sphere between inside and outside. cameras: around the box's centre and all cameras. object: around the point
-    that the cameras look at, as far as the nearest camera; what is between a camera and the sphere is not shown."""
+    that the cameras look at, up to the nearest camera; the space between a camera and the sphere is not shown."""
     num_background_samples: int = 32
     """Samples per ray outside the sphere, uniform in inverse distance (sphere). With --sampler hierarchical, the
     outside gets the same numbers of samples as the inside."""
@@ -54,7 +54,7 @@ def decide_background(
         config: the method's settings; the background and the sampler are filled in if they are open.
         suits: the method's default background if the scene may extend beyond the box. Contraction is not used with
             hierarchical sampling, which samples rays in uncontracted space.
-        bounded: the sampler for bounded scenes; if None, that of `sampler_choice`.
+        bounded: the sampler for bounded scenes; if None, the sampler of `sampler_choice`.
 
     Returns:
         The settings, and the decisions made.

@@ -51,7 +51,7 @@ class Sampler(nn.Module, ABC):
         """
 
     def step_kind(self, step: int) -> StepKind:
-        """Return the kind of training step `step`: what sampling computes besides values of tensors."""
+        """Return the kind of training step `step`: steps of one kind differ only in the values of tensors."""
         return StepKind(varies="the number of samples on a ray varies")
 
     def read_counts(self) -> None:

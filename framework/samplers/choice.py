@@ -33,7 +33,7 @@ MAX_PROPOSALS = 8
 """Maximum number of proposals."""
 COARSEST_MOVING, MOVING_FEATURES = 64, 8
 """Spatial vertices per axis of the first proposal of a moving scene (each further proposal has twice as many), and
-features per vertex. The values are those of K-Planes, whose proposals are planes in space and time."""
+features per vertex. The values are K-Planes', which has planes in space and time as proposals."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class SamplingConfig(RayConfig):
     silhouette_cells: bool = True
     """Never sample cells of the occupancy grid that an image's alpha channel shows to be empty (occupancy)."""
     silhouette_pixels: bool = True
-    """Never draw pixels whose ray passes only through such empty cells (occupancy)."""
+    """Never draw pixels if their ray passes only through such empty cells (occupancy)."""
     grid_resolution: int = 128
     """Cells along each axis of the occupancy grid (occupancy, in a box)."""
     nested_resolution: int = 64
@@ -177,7 +177,7 @@ def batch_choice(config: SamplingConfig, fewest: int, most: int, until: float) -
         config: the method's settings, with the sampler decided; training time and machine are used.
         fewest: samples for short times.
         most: maximum number of samples, also used without a time limit.
-        until: time in seconds on two threads beyond which the samples grow with time.
+        until: time in seconds on two threads; in a longer training, samples grow with time.
     """
     seconds = _seconds(config) if config.sampler == "occupancy" else math.inf
     count = most if seconds == math.inf else min(1024 * round(fewest / 1024 * max(seconds / until, 1.0)), most)
@@ -193,7 +193,7 @@ def _seconds(config: SamplingConfig) -> float:
 
 
 def contracted_box(config: SamplingConfig, scene: Scene) -> Tensor | None:
-    """Return the box (2, 3) around which a method's field contracts all of space; None without contraction."""
+    """Return the box (2, 3) of a method's field that contracts all of space around it; None without contraction."""
     return scene.box if scene.unbounded and config.sampler in ("occupancy", "proposal") else None
 
 

@@ -73,7 +73,7 @@ def bounded_opacity(t: Tensor, distances: Tensor, beta: Tensor) -> Bounded:
         t: (R, S) sorted distances along the rays, scene units.
         distances: (R, S) signed distances there. The bound holds if none of them exceeds the true distance to a
             surface.
-        beta: (R, 1) or () mean distance over which the density falls, scene units.
+        beta: (R, 1) or () scale of the Laplace distribution, scene units.
     """
     lengths = t.diff(dim=-1)
     depth = (laplace_density(distances, beta)[:, :-1] * lengths).cumsum(-1)

@@ -1,4 +1,4 @@
-"""Samples that carry gradients to rays, of a sampler whose own carry none."""
+"""Samples with gradients to rays, from a sampler without such gradients."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from nerfloom.samplers.wrapping import WrappingSampler
 class EvaluatedAgain(WrappingSampler):
     """Samples of another sampler; if rays require a gradient, the renderer evaluates the field at them once more.
 
-    The distances of samples along their rays have no gradient, as with all samplers. Their positions have that of the
-    rays, and so have density or opacity, and colour.
+    The distances of samples along their rays have no gradient, as with all samplers. Their positions, densities or
+    opacities, and colours have the gradient of the rays.
 
     Args:
         sampler: chooses the samples.

@@ -1,4 +1,4 @@
-"""Pixels of a view through which an occupancy grid is visible; all others show only the background."""
+"""Pixels of a view that may show an occupied cell; all others show only the background."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 
 MIN_PIXELS = 2**14
-"""Minimum number of pixels of a view; for smaller views the search takes as long as tracing all rays."""
+"""Minimum number of pixels of a view; for smaller views the search saves no time over tracing all rays."""
 
 
 def pixels_in_view(sampler: Sampler, view: View) -> Tensor | None:
-    """Return the pixels of a view whose rays may meet an occupied cell, with a margin around them.
+    """Return the pixels of a view with rays that may meet an occupied cell, with a margin around them.
 
     Args:
         view: the view, on the sampler's device.

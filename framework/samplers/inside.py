@@ -58,7 +58,7 @@ def inside_foreground(config: BackgroundConfig, scene: Scene, sampler: Sampler) 
 
 
 def clipped(samples: Samples, nears: Tensor, fars: Tensor) -> Samples:
-    """Return samples whose intervals lie between two distances.
+    """Return samples with intervals between two distances.
 
     Samplers may make the last interval of a ray endless, or march from slightly before the near end to slightly beyond.
 

@@ -1,6 +1,6 @@
 """Sampling with an occupancy grid, which skips empty space, in waves, which skip hidden space.
 
-The grid is that of Instant-NGP (Mueller et al. 2022, appendix E.2). It holds a decaying maximum of the density in each
+The grid follows Instant-NGP (Mueller et al. 2022, appendix E.2). It holds a decaying maximum of the density in each
 cell; a cell is skipped while a step through it is nearly transparent. An unbounded scene has several nested boxes, each
 twice as large as the one before, and steps grow with distance. One last sample, long enough to be opaque, covers all
 space behind the largest box. The grid of a moving scene in one box may have slices of time, so that a ray skips cells
@@ -146,7 +146,7 @@ class OccupancySampler(Sampler):
 
     @property
     def occupied_share(self) -> float:
-        """Fraction of occupied cells among those that no smaller box covers."""
+        """Fraction of occupied cells among the cells that no smaller box covers."""
         return int(self.occupied.sum()) / (self.slices * int(own_cells(self.levels, self.resolution).sum()))
 
     @property
@@ -194,7 +194,7 @@ class OccupancySampler(Sampler):
     def sample(self, rays: Rays, field: Field, jitter: bool, early_stop: float | None = None) -> Samples:
         """Return samples in occupied cells, up to the early stop, with densities and features attached.
 
-        In an endless grid, a ray whose light reaches beyond the largest box gets one more sample. The dropped samples
+        In an endless grid, a ray gets one more sample if its light reaches beyond the largest box. The dropped samples
         change a colour channel by at most the threshold of the early stop.
 
         Args:

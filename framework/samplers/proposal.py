@@ -1,7 +1,7 @@
 """Sampling with proposals, which are small density fields: mip-NeRF 360 (Barron et al. 2022), section 3.
 
 Proposals are cheap to evaluate in many intervals of a ray. Intervals of the next level are drawn from their weights.
-The proposals are trained so that their weights bound those of the last level from above (`interlevel_loss`).
+The proposals are trained so that their weights bound the last level's weights from above (`interlevel_loss`).
 
 Intervals are drawn in normalised distance s in [0, 1], from the near to the far end of a ray. In a bounded scene s is
 linear in the distance. In an unbounded scene it is linear up to half the edge of the box and linear in disparity
@@ -226,7 +226,7 @@ def half_edge(box: Tensor) -> float:
 
 
 def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = ()) -> Tensor:
-    """Return the loss () of the proposals, whose weights should bound those of the last level from above.
+    """Return the loss () of the proposals; their weights should bound the last level's weights from above.
 
     mip-NeRF 360, equation 13, or Zip-NeRF's anti-aliased loss: the mean over rays, summed over proposals. It is 0 if
     the proposals are not learning.
@@ -234,7 +234,7 @@ def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = 
     Args:
         samples: N samples of a `ProposalSampler`.
         weights: (N,) rendering weights of the samples; without a gradient.
-        blurs: radius of the box for each proposal, for the anti-aliased loss; empty for that of mip-NeRF 360.
+        blurs: radius of the box for each proposal, for the anti-aliased loss; empty for the loss of mip-NeRF 360.
     """
     if samples.edges is None or not samples.proposals or samples.num_rays == 0:
         return weights.new_zeros(())

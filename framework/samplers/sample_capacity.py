@@ -58,7 +58,7 @@ class SampleCapacity:
         return Sizes(runs, candidates, kept if usual is None else min(kept, MAX_KEPT * max(usual, SLOTS_MULTIPLE)))
 
     def note(self, rays: int, needed: tuple[Tensor, Tensor, Tensor], left_out: Tensor) -> None:
-        """Record on the device what a step of `rays` `needed` (runs, candidates, samples) and `left_out`.
+        """Record on the device the numbers that a step of `rays` `needed` (runs, candidates, samples) and `left_out`.
 
         All numbers are () tensors but `rays`; nothing waits for them.
         """

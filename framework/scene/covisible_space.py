@@ -1,7 +1,7 @@
 """Space that several training images show. Rays start there.
 
 The content of a single image could be at any distance. Matter that only one camera sees, mostly right before it, is
-usually wrong, and hides what lies behind it from other viewpoints. (Instant-NGP, Mueller et al. 2022, skips space that
+usually wrong, and hides the scene behind it from other viewpoints. (Instant-NGP, Mueller et al. 2022, skips space that
 no camera sees: `mark_untrained_density_grid` of the authors' code.)
 """
 

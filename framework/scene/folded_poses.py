@@ -58,13 +58,13 @@ def folded_neighbours(names: Sequence[str], directions: np.ndarray, thumbnails: 
     """Return the pairs of neighbours that look alike although their cameras look in very different directions.
 
     Args:
-        names: M file names; their order (`in_order`) is that of the sequence.
+        names: M file names; their order (`in_order`) is the sequence's.
         directions: (M, 3) unit viewing directions of the cameras.
         thumbnails: (M, D) `thumbnail` of each photograph.
 
     Returns:
-        Indices of both photographs of each pair. Empty if the photographs are not a sequence, whose neighbours look
-        more alike than distant ones.
+        Indices of both photographs of each pair. Empty if the photographs are not a sequence, where neighbours look
+        more alike than distant photographs.
     """
     if len(names) < MIN_PHOTOGRAPHS:
         return []

@@ -20,7 +20,7 @@ from nerfloom.scene.covisible_space import times_seen
 CELLS = 64
 """Number of cells along each axis of the box."""
 PERIOD = 512
-"""Number of training steps over which cells are watched."""
+"""Number of training steps in a period of observation."""
 MARGIN = 1
 """Cells this close to a cell with samples, along every axis, count as reached: few rays may pass a cell."""
 

@@ -19,11 +19,11 @@ from nerfloom.data.motion_bound import MotionBound
 from nerfloom.scene.silhouettes import Silhouettes, held_cells
 
 IMAGES_PER_MOMENT = 32
-"""Number of images used for a moment: those with the least motion between their time and the moment."""
+"""Number of images used for a moment: the ones with the least motion between their time and the moment."""
 MOTION_PER_MOMENT = 1 / 64
 """Distance that matter may move within a moment, in longest edges of the box, unless moments get too many."""
 MAX_MOMENTS = 96
-"""Maximum number of moments whose hulls form those of slices, beyond one moment for each slice."""
+"""Maximum number of moments in all, beyond one for each slice."""
 BOX_CELLS = 32
 """Cells along each axis in the search for the smallest box of a moving scene."""
 

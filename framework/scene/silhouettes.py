@@ -1,7 +1,7 @@
 """Visual hulls (Laurentini 1994): space that transparent pixels show to be empty before training.
 
-A point that is fully transparent in some image is empty. So a cell whose projection into one image has no opaque pixel
-can be skipped permanently, and so can the pixels whose rays meet no other cell.
+A point that is fully transparent in some image is empty. So a cell can be skipped permanently if its projection into
+one image has no opaque pixel. A pixel can be skipped if its rays meet only such cells.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MIN_WITNESSES = 3
 """Number of images (or all, if fewer) that must show matter in the direction of a cell for it to be occupied in a
 moving scene. Without this, many cells remain that no image has in its frame at that moment."""
 KEPT_COUNTS = 48
-"""Number of images whose sums are cached if the images exceed the memory."""
+"""Number of images with cached sums if the images exceed the memory."""
 
 
 class _Counts(Sequence[Tensor]):
@@ -177,7 +177,7 @@ def _whole_cubes(cells: Tensor, resolution: int, size: int) -> Tensor:
 
 
 def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor, reach: Sequence[float]) -> Tensor:
-    """Return the balls (N,) in whose direction `MIN_WITNESSES` of `images` (all, if fewer) show matter."""
+    """Return whether `MIN_WITNESSES` of `images` (all, if fewer) show matter in the direction of each ball, (N,)."""
     wanted = min(MIN_WITNESSES, len(images))
     count = torch.zeros(len(centers), dtype=torch.int32, device=centers.device)
     for image, radius in zip(images, reach, strict=True):
@@ -194,7 +194,7 @@ def _witnessed(silhouettes: Silhouettes, images: Sequence[int], centers: Tensor,
 def pixels_near(silhouettes: Silhouettes, hull: Tensor, box: Tensor, resolution: int) -> PixelSet:
     """Return the pixels, counted over all images, that may see the `hull` (n^3,); others see only background.
 
-    `silhouettes` are those of the images. `box` (2, 3) has `resolution` n cells along each axis.
+    `silhouettes` belong to the images. `box` (2, 3) has `resolution` n cells along each axis.
     """
     cells = hull.nonzero().squeeze(-1)
     centers = box[0] + (cell_corners(cells, resolution) + 0.5) * (box[1] - box[0]) / resolution

@@ -29,18 +29,18 @@ SPEED_RATIO = 2**0.5
 SAFETY_FACTOR = 2**0.5
 """Ratio of the speed used to the speed found. Pixels, balls and matter have a size, which makes the latter too low."""
 RAISED_TIMES = 2
-"""The speed is raised at this number of times before, and after, that of an image with an unexplained ray."""
+"""The speed is raised at this number of times before, and after, the time of an image with an unexplained ray."""
 MAX_RAYS = 2**15
 """Maximum number of rays tested, spread evenly over all images."""
 BALLS = 128
-"""Number of balls in a row as long as the box's diagonal."""
+"""Number of balls along a row with the length of the box's diagonal."""
 
 
 @torch.no_grad()
 def motion_bound(silhouettes: Silhouettes, box: Tensor, times: Tensor) -> MotionBound | None:
     """Return how far matter may move, with `SAFETY_FACTOR`, by `silhouettes` at `times` (M,); None if too few.
 
-    `box` (2, 3) has the minimum and maximum corner of what the images show.
+    `box` (2, 3) has the minimum and maximum corner of the imaged scene.
     """
     silhouettes = silhouettes.closed_if_whole()
     images = silhouettes.at_full_size

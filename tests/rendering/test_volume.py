@@ -202,5 +202,5 @@ def test_every_ray_method_scales_and_thins_gradients_if_asked(name: str) -> None
 
 def test_samples_that_nobody_evaluated_are_refused() -> None:
     field, rays = Cloud(), some_rays(2)
-    with pytest.raises(ValueError, match="density and features are attached"):
+    with pytest.raises(ValueError, match="samples with density and features"):
         VolumeRenderer().shade(rays, UniformSampler(4).sample(rays, field, False), field, torch.ones(3))

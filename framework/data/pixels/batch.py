@@ -31,7 +31,7 @@ class PixelBatch:
     pixels: Tensor
     """(R,) int64 numbers of the pixels, counted over all images."""
     rays: Rays
-    """R * K rays, those of a pixel consecutive; if K is 1, they pass through the pixel's centre."""
+    """R * K rays, with the K rays of a pixel consecutive; if K is 1, they pass through the pixel's centre."""
     rgb: Tensor
     """(R, 3) colours over `background`."""
     background: Tensor
@@ -91,7 +91,7 @@ class ViewBatch:
 
 
 def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
-    """Return the background in training: what is `asked`, and for "auto" random if `has_alpha`, else black."""
+    """Return the background in training: the `asked` one, or for "auto" random if `has_alpha`, else black."""
     if asked != "auto":
         return asked
     return "random" if has_alpha else "black"
@@ -156,7 +156,7 @@ def draw_batch(
         dataset: the training images.
         count: number of pixels R.
         background: kind of background.
-        subpixels: (K, 2) positions in a pixel through which its rays pass, as in `Cameras.pixel_rays`.
+        subpixels: (K, 2) positions of the rays in a pixel, as in `Cameras.pixel_rays`.
         look_up: for pixels in a file, a function that returns the stored colours of all drawn pixels, in the order of
             drawing (`PixelStream.look_up`).
         keypoints: number of pixels drawn from `dataset.sparse_depth`; they are the last ones.
@@ -191,7 +191,7 @@ def gather_batch(
         dataset: the images.
         flat: (R,) numbers of the pixels, counted over all images.
         behind: (R, 3) background colours.
-        subpixels: (K, 2) positions in a pixel through which its rays pass.
+        subpixels: (K, 2) positions of the rays in a pixel.
         stored: (R, 3 or 4) uint8 stored colours; looked up if None.
     """
     scene = dataset.scene
@@ -217,7 +217,7 @@ def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None
     Args:
         dataset: the images.
         flat: (R,) numbers of the pixels, counted over all images.
-        rays: R * K rays through the pixels, those of a pixel consecutive.
+        rays: R * K rays through the pixels, with the K rays of a pixel consecutive.
     """
     if dataset.depths is None or rays.camera_indices is None:
         return None

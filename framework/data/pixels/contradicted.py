@@ -8,11 +8,11 @@ tiles and exceeds a threshold. No fixed share of pixels is left out: where nothi
 small.
 
 A method that draws whole images sees all errors of an image at once, but each image rarely. There the errors of the
-last drawing decide, the median is that of the image, and errors count less where the photograph has fine structure,
+last drawing decide, the median is taken over the image, and errors count less where the photograph has fine structure,
 which a model that is not sharp yet misses. The weight of contradicted tiles falls from 1 to 0, so that a part of the
 scene that is learnt late is not left out for good.
 
-Finding what moves from errors, and deciding together with neighbours, are ideas of RobustNeRF (Sabour et al. 2023);
+Finding moving content from errors, and deciding together with neighbours, are ideas of RobustNeRF (Sabour et al. 2023);
 counting all pixels at first, and leaving out more and more, are ideas of SpotLessSplats (Sabour et al. 2024).
 """
 
@@ -39,9 +39,9 @@ learnt."""
 LEAST = 0.07
 """Minimum mean error of a contradicted tile; colours are in [0, 1]."""
 STEPS_PER_LOOK = 25
-"""Steps between decisions on which tiles are contradicted, if batches are pixels."""
+"""Steps between decisions about contradicted tiles, if batches are pixels."""
 FADE = 0.1
-"""Fraction of the budget in which the weight of contradicted tiles of whole images falls to 1 / e."""
+"""Time until the weight of contradicted tiles of whole images falls to 1 / e, as a fraction of the budget."""
 UNSHARP = 0.5
 """Mean error of a tile, in standard deviations of the photograph's colours there, that a model may have because it is
 not sharp yet."""
@@ -133,7 +133,7 @@ def view_scores(errors: Tensor, colors: Tensor, side: int) -> Tensor:
     and the standard deviation s of the photograph's colours in the tile. Scores are averaged over 3 x 3 tiles.
 
     Args:
-        errors: (H, W, 3) drawn minus true colours; those that are not finite count as 0.
+        errors: (H, W, 3) drawn minus true colours; values that are not finite count as 0.
         colors: (H, W, 3) true colours.
         side: side of a tile, pixels; tiles at the right and lower borders may be smaller.
     """

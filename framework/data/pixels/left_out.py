@@ -24,7 +24,7 @@ class LeftOutTiles:
     """
 
     state: Tensor
-    """What a checkpoint holds; here (T,): 1 for tiles that are left out, 0 for others, `UNKNOWN` at first."""
+    """The state in a checkpoint; here (T,): 1 for tiles that are left out, 0 for others, `UNKNOWN` at first."""
 
     def __init__(self, dataset: Dataset, along: int) -> None:
         self.tiles = Tiles(dataset.cameras, max(round(dataset.scene.image_size / along), MIN_SIDE))
@@ -83,7 +83,7 @@ class LeftOutTiles:
         """
 
     def decide(self, progress: float) -> None:
-        """Decide which tiles are left out, from what was learnt of pixels.
+        """Decide which tiles are left out, from the errors of pixels learnt so far.
 
         Args:
             progress: fraction of the budget spent, 0 to 1.

@@ -20,11 +20,11 @@ from nerfloom.base.processes import processes
 from nerfloom.data.dataset import Dataset
 
 MAX_STEPS = 64
-"""Maximum number of steps whose pixels are read together."""
+"""Maximum number of steps in one block of reads."""
 FIRST_STEPS = 4
 """Number of steps of the first block; training waits for it. Each later block has twice as many."""
 MARGIN = 1.25
-"""Ratio of the pixels read per step to those of the last batch, because batches may grow."""
+"""Ratio of the pixels read per step to the pixels of the last batch, because batches may grow."""
 BYTES = 32
 """Memory per pixel read, bytes: 8 for number and position, 3 or 4 for the colour, the rest for temporary arrays."""
 CHUNK = 2**16
@@ -49,7 +49,7 @@ class PixelStream:
     """Reads the colours that training will draw.
 
     Args:
-        dataset: a data set whose pixels are in a file. `drawn` must not change afterwards.
+        dataset: a data set with its pixels in a file. `drawn` must not change afterwards.
         seed: the run's seed.
 
     Raises:
@@ -94,7 +94,7 @@ class PixelStream:
         return block
 
     def _begin(self, first: int, steps: int, count: int) -> Future[Block]:
-        """Start reading a block of `steps` steps, or of as many as fit, in the thread."""
+        """Start reading a block of `steps` steps in the thread, or of fewer if they do not fit."""
         count = max(min(count, self.capacity), 1)
         return self._reader.submit(self.read, first, max(min(steps, self.capacity // count), 1), count)
 

@@ -52,4 +52,4 @@ def check_offsets(offsets: Tensor, count: int) -> None:
     if offsets.ndim != 1 or len(offsets) == 0 or int(offsets[0]) != 0 or int(offsets[-1]) != count:
         raise IndexError(f"the rays' offsets must start at 0 and end at the number of samples, {count}")
     if bool((offsets[1:] < offsets[:-1]).any()):
-        raise IndexError("the rays' offsets must not decrease: the samples of each ray follow those of the ray before")
+        raise IndexError("the rays' offsets must not decrease: each ray's samples follow the ray before's")

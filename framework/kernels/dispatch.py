@@ -51,7 +51,7 @@ FLOAT32, INT64, BOOL = (frozenset({kind}) for kind in (torch.float32, torch.int6
 
 @dataclass(frozen=True)
 class Implementation(Generic[P, R]):
-    """An implementation of an operation, with the conditions under which it can be used."""
+    """An implementation of an operation, with the conditions of its use."""
 
     backend: Backend
     """The backend that runs it."""
@@ -131,7 +131,7 @@ class Operation(Generic[P, R]):
         """Run the operation.
 
         Args:
-            tensors: tensors whose device, type and gradients determine the implementation; None is ignored.
+            tensors: their device, type and gradients determine the implementation; None is ignored.
             args: positional arguments of the operation.
             kwargs: keyword arguments of the operation.
         """

@@ -100,7 +100,7 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
 
 
 def cross_matrix(v: Tensor) -> Tensor:
-    """Return the matrices (..., 3, 3) whose product with a vector w is the cross product `v` x w, for `v` (..., 3)."""
+    """Return the cross-product matrices (..., 3, 3) of `v` (..., 3): their product with a vector w is `v` x w."""
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
     rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)

@@ -2,7 +2,7 @@
 
 Each kernel's Python file declares its C functions as `Function`, and passes tensors through `pointer`, which checks
 them. A C function returns a status, which is raised as an exception here. The library has its own threads
-(`kernels/runtime/parallel.h`), as many as torch is set to use. ctypes releases Python's lock during a call.
+(`kernels/runtime/parallel.h`), in the number that torch is set to use. ctypes releases Python's lock during a call.
 
 The environment variable `NERFLOOM_KERNELS` overrides the choice: a variant's name (baseline, avx2, avx512, avx512_bf16,
 amx_bf16), "triton" for Triton's kernels only, or "reference" for PyTorch only. `NERFLOOM_KERNEL_FOLDER` is a folder of

@@ -62,7 +62,7 @@ class _Call(NamedTuple):
     """A call of an operation on one wave."""
 
     key: Key
-    """Name and settings of the operation, shapes of its inputs, and the earlier calls whose results they are."""
+    """Name and settings of the operation, shapes of its inputs, and the earlier calls that computed them."""
     parameters: tuple[_Value, ...]
     inputs: tuple[_Value, ...]
     """The inputs that are not results of earlier calls."""
@@ -143,7 +143,7 @@ class _Given:
 
 
 def _sources(rows: Sequence[Tensor], results: Sequence[_Value | None]) -> tuple[int | None, ...]:
-    """Return, for each input, the index of the call whose result it is, or None."""
+    """Return, for each input, the index of the call that computed it, or None."""
     return tuple(
         next((number for number, value in enumerate(results) if value is not None and value.is_(row)), None)
         for row in rows
@@ -194,7 +194,7 @@ def result(key: Key, rows: Sequence[Tensor], parameters: Sequence[Tensor], compu
         key: name of the operation, and all settings that its result depends on.
         rows: inputs (N, ...) of the operation with one row per sample.
         parameters: other inputs of the operation.
-        compute: computes the result (N, ...), whose row i must depend only on row i of the inputs.
+        compute: computes the result (N, ...); its row i must depend only on row i of the inputs.
 
     Returns:
         (N, ...) result.

@@ -1,6 +1,6 @@
 """Fingerprint of the C++ sources of a library of kernels.
 
-setup.py writes it into each library, and native.py compares it with that of the sources beside the library.
+setup.py writes it into each library, and native.py compares it with the fingerprint of the sources beside the library.
 """
 
 from __future__ import annotations

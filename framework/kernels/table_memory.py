@@ -31,7 +31,7 @@ def require(size: float, what: str) -> None:
 
     Args:
         size: number of bytes needed.
-        what: name of what needs the memory, such as "a table", for the error.
+        what: purpose of the memory, such as "a table", for the error.
 
     Raises:
         ConfigError: if the machine has less memory.

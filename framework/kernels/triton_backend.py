@@ -69,7 +69,7 @@ def later(file: str, name: str) -> Callable[..., Any]:
     """Return a function that imports another function and calls it.
 
     Args:
-        file: name of a module in `nerfloom.kernels`, with that of its family.
+        file: name of a module in `nerfloom.kernels`, with its family's.
         name: name of a function in it.
     """
 

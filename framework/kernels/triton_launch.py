@@ -1,7 +1,7 @@
 """Launch of kernels, and shared functions: optical depth, and an exponential without cancellation.
 
 Sizes are passed as numbers, not as constants of the kernel, and Triton is told not to specialise on their values. So a
-kernel is compiled once, whatever the number of rays or samples. Constants are those of a method, such as the number of
+kernel is compiled once for all numbers of rays or samples. Constants are a method's sizes, such as the number of
 features, and block sizes.
 """
 

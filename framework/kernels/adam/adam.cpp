@@ -1,4 +1,4 @@
-// Adam over the entries of a table that got a gradient. See ../adam.py for the reference and the formulas.
+// Adam over the entries of a table that got a gradient. See adam.py for the reference and the formulas.
 #include "adam/adam.h"
 
 #include <algorithm>
@@ -20,7 +20,7 @@ int64_t update_all(float* values, float* mean, float* square, float* grad, float
     return touched;
 }
 
-// A separate function, because the compiler assumes that any store of a float may change what a lambda captures.
+// A separate function, because the compiler assumes that any store of a float may change a lambda's captures.
 void update_dense(float* __restrict p, float* __restrict m, float* __restrict v, const float* __restrict g,
                   int64_t count, float step, float unbias, float add1, float keep2, float add2, float eps) {
     for (int64_t k = 0; k < count; k++) {

@@ -1,4 +1,4 @@
-// Adam on entries of a table, shared by adam.cpp and hash_grid.cpp. See ../adam.py for the formulas.
+// Adam on entries of a table, shared by adam.cpp and hash_grid.cpp. See adam.py for the formulas.
 #pragma once
 
 #include "runtime/common.h"
@@ -33,7 +33,7 @@ struct Settings {
     float keep1, add1, keep2, add2, rate, eps;
     std::vector<float> unbias1, unbias2;  // by the number of an entry's updates
     std::vector<uint64_t> unbias;         // the bits of both; the first moment's are the lower half
-    float settled;                        // number of updates after which both are 1: the last index
+    float settled;                        // last index of both, where they are 1
 
     Settings(float rate, double beta1, double beta2, float eps)
         : keep1(float(beta1)), add1(float(1 - beta1)), keep2(float(beta2)), add2(float(1 - beta2)), rate(rate),

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015), dense, and sparse for tables whose entries are mostly unused in a step.
+"""Adam (Kingma and Ba 2015), dense, and sparse for tables with few entries used in a step.
 
 Sparse Adam updates an entry only if its gradient is not zero. The moments of the entry decay, and their bias is
 corrected, by the number of its updates, not by the number of steps. So an entry first used after a thousand steps moves
@@ -52,7 +52,7 @@ def sparse_adam(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
     rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
 ) -> int | Tensor:  # fmt: skip
-    """Update, in place, the entries whose gradient is not zero, and set their gradient to zero.
+    """Update, in place, the entries with a gradient that is not zero, and set their gradient to zero.
 
     Args:
         values: (E, F) parameters.

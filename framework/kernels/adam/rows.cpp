@@ -1,4 +1,4 @@
-// Adam over listed rows of a table. See ../row_gradient.py; the formulas are those of adam/adam.py.
+// Adam over listed rows of a table. See row_gradient.py, and adam.py for the formulas.
 #include "adam/adam.h"
 
 namespace {
@@ -43,7 +43,7 @@ void update_rows(float* values, float* mean, float* square, float* seen, const f
 
 }  // namespace
 
-// values, mean, square (E, F), seen (E): Adam on rows `rows` (T), each once, whose gradient is grad (T, F).
+// values, mean, square (E, F), seen (E): Adam on rows `rows` (T), each once, with the gradient grad (T, F).
 EXPORT int adam_rows(float* values, float* mean, float* square, float* seen, const float* grad, const int32_t* rows,
                      int64_t count, int features, float rate, double beta1, double beta2, float eps, int threads) {
     return guarded([&] {

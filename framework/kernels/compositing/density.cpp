@@ -1,4 +1,4 @@
-// Volume rendering of packed samples, forward and backward. See ../compositing.py for the reference and the equations.
+// Volume rendering of packed samples, forward and backward. See density.py for the reference and the equations.
 #include "runtime/common.h"
 
 #include <cmath>

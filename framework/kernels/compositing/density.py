@@ -133,7 +133,7 @@ class Composited(NamedTuple):
     moment: Tensor
     """(R,) sum of weight * t, without gradient."""
     median: Tensor
-    """(R,) t of the first sample behind which the transmittance is at most 0.5, or the far end; without gradient."""
+    """(R,) t of the first sample with a transmittance of at most 0.5 behind it, or the far end; without gradient."""
     weights: Tensor
     """(N,) weight of each sample."""
 

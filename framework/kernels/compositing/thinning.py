@@ -1,8 +1,8 @@
 """Thinning of gradients: a random fraction of samples with small gradients is kept, scaled up to preserve the mean.
 
-After the first steps most samples along rays have gradients much smaller than the mean: those in empty space, behind
+After the first steps most samples along rays have gradients much smaller than the mean: samples in empty space, behind
 surfaces, and of pixels that are already right. Networks and tables skip samples with zero gradient (`mlp`, `hash_grid`,
-`planes`), so a step takes less time. The roulette is that of Arvo and Kirk 1990, "Particle Transport and Image
+`planes`), so a step takes less time. The roulette is from Arvo and Kirk 1990, "Particle Transport and Image
 Synthesis".
 """
 
@@ -40,9 +40,9 @@ class _Thinned(torch.autograd.Function):
 def thinned(sigma: Tensor, rgb: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Return density (or opacity) and colour of samples unchanged, with most small gradients set to zero.
 
-    The size of a sample's gradient is that of its log-density plus the sum over colour channels. A sample below the
-    bound is kept with a probability proportional to its size, and its gradients are divided by that probability, so the
-    expected gradients are unchanged. If a density is 0, its own gradient counts as 0, because the density cannot
+    The size of a sample's gradient is the size for its log-density plus the sum over colour channels. A sample below
+    the bound is kept with a probability proportional to its size, and its gradients are divided by that probability, so
+    the expected gradients are unchanged. If a density is 0, its own gradient counts as 0, because the density cannot
     decrease.
 
     Args:

@@ -1,4 +1,4 @@
-// The contraction of unbounded space: mip-NeRF 360, equation 10. See ../contraction.py for the reference.
+// The contraction of unbounded space: mip-NeRF 360, equation 10. See contraction.py for the reference.
 #pragma once
 
 #include <algorithm>

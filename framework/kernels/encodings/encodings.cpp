@@ -1,4 +1,4 @@
-// Encodings without parameters. See ../spherical_harmonics.py and ../frequency.py for the references.
+// Encodings without parameters. See spherical_harmonics.py and frequency.py for the references.
 #include "runtime/common.h"
 #include "encodings/harmonics.h"
 

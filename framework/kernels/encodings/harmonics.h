@@ -1,4 +1,4 @@
-// Real spherical harmonics of directions (Sloan 2008), for a single one or a vector. See ../spherical_harmonics.py for
+// Real spherical harmonics of directions (Sloan 2008), for a single one or a vector. See spherical_harmonics.py for
 // the reference.
 #pragma once
 

@@ -1,4 +1,4 @@
-// Integrated directional encoding. See ../integrated_directional.py for the reference and its recurrence.
+// Integrated directional encoding. See integrated_directional.py for the reference and its recurrence.
 #include "runtime/common.h"
 
 #include <algorithm>

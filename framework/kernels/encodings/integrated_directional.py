@@ -36,7 +36,7 @@ def num_features(bands: int) -> int:
 def directional_encoding(directions: Tensor, roughness: Tensor, bands: int = MAX_BANDS) -> Tensor:
     """Return the mean spherical harmonics of degrees 1, 2, 4, ..., 2^(B - 1) over a distribution of directions.
 
-    The distribution is that of von Mises and Fisher, and the attenuation that of equation 8. The paper lists the real
+    The directions have the von Mises-Fisher distribution, and equation 8 has the attenuation. The paper lists the real
     and the imaginary parts of complex harmonics; real harmonics are the same functions, scaled to be orthonormal. The
     compiled forms have first derivatives only.
 

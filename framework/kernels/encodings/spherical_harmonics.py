@@ -1,6 +1,6 @@
 """Real spherical harmonics of up to 4 bands: Instant-NGP (Mueller et al. 2022), section 5.4.
 
-The constants are those of Sloan 2008, "Stupid spherical harmonics tricks", appendix A2, with the Condon-Shortley phase.
+The constants are from Sloan 2008, "Stupid spherical harmonics tricks", appendix A2, with the Condon-Shortley phase.
 """
 
 from __future__ import annotations

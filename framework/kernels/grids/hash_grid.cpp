@@ -1,4 +1,4 @@
-// Multiresolution hash encoding, forward and backward (Instant-NGP, section 3). See ../hash_grid.py for the reference.
+// Multiresolution hash encoding, forward and backward (Instant-NGP, section 3). See hash_grid.py for the reference.
 #include "grids/hash_grid.h"
 
 #include <memory>
@@ -46,7 +46,7 @@ void scatter_level(const Level& level, const float* positions, int64_t count, co
 struct Live {
     std::vector<const float*> points, grads;
 
-    // `ends` holds the number of samples up to the end of each part, whose gradients are `stride` wide.
+    // `ends` holds the number of samples up to the end of each part; its gradients are `stride` wide.
     Live(const float* const* positions, const float* const* all, const int64_t* ends, int parts, int64_t stride) {
         const size_t most = parts ? size_t(ends[parts - 1]) : 0;
         points.reserve(most);

@@ -1,5 +1,5 @@
 // Shared by look-ups in a multiresolution hash grid: levels, and the corners around positions (Instant-NGP, section 3).
-// See ../hash_grid.py for the reference.
+// See hash_grid.py for the reference.
 #pragma once
 
 #include "adam/adam.h"
@@ -185,8 +185,7 @@ void add_position_gradient(const Level& level, const Floats (*xyz)[3], int64_t c
     }
 }
 
-// Fills `out` with the indices of those of `count` rows, `stride` wide, that have a gradient that is not zero (or is
-// NaN).
+// Fills `out` with the indices of rows with a gradient that is not zero (or is NaN), among `count` rows, `stride` wide.
 inline void rows_with_gradient(const float* grads, int64_t count, int64_t stride, std::vector<int64_t>& out) {
     out.clear();
     for (int64_t n = 0; n < count; n++) {
@@ -198,8 +197,8 @@ inline void rows_with_gradient(const float* grads, int64_t count, int64_t stride
 }
 
 // Adds the gradient of each level to `table`. Levels are distributed over threads, so that no two write to the same
-// entry and the order of sums never changes. samples.scatter_to(level, l, first) adds that of level l, starting at its
-// first entry.
+// entry and the order of sums never changes. samples.scatter_to(level, l, first) adds the gradient of level l, starting
+// at its first entry.
 template <int F, typename Samples>
 void add_by_level(const Samples& samples, const int64_t* resolutions, const int64_t* offsets, int levels, float* table,
                   int threads) {

@@ -173,7 +173,7 @@ def _at_all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout) -> 
     x, y, z = _spread(torch.stack([low, low + levels.strides], 2))
     entries = torch.where(levels.dense, x + y + z, (x ^ y ^ z) & levels.masks) + levels.offsets
     wx, wy, wz = _spread(torch.stack([1 - fractions, fractions], 2))
-    # By index_select, whose gradient is added in place; on a GPU that of table[entries] is sorted first.
+    # index_select adds its gradient in place; on a GPU the gradient of table[entries] would be sorted first.
     rows = table.index_select(0, entries.flatten()).view(layout.num_levels, 8, len(positions), table.shape[1])
     features = (rows * (wx * wy * wz).flatten(1, 3)[..., None]).sum(1)
     return features.transpose(0, 1).flatten(1)

@@ -43,7 +43,7 @@ class HashGridLayout:
 
     @classmethod
     def build(cls, num_levels: int, base_resolution: int, max_resolution: int, log2_table_size: int) -> HashGridLayout:
-        """Return a layout whose resolutions grow geometrically: equations 2 and 3.
+        """Return a layout with geometrically growing resolutions: equations 2 and 3.
 
         Args:
             num_levels: number L of levels.

@@ -108,7 +108,7 @@ class TableGradient:
     table; autograd's dense gradient takes many.
 
     Args:
-        look_up: kind of look-up whose gradients are collected.
+        look_up: kind of look-up; its gradients are collected.
         layout: resolutions and offsets of the levels in use: all of the table's, or the first ones.
     """
 

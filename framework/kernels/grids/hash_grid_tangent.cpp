@@ -17,8 +17,8 @@ void forward(const float* points, int64_t count, const float* table, const int64
     });
 }
 
-// Samples with a gradient, collected from parts: points, and the incoming gradients level by level, those of a level's
-// features before those of their derivatives.
+// Samples with a gradient, collected from parts: points, and the incoming gradients level by level: first of a level's
+// features, then of their derivatives.
 template <int F>
 struct Gathered {
     std::vector<const float*> from, grads;

@@ -1,8 +1,8 @@
 """Multiresolution hash encoding with its derivative along a direction, for losses on gradients of a field.
 
 A gradient n(x) of a scalar function of the encoding has a gradient of its own. With v the gradient of a loss by n, the
-product v . n is the derivative along v, so the loss's gradients by table and network are those of a derivative along a
-fixed direction. That needs first derivatives only.
+product v . n is the derivative along v, so the loss's gradients by table and network are gradients of a derivative
+along a fixed direction. They need first derivatives only.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ def hash_grid_tangent_reference(points: Tensor, table: Tensor, layout: HashGridL
 
     `points`, `table`, `layout` and the result are as there.
     """
-    # The gradient of weighted features is linear in the weights: its derivatives by them, along a direction, are those
-    # of the features. The first use of PyTorch's forward mode would load decompositions, which takes seconds.
+    # The gradient of weighted features is linear in the weights: its derivatives by them, along a direction, are the
+    # derivatives of the features. The first use of PyTorch's forward mode would load decompositions, which takes
+    # seconds.
     learns = torch.is_grad_enabled() and (points.requires_grad or table.requires_grad)
     with torch.enable_grad():
         positions = points[:, :3] if points.requires_grad else points[:, :3].detach().requires_grad_()

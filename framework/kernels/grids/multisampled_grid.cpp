@@ -1,5 +1,5 @@
 // A hash grid at the multisamples of conical frustums: means of features, weighted by scale (Zip-NeRF). See
-// ../multisampled_grid.py for the reference.
+// multisampled_grid.py for the reference.
 //
 // The points of a sample lie close together, and at most levels some or all of them have the same corners. The weights
 // of such a run are added up before an entry is accessed: if all 6 points share a cell, 8 entries are read or written
@@ -39,7 +39,7 @@ inline void load_points(const float* points, int per_sample, int64_t first, int 
     load_points(points, per_sample, size, out, [&](int s) { return first + s; });
 }
 
-// erf of x >= 0: Abramowitz and Stegun 1964, 7.1.26, whose error is at most 1.5e-7, and the series for small x.
+// erf of x >= 0: Abramowitz and Stegun 1964, 7.1.26 (error at most 1.5e-7), and the series for small x.
 inline Floats error_function(Floats x) {
     const Floats squared = x * x, t = 1.0f / (1.0f + 0.3275911f * x);
     const Floats sum = (((1.061405429f * t - 1.453152027f) * t + 1.421413741f) * t - 0.284496736f) * t + 0.254829592f;
@@ -77,7 +77,7 @@ inline Ints have_moved(const Cell& here, const Cell& before) {
     return moved;
 }
 
-// For the lanes whose bits are set.
+// For the lanes with a bit set.
 template <int F>
 inline void prefetch(const Cell& cell, uint32_t lanes, const float* entries) {
     for (; lanes; lanes &= lanes - 1)
@@ -238,7 +238,7 @@ struct Gathered {
 };
 
 // Adds the gradient of one level by the points of `count` samples to `out`, with three sums per block of points;
-// `grad`: that of the level, (count, F). The points of a run share one look-up of their corners.
+// `grad`: gradient of the level, (count, F). The points of a run share one look-up of their corners.
 template <int F, bool DENSE>
 void add_point_gradient(const Level& level, const Point* points, int per_sample, int64_t count, const float* table,
                         const float* grad, Floats (*out)[3]) {

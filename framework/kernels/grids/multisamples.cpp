@@ -1,5 +1,5 @@
 // Points in conical frustums, in the unit cube of a grid (Zip-NeRF): several per frustum, or one ball of its volume.
-// See ../multisamples.py for the references.
+// See multisamples.py for the references.
 #include "runtime/common.h"
 
 #include <algorithm>
@@ -83,7 +83,7 @@ inline void contract(Floats* x, Floats& shrunk) {
     shrunk = power * power;
 }
 
-// The gradient by a position in half edges, from that by its image in the unit cube.
+// The gradient by a position in half edges, from the gradient by its image in the unit cube.
 inline void contract_backward(Floats* x, Floats* grad) {
     Floats inverse_norm, along = splat(0);
     const Floats inverse = shrink(x, inverse_norm);
@@ -182,8 +182,7 @@ struct Map {
             for (int i = 0; i < 4; i++) out[s * stride + i] = lanes[i][s];
     }
 
-    // The gradient by positions x in the scene, from that by the values that `write` has written, `stride` floats
-    // apart.
+    // The gradient by positions x in the scene, from the gradient by the values of `write`, `stride` floats apart.
     void read_gradient(Floats* x, int size, const float* from, int stride, Floats* grad) const {
         alignas(64) float lanes[3][LANES] = {};
         for (int s = 0; s < size; s++)
@@ -206,9 +205,9 @@ inline void for_blocks(int64_t count, int threads, const Body& body) {
 
 }  // namespace
 
-// 6 points (x, y, z, deviation) in each of `count` frustums. `cosines` and `sines` are those of the pattern's rotation,
+// 6 points (x, y, z, deviation) in each of `count` frustums. `cosines` and `sines` describe the pattern's rotation,
 // `mirrors` are 1 or -1. A position p becomes (p - centre) * scale and is then contracted if `contracted`. A deviation
-// is multiplied by `deviation_scale`, which includes that of the box.
+// is multiplied by `deviation_scale`, which includes the box's scale.
 EXPORT int multisamples(const float* origins, const float* directions, const float* t_starts, const float* t_ends,
                         const float* radii, const float* cosines, const float* sines, const float* mirrors,
                         int64_t count, const float* centre, const float* scale, float deviation_scale, int contracted,

@@ -1,5 +1,5 @@
 // The mean squared difference of neighbours along each axis in bands of rows, summed over both axes. See
-// ../../plane_bands.py. `shapes` has for each band its first entry, its number of rows and the entries per row.
+// plane_bands.py. `shapes` has for each band its first entry, its number of rows and the entries per row.
 #include "runtime/common.h"
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Factorised features: look-ups in planes and lines, multiplied (K-Planes, TensoRF). See ../../planes.py.
+// Factorised features: look-ups in planes and lines, multiplied (K-Planes, TensoRF). See planes.py.
 //
 // An entry is a row of features, so that a corner takes one or two cache lines and every product is a whole vector.
 #include "runtime/common.h"

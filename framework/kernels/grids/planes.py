@@ -292,7 +292,7 @@ def _at_all_factors(positions: Tensor, table: Tensor, layout: PlanesLayout) -> T
     second = second * constants.planes
     along, beside = (torch.stack([1 - fraction, fraction], 1) for fraction in (first, second))
     weights = beside[:, :, None] * along[:, None]
-    # By index_select, whose gradient is added in place; on a GPU that of table[entries] is sorted first.
+    # index_select adds its gradient in place; on a GPU the gradient of table[entries] would be sorted first.
     corners = table.index_select(0, entries.flatten()).view(len(constants.offsets), 4, len(positions), table.shape[1])
     values = (corners * weights.flatten(1, 2)[..., None]).sum(1).unflatten(0, (layout.num_groups, -1))
     product, *others = values.unbind(1)

@@ -1,5 +1,5 @@
-// Histograms of rays in proposal sampling, and the contraction of space. See ../intervals.py and ../contraction.py for
-// the references and the equations.
+// Histograms of rays in proposal sampling, and the contraction of space. See intervals.py and
+// ../encodings/contraction.py for the references and the equations.
 #include "encodings/contraction.h"
 #include "histograms/interval_weights.h"
 
@@ -120,7 +120,7 @@ float from_disparity(float s) {
 }  // namespace
 
 // Converts normalised distances (rays, count) between the near and the far end of each ray to distances: linear if
-// scale is 0, otherwise in disparity beyond that distance. See ../spacing.py.
+// scale is 0, otherwise in disparity beyond that distance. See spacing.py.
 EXPORT int spaced_distances(const float* edges, const float* nears, const float* fars, int64_t rays, int64_t count,
                             float scale, float* out, int threads) {
     return guarded([&] {

@@ -34,7 +34,7 @@ def interval_weights(sigma: Tensor, t: Tensor) -> Tensor:
 
     Args:
         sigma: (R, B) density of each interval, 1/length.
-        t: (R, B + 1) sorted distances between which the intervals lie; without a gradient.
+        t: (R, B + 1) sorted ends of the intervals, distances along the rays; without a gradient.
     """
     t = t.detach()
     return INTERVAL_WEIGHTS((sigma, t), sigma, t)

@@ -13,7 +13,7 @@ def inverse_cdf(edges: Tensor, weights: Tensor, u: Tensor, padding: float = 1e-5
         edges: (R, B + 1) sorted edges of the bins.
         weights: (R, B) weights of the bins, at least 0, not necessarily normalised.
         u: (R, S) values of the cumulative distribution in [0, 1], random or evenly spaced, in any order.
-        padding: added to each weight, so that all bins of a ray whose weights are 0 are drawn equally often.
+        padding: added to each weight, so that all bins are drawn equally often on a ray with zero weights.
 
     Returns:
         (R, S) points in [edges[:, 0], edges[:, -1]], in the order of `u`.

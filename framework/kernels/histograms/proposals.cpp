@@ -1,4 +1,4 @@
-// Weights of a proposal along rays in one call. See ../proposals.py for the reference.
+// Weights of a proposal along rays in one call. See proposals.py for the reference.
 //
 // A block of rays is placed, encoded, evaluated and weighted on one thread while it is in cache.
 #include "grids/grid_density.h"

@@ -3,7 +3,7 @@
 A proposal is a small network on a hash grid. Its density is evaluated in many intervals of each ray, only to draw the
 intervals of the next level from its weights. In single operations most intermediate values (positions, their
 contraction, features, outputs) are written to memory and read once. The compiled form processes a block of rays in
-cache (`proposals.cpp`). In steps where the proposal learns, it also writes what the backward pass needs.
+cache (`proposals.cpp`). In steps where the proposal learns, it also writes the values that the backward pass needs.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def power_ladder(x: Tensor, power: float) -> Tensor:
 
 
 def inverse_power_ladder(y: Tensor, power: float) -> Tensor:
-    """Return the distances whose `power_ladder` is `y`; large but finite where the ladder is bounded.
+    """Return the inverse of `power_ladder` at `y`; large but finite where the ladder is bounded.
 
     Args:
         y: values of the ladder.

@@ -1,4 +1,4 @@
-// The anti-aliased loss of proposals, on blurred step functions (Zip-NeRF). See ../step_functions.py for the reference.
+// The anti-aliased loss of proposals, on blurred step functions (Zip-NeRF). See step_functions.py for the reference.
 #include "runtime/common.h"
 
 #include <stdexcept>

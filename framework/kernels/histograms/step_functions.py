@@ -68,7 +68,7 @@ def blurred_excess_reference(
 
 
 def blurred_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:
-    """Return the loss (R,) of proposed weights below those of a blurred histogram: Zip-NeRF's loss.
+    """Return the loss (R,) of proposed weights below a blurred histogram's weights: Zip-NeRF's loss.
 
     It is the sum over proposed bins of max(0, b - p)^2 / p, where b is the weight of the blurred histogram in a bin and
     p the proposed one.

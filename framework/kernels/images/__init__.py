@@ -1,1 +1,1 @@
-"""Whole images: similarity, and what silhouettes show."""
+"""Whole images: similarity, and tests against silhouettes."""

@@ -1,4 +1,4 @@
-// Inversion of a lens's distortion for one position on an image. See ../../lenses.py for the iteration.
+// Inversion of a lens's distortion for one position on an image. See ../../geometry/lenses.py.
 #pragma once
 
 #include <cmath>

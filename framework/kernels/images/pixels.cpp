@@ -1,4 +1,5 @@
-// A batch of training pixels: rays through them, and their colours over a background. See ../../cameras.py, ../../pixels.py.
+// A batch of training pixels: rays through them, and their colours over a background. See ../../cameras/cameras.py,
+// ../../data/pixels/batch.py.
 #include "runtime/common.h"
 #include "images/lens.h"
 
@@ -28,7 +29,7 @@ static inline float look(int model, double x, double y, const double* lens, floa
 
 // flat (P): pixel indices over all images, which start at offsets (M + 1); places (K, 2): column and row from a pixel's
 // centre. poses (M, 3, 4); fx, fy, cx, cy (M); widths (M); lenses (M, LENS_SIZE), null for pinholes. Writes P * K rays,
-// those of a pixel consecutively.
+// the K rays of a pixel consecutively.
 EXPORT int camera_rays(int model, const int64_t* flat, int64_t count, const float* places, int64_t per_pixel,
                        const int64_t* offsets, int64_t images, const int64_t* widths, const float* poses,
                        const float* fx, const float* fy, const float* cx, const float* cy, const double* lenses,

@@ -1,4 +1,4 @@
-// Tests of cells of space and of pixels against photographs with alpha. See ../silhouettes.py for the references.
+// Tests of cells of space and of pixels against photographs with alpha. See silhouettes.py for the references.
 #include "runtime/common.h"
 
 #include <algorithm>

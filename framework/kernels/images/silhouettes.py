@@ -97,7 +97,7 @@ def footprint(photograph: Photograph, centers: Tensor, radius: float) -> tuple[T
 
     Returns:
         Left, right, top and bottom (4, N) int64 as numbers of pixel corners, clamped to the image; and (N,) bool, True
-        for balls in front of the camera whose rectangle is entirely inside the image, or anywhere if it is closed.
+        for balls in front of the camera with a rectangle entirely inside the image, or anywhere if it is closed.
     """
     pose, depth = photograph.pose, photograph.depth(centers)
     nearest = depth - radius
@@ -170,7 +170,7 @@ def pixels_near_balls_reference(photograph: Photograph, centers: Tensor, radius:
 
 
 def pixels_near_balls(photograph: Photograph, centers: Tensor, radius: float) -> Tensor:
-    """Return the pixels (H, W) bool whose rays may meet one of the balls, with a margin.
+    """Return the pixels (H, W) bool with rays that may meet one of the balls, with a margin.
 
     The projection of a ball that is entirely inside the image contains an opaque pixel, and the pixels of rays that
     meet the ball. So all pixels within twice the largest radius of a projection around opaque pixels suffice. For balls

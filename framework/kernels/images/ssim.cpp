@@ -1,5 +1,5 @@
 // The loss of an image from structural similarity and mean absolute error, and its derivative by the image. See
-// ../ssim.py for formulas and reference.
+// ssim.py for formulas and reference.
 //
 // An image of interleaved channels is filtered as rows of width * channels floats, with taps `channels` apart. A band
 // of rows is processed from input to gradient in one sweep, which keeps no more rows than the window covers. Rows are
@@ -199,7 +199,8 @@ class Band {
                 const Floats per_light = 1.0f / light, per_contrast = 1.0f / contrast;
                 const Floats darker = square * per_light, flatter = of_difference * per_contrast;
                 const Floats similar = 1.0f - darker;
-                // Twice the derivatives by E[u^2] and E[v^2], and the one by the means, on which variances depend too.
+                // Twice the derivatives by E[u^2] and E[v^2], and the one by the means; variances depend on the means
+                // too.
                 const Floats by_sum = similar * flatter * per_contrast;
                 const Floats by_difference = by_sum - 2.0f * similar * per_contrast;
                 const Floats by_mean =
@@ -258,7 +259,7 @@ class Band {
     const Images& images;
     const int64_t top, rows, step, row_floats, reach, windows, margin;
     Rows moments[4];            // sum, difference and their squares, blurred along
-    Rows slopes[3];             // by the mean, and twice those by the means of both squares, after `margin` zeros
+    Rows slopes[3];             // by the mean, and twice by the means of both squares, after `margin` zeros
     Rows blurred[3];            // the slopes, blurred down
     float *sums, *differences;  // of a row of both images
     float* counting;            // the weights of a row of pixels

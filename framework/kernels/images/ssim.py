@@ -58,8 +58,7 @@ def ssim(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor
         The mean over channels and over the windows that count, a tensor without dimensions.
 
     Raises:
-        ValueError: The shapes differ or are not those of images, a side is shorter than the window, or no window
-            counts.
+        ValueError: The shapes differ or do not fit images, a side is shorter than the window, or no window counts.
     """
     _check(image, target)
     _check_window(image, counted)

@@ -1,4 +1,4 @@
-// The first position along a ray that enough images show. See ../first_covisible.py for the reference.
+// The first position along a ray that enough images show. See first_covisible.py for the reference.
 #include "runtime/common.h"
 
 #include <algorithm>

@@ -27,7 +27,7 @@ from nerfloom.kernels.triton_backend import later
 
 @dataclass(frozen=True)
 class Slots:
-    """C slots distributed among R rays: first those of a ray's items, then empty ones."""
+    """C slots distributed among R rays: first the slots with a ray's items, then empty ones."""
 
     owners: Tensor
     """(C,) int64 ray of each slot, in ascending order."""
@@ -38,7 +38,7 @@ class Slots:
     counts: Tensor
     """(R,) int64 items of each ray; 0 if the ray was dropped."""
     left_out: Tensor
-    """() int64 number of rays dropped for lack of slots."""
+    """() int64 number of rays dropped: no slot left."""
 
 
 def share_out(counts: Tensor, capacity: int) -> Slots:
@@ -81,7 +81,7 @@ class Placed:
         Args:
             starts: (N,) distance at the start of each interval, finite; N > 0.
             ends: (N,) distance at the end of each interval, finite.
-            firsts: (R,) int64 index of the first interval of each ray; those of a ray are consecutive.
+            firsts: (R,) int64 index of the first interval of each ray; the intervals of a ray are consecutive.
             slots: slots for that many intervals of each ray.
         """
         held = slots.counts.index_select(0, slots.owners)
@@ -106,13 +106,13 @@ class Filled:
     runs: Tensor
     """() int64 number of runs of steps near an occupied cell; 0 if runs need no capacity."""
     candidates: Tensor
-    """() int64 number of candidates on all rays whose runs fitted."""
+    """() int64 number of candidates on all rays that had slots for their runs."""
     left_out: Tensor
     """() int64 number of dropped rays."""
 
 
 def most_steps(num_steps: int) -> int:
-    """Return the maximum number of steps on a ray through a box whose diagonal is `num_steps` steps long."""
+    """Return the maximum number of steps on a ray through a box with a diagonal of `num_steps` steps."""
     return num_steps + 2  # one is cut off at each end
 
 
@@ -120,7 +120,7 @@ def most_steps(num_steps: int) -> int:
 def fill(
     rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, capacities: tuple[int, int]
 ) -> Filled:
-    """Return the steps of rays whose middle is in an occupied cell, in a fixed number of slots.
+    """Return the steps of rays with their middle in an occupied cell, in a fixed number of slots.
 
     They are the steps of `nerfloom.kernels.march.waves.candidates`, for even steps.
 
@@ -146,7 +146,7 @@ def fill_reference(
     count, device, (runs_capacity, capacity) = len(rays), rays.origins.device, capacities
     enter, leave, first, steps = step_range(rays, occupancy, step, 0.0, shift)
     slices = occupancy.slices_of(rays.times)
-    # All possible runs of all rays: one look-up each, then one position each for those that count.
+    # All possible runs of all rays: one look-up each, then one position each for the runs that count.
     most = math.ceil(most_steps(num_steps) / RUN)
     owners = torch.arange(count, device=device).repeat_interleave(most)
     run = torch.arange(most, device=device).repeat(count)

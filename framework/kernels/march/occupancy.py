@@ -24,7 +24,7 @@ from nerfloom.kernels.triton_backend import later
 BLOCK = 4
 """Cells along an edge of a block; a block is a cell of the coarser level."""
 ROUNDING = 1e-5
-"""Relative tolerance of the mean opacity, so that rounding errors do not empty a grid whose cells are all equal."""
+"""Relative tolerance of the mean opacity, so that rounding errors do not empty a grid of equal cells."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def refresh_occupancy_reference(
 def refresh_occupancy(
     density: Tensor, occupied: Tensor, decay: float, step: float, threshold: float, elsewhere: float = 0.0
 ) -> None:
-    """Mark, in place, the cells whose opacity over one step is at least a threshold.
+    """Mark, in place, the cells with an opacity over one step of at least a threshold.
 
     Args:
         density: (n^3,) density of each cell, 1/length, multiplied by `decay` in place; infinite if unknown. NaN cells

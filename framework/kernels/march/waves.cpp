@@ -1,9 +1,9 @@
-// Marching rays through an occupancy grid, one wave at a time. See ../march.py for the reference.
+// Marching rays through an occupancy grid, one wave at a time. See waves.py for the reference.
 //
 // A ray's candidates are the steps first + k * step (growing with distance beyond step / cone). A wave finds the next
-// `limit` candidates of every active ray whose middle lies in an occupied cell; blocks of 4^3 empty cells are skipped
-// at once. With nested boxes, each twice as large, the smallest box that contains the middle decides. The middle of a
-// larger box covers the smaller ones, so a box can be traversed by its own blocks up to its faces.
+// `limit` candidates of every active ray that have their middle in an occupied cell; blocks of 4^3 empty cells are
+// skipped at once. With nested boxes, each twice as large, the smallest box that contains the middle decides. The
+// middle of a larger box covers the smaller ones, so a box can be traversed by its own blocks up to its faces.
 #include "march/waves.h"
 
 using namespace marching;
@@ -41,7 +41,7 @@ EXPORT int pack_occupancy(const uint8_t* occupied, int resolution, uint8_t* bits
     return DONE;
 }
 
-// Marks the cells whose opacity over one step is at least `threshold`, or the mean opacity if that is less. `elsewhere`
+// Marks the cells with an opacity over one step of at least `threshold`, or the mean opacity if it is less. `elsewhere`
 // replaces the mean if it is larger. The grid of densities is multiplied by `decay` first. NaN cells are marked and
 // left out of the mean.
 EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float step, float threshold,
@@ -77,7 +77,7 @@ EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float s
         double total = 0, count = 0;
         for (double part : opacity) total += part;
         for (int64_t part : known) count += double(part);
-        constexpr double ROUNDING = 1e-5;  // see ../march.py
+        constexpr double ROUNDING = 1e-5;  // see occupancy.py
         const float mean = float(total / count * (1 - ROUNDING));
         const float least = std::min(threshold, std::max(mean, elsewhere));  // the threshold if all are NaN
         const float density_threshold = -std::log1p(-std::min(least, 1 - 1e-7f)) / step;
@@ -88,7 +88,7 @@ EXPORT int refresh_occupancy(float* density, int64_t cells, float decay, float s
     });
 }
 
-// The distances at which each ray enters and leaves the box, and its first step: `enter` minus a fraction of a step.
+// The distances where each ray enters and leaves the box, and its first step: `enter` minus a fraction of a step.
 // `hits`: number of rays that hit the box; their indices are written to `alive`.
 EXPORT int march_begin(const float* origins, const float* directions, const float* nears, const float* fars,
                        const float* shift, int64_t rays, const float* box, float step, float* enter, float* leave,

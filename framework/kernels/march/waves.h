@@ -1,4 +1,4 @@
-// Rays through an occupancy grid, shared by march.cpp (waves) and trace.cpp (traces). See ../march.py.
+// Rays through an occupancy grid, shared by waves.cpp (waves) and trace.cpp (traces). See waves.py.
 #pragma once
 
 #include "runtime/common.h"
@@ -95,7 +95,7 @@ struct Ray {
         std::memcpy(&bits, &farthest, sizeof bits);
         return std::clamp(int(bits >> 23) - 126, 0, levels - 1);
     }
-    // Distance at which the ray leaves the cube of `size` cells that contains cell c, plus `more` cells around it.
+    // Distance where the ray leaves the cube of `size` cells that contains cell c, plus `more` cells around it.
     float leave(FourInts c, int size, int more) const {
         const FourInts corner = (c & -size) + (forward ? FourInts{} + (size + more) : FourInts{} - more);
         const Four t = (__builtin_convertvector(corner, Four) - origin) * inverse;

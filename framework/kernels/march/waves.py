@@ -1,7 +1,7 @@
 """Marching of rays through an occupancy grid, in waves.
 
 The candidates of a ray are the steps first + k * step, which grow with distance beyond step / cone (Instant-NGP,
-Mueller et al. 2022, appendix E.1). Candidates whose middle lies in an occupied cell are samples. A wave consists of the
+Mueller et al. 2022, appendix E.1). Candidates with their middle in an occupied cell are samples. A wave consists of the
 next few samples of every active ray. When their density is known, `advance` ends rays with low transmittance. So hidden
 samples are not evaluated, and no sample is evaluated twice. Finally, `rest` adds a sample for all space behind the
 grid. On devices other than the CPU a wave costs more than unnecessary samples: the form in PyTorch takes all samples in
@@ -291,7 +291,7 @@ MARCH.implementation(TRITON)(later("march.waves_triton", "TritonMarch"))
 
 
 def step_start(first: Tensor, k: Tensor, step: float, cone: float) -> Tensor:
-    """Return the distances (N,) where steps `k` (N,) start on rays whose step 0 starts at `first` (N,).
+    """Return the distances (N,) where steps `k` (N,) start on rays with step 0 at `first` (N,).
 
     Steps have the length `step` while it exceeds `cone` * t, and then grow by the factor 1 + `cone`.
     """
@@ -330,7 +330,7 @@ def step_range(
 def candidates(
     rays: Rays, occupancy: Occupancy, step: float, cone: float, shift: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-    """Return all steps whose middle is in an occupied cell.
+    """Return all steps with their middle in an occupied cell.
 
     `rays`, `occupancy`, `step`, `cone` and `shift` are as in `march`.
 

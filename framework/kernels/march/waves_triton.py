@@ -111,7 +111,7 @@ def _level(x, y, z, half, levels):
 
 @triton.jit
 def _shrunk(position, size, half):
-    """Return a position in cells of a larger box, whose cells have this size; unchanged if it is 1."""
+    """Return a position in cells of a larger box with cells of this size; unchanged if it is 1."""
     return tl.where(size == 1, position, (position - half) * size + half)
 
 

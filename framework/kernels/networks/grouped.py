@@ -169,7 +169,7 @@ def grouped_density_mlp(
     widths: Sequence[int],
     deferred: RowGradient | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return the density (N,) and features (N, D_out) of networks whose first output is the log-density.
+    """Return the density (N,) and features (N, D_out) of networks with the log-density as first output.
 
     It equals `nerfloom.kernels.math.split_density` of `grouped_mlp`, except that the first feature is the number of the
     row's network, without a gradient, so that other networks of the same cells can follow. Numbers below 2^24 are
@@ -266,7 +266,7 @@ class _Call:
 class _Grouped(torch.autograd.Function):
     """The compiled form of `grouped_mlp`, or of `grouped_density_mlp` if the plan says so.
 
-    Backward recomputes hidden layers, and skips rows whose gradient is 0.
+    Backward recomputes hidden layers, and skips rows with a gradient of 0.
     """
 
     @staticmethod
@@ -285,7 +285,7 @@ class _Grouped(torch.autograd.Function):
             return out
 
         def its_density() -> Tensor:
-            if density is None:  # the outputs are those of a recorded call
+            if density is None:  # a recorded call computed the outputs
                 compute()
             assert density is not None
             return density
@@ -373,5 +373,5 @@ def _apply(
 
 
 def _with_adjacent_features(part: Tensor) -> Tensor:
-    """Return an input whose features follow each other in memory; its rows may lie apart."""
+    """Return an input with features that follow each other in memory; its rows may lie apart."""
     return part if part.stride(1) == 1 else part.contiguous()

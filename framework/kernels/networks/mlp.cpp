@@ -1,4 +1,4 @@
-// Small fully connected networks, ReLU between layers, in float32. See ../mlp.py for the reference.
+// Small fully connected networks, ReLU between layers, in float32. See mlp.py for the reference.
 //
 // Samples pass through all layers in blocks that stay in cache; only the result leaves it. The backward pass recomputes
 // a block's hidden layers, which costs less than writing them to memory and reading them back. Samples with zero
@@ -18,7 +18,7 @@ std::unique_ptr<Layers> mlp::layers_bf16_of(const int64_t*, int, const float* co
 }
 #endif
 
-// The input is `parts` arrays (count, part_widths[p]) side by side; widths are those of the input and every layer.
+// The input is `parts` arrays (count, part_widths[p]) side by side; widths: of the input and every layer.
 // density (count), or null: exp of the first output, clamped at exp(15).
 EXPORT int mlp_forward(const float* const* inputs, const int64_t* part_widths, int parts, int64_t count,
                        const int64_t* widths, int layers, const float* const* weights, const float* const* biases,

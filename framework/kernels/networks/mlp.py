@@ -62,9 +62,9 @@ _backward_bf16 = native.Function("mlp_backward_bf16", "ppiqpippippppppi")
 
 
 class _MLP(torch.autograd.Function):
-    """The compiled form of `mlp`, or of `density_mlp` if the plan says so, whose results it returns.
+    """The compiled form of `mlp`, or of `density_mlp` if the plan says so.
 
-    Backward recomputes hidden layers, and skips samples whose gradient is 0.
+    Backward recomputes hidden layers, and skips samples with a gradient of 0.
     """
 
     @staticmethod
@@ -231,7 +231,7 @@ def _apply(
 def density_mlp(
     inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the density (N,) and the outputs (N, D_out) of a network whose first output is the log-density.
+    """Return the density (N,) and the outputs (N, D_out) of a network with the log-density as first output.
 
     It equals `nerfloom.kernels.math.split_density` of `mlp`, without separate passes over the outputs and their
     gradient.

@@ -2,12 +2,12 @@
 //
 // A form has
 //   Value, the type of an activation;
-//   Prepared, which stands on the stack of a thread while it computes;
+//   Prepared, an object on the stack of a thread while it computes;
 //   Network(widths, layers, weights, biases): `width` of the input and of each layer, padded to `rows` for a row of
 //     activations and to `columns` for a row of sums;
-//   Block, the activations of BLOCK rows: layer[l] is the input of layer l, output(network) what the last has given,
+//   Block, the activations of BLOCK rows: layer[l] is the input of layer l, output(network) the last layer's output,
 //     before its activation function;
-//   Gradient, what the way back needs; start(block, gradient) is where the output's gradient is to stand;
+//   Gradient, memory of the backward pass; start(block, gradient) takes the output's gradient;
 //   read_input and run_forward, which fill a block, and run_backward, which adds to `sums` and returns the gradient of
 //     the input (columns wide).
 #pragma once

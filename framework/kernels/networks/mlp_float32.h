@@ -68,7 +68,7 @@ struct Float {
     }
 
     // Not inline, because they are called from several places. `count` is the number of rows in use, a multiple of
-    // ROW_STEP. to_input: whether the gradient of the input is needed; without it the result is of no use.
+    // ROW_STEP. to_input: whether the gradient of the input is needed; without it the result is undefined.
     __attribute__((noinline)) static void run_forward(const Network& net, Block& block, int count = BLOCK) {
         for (int l = 0; l < net.layers; l++) {
             const int in = net.rows[l], out = net.rows[l + 1];

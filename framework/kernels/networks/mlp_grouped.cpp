@@ -1,4 +1,4 @@
-// Many small networks of the same shape, each for some of the rows. See ../grouped.py for the reference.
+// Many small networks of the same shape, each for some of the rows. See grouped.py for the reference.
 //
 // Rows are sorted by network. The rows of a network pass through its layers in blocks, while its weights are in the
 // cache. A network without rows costs nothing. A thread takes a piece of one network's rows at a time; the pieces do
@@ -159,7 +159,7 @@ void run_backward(const Groups& groups, const Inputs& input, const float* table,
             Float::run_forward(net, block, in_use);
             float* start = Float::start(block, gradient);
             read_output_gradient(incoming, columns[layers], rows, live, activation, block.output(net), start);
-            for (int r = 0; incoming.density && r < live; r++)  // the first output is only that of the density
+            for (int r = 0; incoming.density && r < live; r++)  // the first output is only the density's
                 start[r * columns[layers]] =
                     incoming.density_grad ? incoming.density_grad[rows[r]] * incoming.density[rows[r]] : 0;
             const float* dx = Float::run_backward(net, block, gradient, places, sums, in_use, to_input);
@@ -206,9 +206,9 @@ EXPORT int group_rows(const int64_t* owners, int64_t count, int64_t networks, in
     });
 }
 
-// The input is `parts` arrays (rows, part_widths[p]) side by side, whose rows are part_strides[p] apart. order,
-// networks and starts are those of group_rows. table (networks, parameters): a row for each network, as in Layout.
-// widths are those of the input and every layer. out (rows, outputs). density (rows), or null: exp of the first output,
+// The input is `parts` arrays (rows, part_widths[p]) side by side, with rows part_strides[p] apart. order, networks and
+// starts come from group_rows. table (networks, parameters): a row for each network, as in Layout.
+// widths: of the input and every layer. out (rows, outputs). density (rows), or null: exp of the first output,
 // clamped at exp(15); the number of the network then takes the place of the first output.
 EXPORT int grouped_mlp_forward(const float* const* inputs, const int64_t* part_widths, const int64_t* part_strides,
                                int parts, const int64_t* order, const int32_t* networks, const int64_t* starts,
@@ -222,8 +222,8 @@ EXPORT int grouped_mlp_forward(const float* const* inputs, const int64_t* part_w
 }
 
 // The gradients of the output, `grad`, and of the density may be null. If there is a density, the gradient of the first
-// output is not used. Writes the gradients of the inputs (null parts are skipped) and, unless it is null, those of the
-// table's rows of `networks`: table_grad (groups, parameters).
+// output is not used. Writes the gradients of the inputs (null parts are skipped) and, unless it is null, the gradients
+// of the table's rows of `networks`: table_grad (groups, parameters).
 EXPORT int grouped_mlp_backward(const float* const* inputs, const int64_t* part_widths, const int64_t* part_strides,
                                 int parts, const int64_t* order, const int32_t* networks, const int64_t* starts,
                                 int64_t groups, const float* table, const int64_t* widths, int layers, int activation,

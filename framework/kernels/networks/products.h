@@ -39,7 +39,7 @@ inline void product_columns(const float* x, int ldx, const float* w, int ldw, in
         product_tile<ROWS, VECTORS>(x + r * ldx, ldx, w, ldw, inner, y + r * ldy, ldy);
 }
 
-// Number of vectors of a row summed at once: as many as registers hold.
+// Number of vectors of a row summed at once: they fill the registers.
 constexpr int WIDE = LANES == 16 ? 4 : 2;
 
 inline void product(const float* x, int ldx, const float* w, int inner, int width, float* y, int ldy,

@@ -5,8 +5,8 @@ cells, their octants of 4^3, and cells. A dense grid of bricks says where they a
 nearest one is, so that a ray passes it in few steps. An octant is a bit set of its cells, as in Laine and Karras 2010,
 "Efficient sparse voxel octrees", and the leaves of an octant follow each other.
 
-A grid may have coarser ones around it, each with cells of twice the edge. They show what lies outside of its box, and
-what a ray meets where its pixel is much wider than a cell (`walk.py`).
+A grid may have coarser ones around it, each with cells of twice the edge. They show the space outside of its box, and
+serve rays where their pixel is much wider than a cell (`walk.py`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_BRICKS = 2**24
 MAX_LEVELS = 24
 """Maximum number of grids around one another, as in `walk.h`."""
 BRICKS_AT_ONCE = 2**12
-"""Number of bricks whose cells are listed together; each takes some kilobytes meanwhile."""
+"""Number of bricks that list their cells together; each takes some kilobytes meanwhile."""
 
 
 class Tables(NamedTuple):
@@ -65,10 +65,10 @@ class OctreeLayout:
     firsts: Tensor
     """(B, 8) int32 index of the first leaf of each octant."""
     own_leaves: int
-    """Number of leaves, without those of coarser grids."""
+    """Number of leaves, without the leaves of coarser grids."""
     coarser: OctreeLayout | None = None
-    """The grid with cells of twice the edge, whose box contains this one's; None if there is none. Leaves are numbered
-    grid by grid, those of the finest first."""
+    """The grid with cells of twice the edge around this one; None if there is none. Leaves are numbered grid by grid,
+    from the finest."""
 
     @classmethod
     def build(cls, origin: Tensor, cell: float, size: Sequence[int], cells: Tensor) -> tuple[OctreeLayout, Tensor]:

@@ -1,4 +1,4 @@
-"""Light along rays through an octree whose leaves are bytes."""
+"""Light along rays through an octree with leaves in bytes."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ class PackedLeaves:
 def trace_packed(
     layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
 ) -> OctreeLight:
-    """Return the light of R rays through an octree whose leaves are bytes, without gradient.
+    """Return the light of R rays through an octree with leaves in bytes, without gradient.
 
     Args:
         layout: where the L leaves are.
         leaves: their values.
-        rays: the rays. With `pixel_radii`, coarser levels show what is small in a pixel (`smallest_cells`).
+        rays: the rays. With `pixel_radii`, coarser levels show matter that is small in a pixel (`smallest_cells`).
         background: (R, 3) or (3,) colour of the background.
         stop: transmittance below which a ray ends; see `error_bound`.
     """

@@ -1,4 +1,4 @@
-// Light along rays through an octree: colour, opacity and depth, and the gradient of its leaves. See ../light.py for the
+// Light along rays through an octree: colour, opacity and depth, and the gradient of its leaves. See light.py for the
 // reference and the equations.
 #include "encodings/harmonics.h"
 #include "octree/walk.h"
@@ -177,7 +177,7 @@ struct Incoming {  // gradients of R rays
     const float *color, *opacity, *background;
 };
 
-// A ray's visits. Behind a leaf, the ray shows `behind`: the light of what follows and of the background.
+// A ray's visits. Behind a leaf, the ray shows `behind`: the light of all leaves behind and of the background.
 void differentiate(const std::vector<Record::Part>& met, int32_t ray, const float* y, const Raw& leaves,
                    const Incoming& grad, std::vector<Visit>& visits) {
     const int n = leaves.values, basis = n / 3;

@@ -1,4 +1,4 @@
-"""Light along rays through an octree whose leaves are learnt; `light.py` has the equations."""
+"""Light along rays through an octree with trainable leaves; `light.py` has the equations."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Light along rays through an octree, in Triton. `walk.py` and `light.py` have the definition.
 
-The backward pass walks again: what a ray shows behind a leaf is the whole light minus the leaf and everything in front
-of it. The gradient of the leaves is accumulated by atomic operations, so its rounding errors depend on the order of
+The backward pass walks again: the light behind a leaf is the whole light minus the leaf and everything in front of it.
+The gradient of the leaves is accumulated by atomic operations, so its rounding errors depend on the order of
 execution.
 """
 
@@ -181,8 +181,8 @@ def _run(
         out: colour, opacity, moment, median and visits, which are written; in the backward pass colour and opacity are
             read, and the others None.
         peaks: (L,) largest weights, which are raised; None for none.
-        gradients: of the colour, of the opacity or None, and those of `values` and `colors`, which are added to; all
-            None in the forward pass.
+        gradients: of the colour, of the opacity or None, and of `values` and `colors`, which are added to; all None in
+            the forward pass.
     """
     tables, count, width = layout.tables, len(rays), 3 if colors is None else colors.shape[1]
     limited = smallest is not None and layout.coarser is not None

@@ -1,4 +1,4 @@
-// The leaves of an octree along rays, in order. See ../layout.py for the structure, ../walk.py for the reference.
+// The leaves of an octree along rays, in order. See layout.py for the structure, walk.py for the reference.
 //
 // A vector of rays walks together, one ray a lane; a ray that ends is replaced by the next, so no lane waits. Each step
 // finds the largest known empty block around the ray's cell (or the cell, if it is a leaf) and moves to its far side.
@@ -15,8 +15,8 @@
 namespace octree {
 
 constexpr int BRICK = 8, OCTANT = 4;  // cells along an edge
-constexpr int MAX_LEVELS = 24;        // grids around one another; see ../layout.py
-constexpr float FARTHEST = 1 << 20;   // largest coordinate of an origin, in cells; see ../walk.py
+constexpr int MAX_LEVELS = 24;        // grids around one another; see layout.py
+constexpr float FARTHEST = 1 << 20;   // largest coordinate of an origin, in cells; see walk.py
 
 struct Grid {
     const float* origin;    // (3) corner of the first cell
@@ -24,11 +24,11 @@ struct Grid {
     const int64_t* size;    // (3) bricks along each axis
     const int32_t* bricks;  // (X Y Z) index of a brick, or minus the distance in bricks to the nearest one
     const int64_t* masks;   // (B, 8) leaves of each octant, a bit each
-    const int32_t* firsts;  // (B, 8) index of each octant's first leaf, among those of the grid
+    const int32_t* firsts;  // (B, 8) index of each octant's first leaf, within the grid
     int32_t first;          // index of the grid's first leaf
 };
 
-struct Layout {  // grids around one another, each with cells of twice the edge of those of the one before
+struct Layout {  // nested grids; each has cells of twice the edge of the one before
     Grid grids[MAX_LEVELS];
     int count;
 
@@ -61,7 +61,7 @@ inline void fetch(const T* from, int count = 1) {
     __builtin_prefetch(bytes + count * sizeof(T) - 1);
 }
 
-// The walk of one ray in each lane. `Light` follows what a ray has met:
+// The walk of one ray in each lane. `Light` follows the leaves that a ray meets:
 //   start(lane, ray); finish(lane, ray); expect(leaf): it is met soon, and its values should be on their way.
 //   meet(passage, ends): a step of all lanes through leaves; sets ends for rays that end.
 template <typename Light>

@@ -18,12 +18,12 @@ from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.octree.layout import BRICK, OCTANT, OctreeLayout
 
 FARTHEST = 2.0**20
-"""Maximum coordinate of a ray's origin, in cells; a ray from further away meets no leaf. From there an octree of 1024
-cells is as large as a pixel. Where float32 does not tell cells apart, a walk could go in circles."""
+"""Maximum coordinate of a ray's origin, in cells; a ray from further away meets no leaf. Seen from there, an octree of
+1024 cells covers a pixel. Where float32 does not tell cells apart, a walk could go in circles."""
 SMALLEST = 1e-12
 """Minimum magnitude of a direction's coordinate, in cells per scene unit; smaller ones are replaced by it."""
 CELLS_PER_PIXEL = 3.0
-"""Maximum width of a pixel, in cells; a coarser level shows what is farther away. The cells of that level are a third
+"""Maximum width of a pixel, in cells; a coarser level shows matter farther away. The cells of that level are a third
 to two thirds of a pixel wide. Baked cells are about half as wide as a pixel of the photographs, so views like these are
 shown by the finest level alone."""
 
@@ -60,7 +60,7 @@ def leaf_samples(layout: OctreeLayout, rays: Rays, smallest: Tensor | None = Non
 def leaf_at(layout: OctreeLayout, positions: Tensor) -> Tensor:
     """Return the leaf (N,) int64 at `positions` (N, 3) in scene units; -1 where `layout` has none.
 
-    Of several levels, the finest has it whose box contains the position.
+    With several levels, the finest level with the position in its box has the leaf.
     """
     leaves = torch.full_like(positions[:, 0], -1, dtype=torch.int64)
     unknown = torch.ones_like(leaves, dtype=torch.bool)
@@ -103,7 +103,7 @@ def _stretches(ranges: Sequence[Range]) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Yield the stretches of rays in each level, front to back: its index, and where they begin and end (R,).
 
     Args:
-        ranges: where each level may show rays; those of a level contain those of finer levels.
+        ranges: where each level may show rays; a level's ranges contain the ranges of finer levels.
     """
     nested = list[Range]()
     for begin, end in reversed(ranges):
@@ -119,7 +119,7 @@ def _stretches(ranges: Sequence[Range]) -> Iterator[tuple[int, Tensor, Tensor]]:
 
 
 def _walked(layout: OctreeLayout, first: int, line: Line, begin: Tensor, end: Tensor) -> list[tuple[Tensor, ...]]:
-    """Return what rays meet in a level, step by step: indices of rays, leaves, and where these begin and end."""
+    """Return the leaves that rays meet in a level, step by step: indices of rays, leaves, and their ends."""
     place, along = line
     top = BRICK * torch.tensor(layout.size, device=place.device)
     t, far, found = begin.clone(), end, list[tuple[Tensor, ...]]()

@@ -117,7 +117,7 @@ def _change(
     origins, directions, nears, fars, smallest, frames, numbers, r, here, leaving, level, far, t, x, y, z, levels,
     LIMITED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Return levels, their ends, and `_place`, of rays after those that are leaving their level are in another."""
+    """Return levels, their ends, and `_place`, of rays after all rays that are `leaving` have entered another level."""
     other, end, _ = _enter(
         origins, directions, nears, fars, smallest, frames, numbers, r, leaving, t, levels, LIMITED, BLOCK
     )
@@ -166,7 +166,7 @@ def _side(low, size, p, d):
 
 @triton.jit
 def _moved(low, size, side, leave, p, d, reach):
-    """Return the next cell along an axis: behind the side that a ray leaves by, else that of its position."""
+    """Return the next cell along an axis: behind the side that a ray leaves by, else the cell of its position."""
     cell = tl.minimum(tl.maximum(p + reach * d, 0.0), 1e9).to(tl.int32)
     cell = tl.minimum(tl.maximum(cell, low), low + size - 1)
     return tl.where(leave <= reach, tl.where(d > 0, side, side - 1), cell)

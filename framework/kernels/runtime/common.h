@@ -70,7 +70,7 @@ static inline Floats magnitude(Floats x) {
     return x;
 }
 
-// exp(x) as power * (1 + rest): 2^n from the exponent's bits, and Cephes' polynomial (expf), which is as small as x.
+// exp(x) as power * (1 + rest): 2^n from the exponent's bits, and Cephes' polynomial (expf), small for small x.
 static inline void split_exponential(Floats x, Floats& power, Floats& rest) {
     const Floats clipped = smaller(larger(x, splat(-87.3f)), splat(88.3f));
     const Ints n = __builtin_convertvector(clipped * 1.44269504f + (clipped < 0 ? splat(-0.5f) : splat(0.5f)), Ints);
@@ -105,7 +105,7 @@ static inline Floats opacity_of(Floats x) {
 
 constexpr float MAX_OPTICAL_DEPTH = 1e3f, MAX_FLOAT = 3.402823466e38f;
 
-// Optical depth of an interval; see ../compositing.py.
+// Optical depth of an interval; see compositing/density.py.
 static inline float optical_depth(float sigma, float delta) {
     const float density = sigma > MAX_FLOAT ? MAX_FLOAT : sigma;  // infinity * 0 would be NaN
     const float length = delta > MAX_FLOAT ? MAX_FLOAT : delta;

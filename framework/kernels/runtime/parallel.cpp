@@ -22,7 +22,7 @@ namespace {
 typedef std::chrono::steady_clock Clock;
 using std::chrono::microseconds;
 
-// Time for which a thread polls for work, or for the end of a region, before it sleeps. If a thread has a core to
+// Time that a thread polls for work, or for the end of a region, before it sleeps. If a thread has a core to
 // itself, this is longer than most gaps between the regions of a step, because a wake-up takes tens of microseconds. If
 // another program needs the core, polling uses up time that the system would otherwise give us later.
 constexpr microseconds PATIENCE(2000), CROWDED_PATIENCE(10);

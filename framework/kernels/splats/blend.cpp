@@ -1,4 +1,4 @@
-// Blending the Gaussians of each tile from front to back, forward and backward. See ../splat_blend.py.
+// Blending the Gaussians of each tile from front to back, forward and backward. See blend.py.
 //
 // A tile of TILE x TILE pixels consists of blocks of LANES pixels, 4 across: a vector holds a block. For each Gaussian
 // of the tile's list, only the blocks that its ellipse meets are evaluated. They are found for TOGETHER entries before
@@ -13,7 +13,7 @@ namespace {
 constexpr int ACROSS = 4, DOWN = LANES / ACROSS;  // pixels of a block
 constexpr int COLUMNS = TILE / ACROSS, ROWS = TILE / DOWN, BLOCKS = COLUMNS * ROWS;
 constexpr int64_t TOGETHER = 32;
-constexpr int64_t AHEAD = 8;  // entries whose memory is fetched before it is used
+constexpr int64_t AHEAD = 8;  // entries that are fetched ahead of their use
 
 #if defined(__AVX512F__)
 // 2^x for x in [-126, 0], to 2 units in the last place: 2^(k / 16) of the nearest sixteenth from a table in a register,
@@ -51,8 +51,8 @@ inline Floats power_of_two(Floats x) {
 }
 #endif
 
-// The lanes where a comparison holds, among those of `within`. AVX-512 has registers of bits for them; compilers make
-// vectors of whole lanes of comparisons that are combined.
+// The lanes where a comparison holds, among the lanes of `within`. AVX-512 has registers of bits for them; compilers
+// make vectors of whole lanes of comparisons that are combined.
 #if defined(__AVX512F__)
 typedef __mmask16 Mask;
 constexpr Mask EVERYWHERE = 0xffff;
@@ -89,7 +89,7 @@ inline bool lets_through(Floats through) {
     return __builtin_expect_with_probability(bits(at_most(splat(OPAQUE), through)) != 0, true, 0.999);
 }
 
-// Blocks of a tile: bit TILE c + r is set for the block in column c whose first row of pixels is r.
+// Blocks of a tile: bit TILE c + r is set for the block in column c that starts at row r of pixels.
 typedef uint64_t Blocks;
 static_assert(COLUMNS * TILE == 64, "a tile's blocks have a bit each");
 constexpr Blocks FIRST_ROWS = ~Blocks(0) / ((Blocks(1) << DOWN) - 1);
@@ -194,7 +194,7 @@ struct Reach {
     }
 };
 
-// What one Gaussian is at the pixels of a tile.
+// One Gaussian at the pixels of a tile.
 struct Shape {
     float x, y;  // of the tile's first pixel's centre, from the Gaussian's
     float u_x, u_y, v_y, cut, opacity;
@@ -204,7 +204,7 @@ struct Shape {
     // Where the offset from the tile's first pixel is (across, down).
     Floats u(Floats across, Floats down) const { return u_x * (across + x) + u_y * (down + y); }
     Floats v(Floats down) const { return v_y * (down + y); }
-    // Of u^2 + v^2.
+    // Alpha from q = u^2 + v^2.
     Floats alpha(Floats q) const { return opacity * power_of_two(smaller(q, splat(80)) * -LOG2_E); }
 };
 
@@ -364,9 +364,9 @@ void check_tile(const int32_t* offsets, int64_t tile, int64_t entries, const int
 }  // namespace
 
 // The image (height, width, channels): colours over the background (3), then, of 4 channels, the sum of weight times
-// distance, and of 7 the sum of the normals. The transmittance (height, width). If median is not null, the distance at
-// which half of the light is gone, or 0. How many entries of each tile's list were used and, if blended (entries) is not
-// null, in which blocks of the tile.
+// distance, and of 7 the sum of the normals. The transmittance (height, width). If median is not null, the distance
+// where half of the light is gone, or 0. The number of entries used in each tile's list and, if blended (entries) is
+// not null, the blocks of the tile that each was used in.
 EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids, int64_t entries,
                        int width, int height, int channels, const float* background, float* image, float* through,
                        float* median, uint64_t* blended, int32_t* used, int threads) {

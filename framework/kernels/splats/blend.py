@@ -154,7 +154,7 @@ class _OfEachPixel(torch.autograd.Function):
 def _blend_together(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Compute `blend` for many tiles at once, those with lists of similar lengths together.
+    """Compute `blend` for many tiles at once; tiles with lists of similar lengths go together.
 
     Synchronises once, for the lengths. If not all tiles fit into memory, the backward pass computes them again.
     """

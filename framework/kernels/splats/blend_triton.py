@@ -44,7 +44,7 @@ from nerfloom.kernels.triton_launch import blocks, launch
 BATCH = 8
 """Gaussians that are evaluated together."""
 BLOCK = 32
-"""Gaussians whose entries' sums are added up together."""
+"""Number of Gaussians that add up the sums of their entries together."""
 TILE, PIXELS = tl.constexpr(tiles.TILE), tl.constexpr(tiles.TILE**2)
 MAX_ALPHA, OPAQUE = tl.constexpr(blending.MAX_ALPHA), tl.constexpr(blending.OPAQUE)
 SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY = (tl.constexpr(k) for k in range(5))
@@ -71,7 +71,7 @@ def _column(record, listed, k: tl.constexpr):
 def _alphas(record, listed, x, y, through):
     """Return the offsets (P, G) of pixels from Gaussians, alphas before and after they are bounded, and transmittances.
 
-    The transmittances are those in front of each Gaussian; alphas are 0 where nothing is blended.
+    Each transmittance is in front of the Gaussian; alphas are 0 where nothing is blended.
     """
     dx, dy = x[:, None] - _column(record, listed, X), y[:, None] - _column(record, listed, Y)
     u = _column(record, listed, U_X) * dx + _column(record, listed, U_Y) * dy

@@ -39,15 +39,15 @@ struct Packed {
     }
 };
 
-// Sides of the image, as planes through the camera. No Gaussian is on the image whose centre p has n . p > per_reach
+// Sides of the image, as planes through the camera. No Gaussian is on the image if its centre p has n . p > per_reach
 // times its reach.
 struct Sides {
     float n[4][3], length[4], per_reach[4];
     int count = 0;
     explicit Sides(const Camera& c) {
         if (c.lens || c.unscented) return;  // a lens bends the sides; blocks behind the camera are still found
-        // x / z of a centre and half the width of what is drawn around it: fx reach sqrt(1 + (x/z)^2) / z, where x / z
-        // is bounded as in the Jacobian, and the root of what the blur adds, of a CUT of at most log(255).
+        // x / z of a centre and half the width of the area drawn around it: fx reach sqrt(1 + (x/z)^2) / z, where x / z
+        // is bounded as in the Jacobian, and the root of the blur's part, of a CUT of at most log(255).
         const float blur = std::sqrt(2 * std::log(1 / MIN_ALPHA) * c.blur);
         const float wide = c.fx * std::sqrt(1 + std::max(c.low_x * c.low_x, c.high_x * c.high_x));
         const float high = c.fy * std::sqrt(1 + std::max(c.low_y * c.low_y, c.high_y * c.high_y));
@@ -90,8 +90,8 @@ void project(const Packed<Stored>& in, const float* balls, int64_t blocks, int b
 }  // namespace
 
 // Records of `blocks` blocks of PACK Gaussians, (blocks * PACK, RECORD). One that is not visible has a CUT of 0, and
-// anything elsewhere. Blocks whose ball, (blocks, 5) centre, radius and longest reach, is not on the image are not read.
-// The harmonics are floats or, if `halves`, bfloat16.
+// anything elsewhere. A block is not read if its ball, (blocks, 5) centre, radius and longest reach, is not on the
+// image. The harmonics are floats or, if `halves`, bfloat16.
 EXPORT int splat_project_packed(const float* values, const void* harmonics, int halves, const float* balls, int64_t blocks,
                                 int basis, int stride, const double* settings, float* records, int threads) {
     return guarded([&] {

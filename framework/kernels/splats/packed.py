@@ -1,7 +1,7 @@
 """Projection of Gaussians that do not change, packed to be drawn many times.
 
 A block of PACK Gaussians stores each parameter contiguously, so that a kernel loads vectors instead of gathering from
-rows. Coefficients of harmonics may take two bytes. Blocks whose ball is not on the image are skipped.
+rows. Coefficients of harmonics may take two bytes. A block is skipped if its ball is not on the image.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-// Projection of Gaussians to an image, forward and backward. See ../splat_project.py for the reference and equations.
+// Projection of Gaussians to an image, forward and backward. See project.py for the reference and equations.
 #include "splats/project.h"
 
 #include <vector>
@@ -36,7 +36,7 @@ inline void put(float* table, int64_t from, int64_t count, int width, int c, Flo
     for (int i = 0; i < LANES && from + i < count; i++) table[(from + i) * width + c] = out[i];
 }
 
-// The gradients of the centre and of the axes in the camera's frame, from those of SigmaPoints::backward.
+// The gradients of the centre and of the axes in the camera's frame, from the results of SigmaPoints::backward.
 inline void through_points(const Projected& g, Ints visible, const Floats* of_shape, Floats* of_p, Floats (*of_v)[3]) {
     float given[6][LANES], centers[3][LANES] = {}, axes[3][3][LANES] = {};
     int32_t shown[LANES];

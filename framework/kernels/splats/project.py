@@ -76,8 +76,8 @@ class SplatCamera:
     height: int
     """Height of the image, pixels."""
     near: float = 0.01
-    """Gaussians whose centre has a smaller depth along the optical axis are not drawn, scene units; if the camera is
-    `all_around`, those whose centre has a smaller distance."""
+    """Minimum depth of a centre along the optical axis, or its minimum distance if the camera is `all_around`;
+    Gaussians closer than this are not drawn, scene units."""
     blur: float = BLUR
     """Variance added in both directions on the image, pixels^2."""
     antialiased: bool = False
@@ -98,7 +98,7 @@ class SplatCamera:
 
     @property
     def turn(self) -> float | None:
-        """Width of a whole turn of a panorama, pixels, after which positions repeat; None for other images."""
+        """Width of a whole turn of a panorama, the period of positions, pixels; None for other images."""
         return TURN * self.intrinsics[0] if self.model == "equirectangular" else None
 
     def plain(self) -> list[float]:

@@ -134,7 +134,8 @@ def _forward(
     red = _color(colors, coefficients, n, here, stride, 0, dx, dy, dz, BASIS)
     green = _color(colors, coefficients, n, here, stride, 1, dx, dy, dz, BASIS)
     blue = _color(colors, coefficients, n, here, stride, 2, dx, dy, dz, BASIS)
-    # A number times 0 is 0 only if it is finite. What overflows on the way is not visible either, but not counted.
+    # A number times 0 is 0 only if it is finite. A Gaussian with an overflow on the way is not visible either, but not
+    # counted.
     given = (x + y + z) * 0 + (l0 + l1 + l2) * 0 + (w + i + j + k + norm) * 0 + logit * 0 + (red + green + blue) * 0
     computed = (u + v) * 0 + (u_x + u_y + v_y + cut) * 0 + (reach_x + reach_y + distance) * 0
     tl.atomic_add(dropped, tl.sum((here & ((given != 0) | (sound == 0))).to(tl.int64), 0), sem="relaxed")

@@ -138,7 +138,7 @@ def towards(x, y, z, pose):
 
 @triton.jit
 def shape_back(grad, shown, a0, a1, a2, b0, b1, b2, blur, base, ANTIALIASED: tl.constexpr):
-    """Return the gradients of the rows of T, and of the logistic, from those of u_x, u_y, v_y and the opacity.
+    """Return the gradients of the rows of T, and of the logistic, from the gradients of u_x, u_y, v_y and the opacity.
 
     u_x = sqrt(c / (2 det)), u_y = -b / sqrt(2 c det), v_y = 1 / sqrt(2 c).
 
@@ -185,7 +185,7 @@ def column_back(pose, of_a, of_b, r0, r1, r2, s, over, bounded_x, bounded_y, fx,
     of_1 = tl.load(pose + 1) * of_v0 + tl.load(pose + 5) * of_v1 + tl.load(pose + 9) * of_v2
     of_2 = tl.load(pose + 2) * of_v0 + tl.load(pose + 6) * of_v1 + tl.load(pose + 10) * of_v2
     of_s = of_0 * r0 + of_1 * r1 + of_2 * r2
-    # Of the Jacobian's entries that are not 0: 1 / z twice, and -x / z^2 and -y / z^2.
+    # The Jacobian's entries that are not 0 are 1 / z twice, and -x / z^2 and -y / z^2.
     of_over = fx * of_a * v0 + fy * of_b * v1
     return of_0 * s, of_1 * s, of_2 * s, of_s * s, of_v0, of_v1, of_v2, of_over, fx * of_a * v2, fy * of_b * v2
 

@@ -1,4 +1,4 @@
-// What the splatting kernels share: how a Gaussian on the image is laid out. See ../splat_project.py.
+// The layout of a Gaussian on the image, shared by the splatting kernels. See project.py.
 #pragma once
 
 #include "runtime/common.h"
@@ -6,8 +6,8 @@
 #include <cmath>
 
 // A Gaussian on the image. Its alpha at an offset (dx, dy) from the centre is opacity exp(-(u^2 + v^2)) with
-// u = U_X dx + U_Y dy and v = V_Y dy: half of the inverse covariance as a product of triangular matrices, whose squares
-// cannot cancel.
+// u = U_X dx + U_Y dy and v = V_Y dy: half of the inverse covariance as a product of triangular matrices, so that
+// squares cannot cancel.
 enum Record {
     X, Y,            // centre, pixels
     U_X, U_Y, V_Y,   // 1 / pixels
@@ -22,7 +22,7 @@ enum Record {
 };
 
 constexpr float MIN_ALPHA = 1.0f / 255, MAX_ALPHA = 0.999f;
-constexpr float OPAQUE = 1e-4f;  // transmittance behind which nothing counts
+constexpr float OPAQUE = 1e-4f;  // a Gaussian counts only in front of this transmittance
 constexpr int TILE = 16;         // pixels along a tile's edge
 
 static inline Floats square_root(Floats x) {

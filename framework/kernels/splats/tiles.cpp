@@ -32,8 +32,8 @@ struct Span {
     }
 };
 
-// Calls `body` with each tile whose rectangle of pixel centres meets a Gaussian's ellipse. In a row these tiles are
-// adjacent: from the leftmost to the rightmost point of the ellipse within the row.
+// Calls `body` with each tile that meets a Gaussian's ellipse, by the rectangle of its pixel centres. In a row these
+// tiles are adjacent: from the leftmost to the rightmost point of the ellipse within the row.
 template <typename Body>
 void for_tiles(const float* g, const Grid& grid, const Body& body) {
     const Span span(g, grid);

@@ -67,8 +67,8 @@ struct Position {
 
 struct SigmaPoints {
     static constexpr int COUNT = 7;  // the centre, and a step along each axis and against it
-    double x[COUNT], y[COUNT];       // columns whose products are the covariance, pixels
-    double weight[COUNT];            // of each point in mean_x
+    double x[COUNT], y[COUNT];       // columns; their products are the covariance, pixels
+    double weight[COUNT];            // weight of each point in mean_x
     double slope[COUNT][2][3];       // Jacobian of each position, pixels by scene units
     double mean_x, mean_y, xx, xy, yy;
     bool shown;
@@ -117,13 +117,14 @@ struct SigmaPoints {
         mean_x = camera.fx * middle + camera.cx, mean_y = camera.fy * (v[0] + off_y) + camera.cy;
     }
 
-    // Of the covariance without blur; in double, what cancels is as exact as a float.
+    // The determinant of the covariance without blur; in double, a cancelled difference is as exact as a float.
     double determinant() const {
         const double value = xx * yy - xy * xy;
         return value > 0 ? value : 0;
     }
 
-    // Adds to the gradients of the centre and of the axes, from those of mean_x, mean_y, xx, xy, yy and the determinant.
+    // Adds to the gradients of the centre and of the axes, from the gradients of mean_x, mean_y, xx, xy, yy and the
+    // determinant.
     void backward(double of_mean_x, double of_mean_y, double of_xx, double of_xy, double of_yy, double of_determinant,
                   double* of_at, double (*of_axes)[3]) const {
         of_xx += of_determinant * yy, of_yy += of_determinant * xx, of_xy -= 2 * of_determinant * xy;

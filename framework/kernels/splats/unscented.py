@@ -10,7 +10,7 @@ centre and v_k are its axes times their standard deviations, in the camera's fra
     w_i = c_i = OUTER = 1 / (2 STEP^2),   w_0 = CENTER = 1 - 3 / STEP^2,   c_0 = CENTER + 1 - ALPHA^2 + BETA
 
 No Jacobian is taken, so a Gaussian may lie beside the camera or behind it. The covariance is returned as the columns
-sqrt(c_i) (f(p_i) - mean), whose squares cannot cancel; gradients go through all seven points. `unscented.h` is the
+sqrt(c_i) (f(p_i) - mean), so that squares cannot cancel; gradients go through all seven points. `unscented.h` is the
 same in C++.
 
 **Points that a lens does not show.** A Gaussian is left out if the lens does not show its centre. For the lenses
@@ -19,10 +19,10 @@ size. For the other lenses, a Gaussian is left out if the lens does not show all
 the camera have no position.
 
 **A panorama** (equirectangular) is an image of longitudes and latitudes. Longitudes are angles: they are counted from
-that of the centre, within half a turn, and their mean is the angle of the mean sine and cosine. So a Gaussian on the
-seam has the same size as elsewhere; `seam.py` draws its other side. Near a pole a Gaussian is wide, and the image of a
-Gaussian that contains the pole is not an ellipse. Its longitudes still differ by at most half a turn, so the covariance
-stays finite. The Gaussian covers much of the rows next to the pole, which show a small solid angle.
+the centre's longitude, within half a turn, and their mean is the angle of the mean sine and cosine. So a Gaussian on
+the seam has the same size as elsewhere; `seam.py` draws its other side. Near a pole a Gaussian is wide, and the image
+of a Gaussian that contains the pole is not an ellipse. Its longitudes still differ by at most half a turn, so the
+covariance stays finite. The Gaussian covers much of the rows next to the pole, which show a small solid angle.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def unscented(
             the image is returned.
 
     Returns:
-        The means x, y (K,), pixels; columns (K, 2, 7) whose products are the covariance, pixels; and (K,) bool, whether
-        the lens shows the Gaussian.
+        The means x, y (K,), pixels; columns (K, 2, 7) with the covariance as their products, pixels; and (K,) bool,
+        whether the lens shows the Gaussian.
     """
     fx, fy, cx, cy = intrinsics
     steps = STEP * axes.transpose(1, 2)

@@ -102,7 +102,7 @@ private:
     bool begin(int64_t r, Path& path) {
         float start;
         if (!(rays.leave[r] > rays.enter[r]) || !next_piece(r, rays.first[r], start)) return false;
-        // The first piece may begin at the face of the box, behind which is the outside, or at the ray's own start.
+        // The first piece may begin at the face of the box, with the outside behind it, or at the ray's own start.
         const bool clear = start > rays.nears[r] + limits.shortest;
         path = {r, start, start, clear ? 1.0f : -1.0f, clear ? INF : -INF, start, -INF, start, start, start};
         return true;
@@ -229,7 +229,7 @@ EXPORT int crossings_take(int64_t rays, int64_t total, int64_t* owners, float* t
         int64_t from = 0, sum = 0;
         for (size_t c = 0; c < all.of_chunks.size(); c++) {
             std::vector<Met>& met = all.of_chunks[c];
-            // Those of a ray are in order.
+            // The crossings of a ray are in order.
             std::stable_sort(met.begin(), met.end(), [](const Met& a, const Met& b) { return a.ray < b.ray; });
             for (const Met& each : met) owners[from] = each.ray, t[from] = each.t, coverage[from] = each.coverage, from++;
             sum += all.evaluations[c];

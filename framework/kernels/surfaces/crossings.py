@@ -104,7 +104,7 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     active = (pieces.offsets[1:] > pieces.offsets[:-1]).nonzero().squeeze(-1)
     radii = torch.zeros_like(rays.nears) if rays.pixel_radii is None else rays.pixel_radii
     first = pieces.starts[pieces.offsets[:-1][active]]
-    # The first piece may begin at the face of the box, behind which is the outside, or at the ray's own start.
+    # The first piece may begin at the face of the box, with the outside behind it, or at the ray's own start.
     was = torch.where(first > rays.nears[active] + shortest, 1.0, -1.0).to(first)
     unclear = torch.full_like(first, -torch.inf)
     paths = _Paths(active, first, first, was, was * torch.inf, first, unclear, first, first, first)
@@ -138,7 +138,7 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     entered = found.outside > -torch.inf
     at = found.nearest
     at[entered], more = _refined(distance, rays, found.of(entered), EXACT * shortest)
-    order = found.rays.argsort(stable=True)  # those of a ray are in order
+    order = found.rays.argsort(stable=True)  # the crossings of a ray are in order
     shares = torch.cat([share for _, share in met])
     return Crossings(found.rays[order], at[order], shares[order], evaluations + more)
 

@@ -12,8 +12,8 @@ A loss with the gradients dy for y and v for n has the gradients of dy . y + (dy
     by W1:  (m W2^T dy) e^T + (m w) t^T
     by e:   W1^T (m W2^T dy)            by t:  W1^T (m w)
 
-By the position x, the outputs have the gradient of e (`following_positions`). That of n needs the grid's second
-derivative, which is 0 along the axes and jumps at the faces of cells.
+By the position x, the outputs have the gradient of e (`following_positions`). The derivative of n needs the grid's
+second derivative, which is 0 along the axes and jumps at the faces of cells.
 """
 
 from __future__ import annotations

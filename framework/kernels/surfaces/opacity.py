@@ -22,9 +22,9 @@ def surface_opacity(
         distances: (N,) signed distance f in the middle of each interval, negative inside.
         cosines: (N,) derivative of f along the ray.
         lengths: (N,) lengths of the intervals, in the unit of the distance.
-        sharpness: () inverse of the width over which a surface turns opaque.
-        annealing: 1 for the paper's formula. Below 1, intervals along which the distance does not fall are partly
-            opaque too, so that wrong surfaces that face away also have a gradient; 0 at the start of training.
+        sharpness: () inverse width of the transition from transparent to opaque at a surface.
+        annealing: 1 for the paper's formula. Below 1, intervals with a distance that does not fall are partly opaque
+            too, so that wrong surfaces that face away also have a gradient; 0 at the start of training.
 
     Returns:
         (N,) opacity in [0, 1].
@@ -42,7 +42,7 @@ def laplace_density(distances: Tensor, beta: Tensor) -> Tensor:
 
     Args:
         distances: (N,) signed distances, negative inside.
-        beta: () mean distance over which the density falls, in the unit of the distance.
+        beta: () scale of the Laplace distribution, in the unit of the distance.
 
     Returns:
         (N,) density, 1/length: 1 / beta deep inside, half of it on the surface.

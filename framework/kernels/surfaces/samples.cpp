@@ -13,7 +13,7 @@ namespace {
 constexpr int64_t CHUNK = 512;
 constexpr int PLACED = 6;  // features before the network's: gradient and position
 
-// Distance and gradient at LANES samples, and the derivatives of what stops light by both.
+// Distance and gradient at LANES samples, and the derivatives of opacity or density by both.
 struct Lanes {
     alignas(64) float distance[LANES], gradient[3][LANES], direction[3][LANES], length[LANES];
 
@@ -37,7 +37,7 @@ struct Lanes {
     }
 };
 
-// What stops light, and its derivatives.
+// Opacity or density, and its derivatives.
 struct Stopping {
     Floats value, by_distance, by_cosine, by_sharpness;
 };
@@ -160,7 +160,7 @@ EXPORT int unit_normals(const float* features, int64_t count, int width, float s
     });
 }
 
-// of_features: the gradient by the features, from that by the result.
+// of_features: the gradient by the features, from the gradient by the result.
 EXPORT int unit_normals_backward(const float* features, int64_t count, int width, float shortest, const float* grad,
                                  float* of_features, int threads) {
     return guarded([&] {

@@ -28,7 +28,7 @@ PLACED = 6
 NO_FLOOR = 0.0, 0.0, 0.0, -1e30
 """A floor that is farther from any position than any ball."""
 SHORTEST = 1e-12
-"""Length below which a gradient has no direction."""
+"""Minimum length of a gradient with a direction."""
 
 
 class FirstShape(NamedTuple):
@@ -43,8 +43,7 @@ class FirstShape(NamedTuple):
     radius: float
     """Radius of the ball, scene units."""
     rounding: float
-    """Radius around the centre within which the distance is smoothed, scene units, because it has no gradient at the
-    centre."""
+    """Radius of smoothing around the centre, where the distance has no gradient, scene units."""
     floor: Tensor
     """(4,) unit normal m of the floor, upwards, and height h of the floor along it; `NO_FLOOR` for none."""
 
@@ -92,7 +91,7 @@ def first_distance(network: Tensor, positions: Tensor, first: FirstShape) -> tup
 def surface_samples(
     network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return what stops light at samples, and the inputs of their colour.
+    """Return the opacity or density of samples, and the inputs of their colour.
 
     The compiled form has first derivatives by `network` and `sharpness`.
 
@@ -130,7 +129,7 @@ def stopped_samples(
     sharpness: Tensor,
     intervals: Intervals | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return what stops light at samples of any distance, and the inputs of their colour, as `surface_samples` does.
+    """Return opacity or density at samples of any distance, and the inputs of their colour, as `surface_samples` does.
 
     Args:
         distances: (N,) signed distances at the samples, scene units.

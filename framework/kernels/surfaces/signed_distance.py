@@ -54,8 +54,8 @@ class SignedDistance(NamedTuple):
 def stepped(distances: Tensor, gradients: Tensor, safety: float) -> Tensor:
     """Return the lengths (N,) that rays may step from positions with these distances, negative inside.
 
-    A step does not pass a surface if, along the step, the distance changes at most `safety` times as fast as by its
-    gradient at the start, or as by a gradient of length 1 if that is longer.
+    A step does not pass a surface if, along the step, the distance changes at most `safety` times as fast as its
+    gradient at the start says, or as a gradient of length 1 says if that is longer.
 
     Args:
         distances: (N,) signed distances.

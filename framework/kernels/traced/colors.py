@@ -43,7 +43,7 @@ class TracedColors(NamedTuple):
     moment: Tensor
     """(R,) sum of weight * t."""
     median: Tensor
-    """(R,) t of the first sample behind which the transmittance is at most 0.5, or the far end."""
+    """(R,) t of the first sample with a transmittance of at most 0.5 behind it, or the far end."""
     num_samples: int
     """Number of samples that light reached."""
 

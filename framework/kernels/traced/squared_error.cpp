@@ -1,9 +1,9 @@
-// The colours of traced rays, and their squared error with its gradient, each in one call. See ../traced_error.py and
-// ../traced_colors.py for the references.
+// The colours of traced rays, and their squared error with its gradient, each in one call. See squared_error.py and
+// colors.py for the references.
 //
 // A block of rays stays on one thread and in cache: through trace_block, the colour network, compositing and the error,
-// and back through both networks, whose activations were recorded on the forward pass. Only the gradient of the
-// encoding, for the hash table, and the sums of the weights' gradients leave the cache.
+// and back through both networks with the recorded activations. Only the gradient of the encoding, for the hash table,
+// and the sums of the weights' gradients leave the cache.
 #include "encodings/harmonics.h"
 #include "traced/trace.h"
 
@@ -222,7 +222,7 @@ struct Block {
         }
     }
 
-    // Selects the samples that continue through the networks: those with a gradient. If a gradient is below `floor`
+    // Selects the samples with a gradient, which continue through the networks. If a gradient is below `floor`
     // times the mean, the sample is kept with a proportional probability, and its gradient is scaled up accordingly.
     int64_t thin(const Thinning& thinning) {
         int64_t *live = room(own.live, size_t(count)), living = 0;

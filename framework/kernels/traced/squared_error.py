@@ -6,7 +6,7 @@ block of rays forward and backward in cache, and keeps the networks' activations
 (`kernels/traced/squared_error.cpp`).
 
 Most samples have almost no gradient: they lie in space that is already empty, or behind a surface. The compiled form
-can skip most of these (`thin`). A sample whose gradient is a fraction p < 1 of a threshold is kept with probability p,
+can skip most of these (`thin`). A sample with a gradient of a fraction p < 1 of a threshold is kept with probability p,
 and its gradient is then multiplied by 1 / p. The expectation of the sum is unchanged, as in Russian roulette of light
 paths (Arvo and Kirk 1990, "Particle transport and image synthesis").
 """
@@ -124,7 +124,7 @@ def _compiled(
 
 
 class _Known(torch.autograd.Function):
-    """A value whose gradients are already known."""
+    """A value with known gradients."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, grads: Sequence[Tensor], *inputs: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-// Tracing rays: marching, encoding and the density network in one call. See ../trace.py for the reference.
+// Tracing rays: marching, encoding and the density network in one call. See trace.py for the reference.
 //
 // A block of rays passes through all its waves on one thread, so that only samples reached by light leave the cache,
 // and no thread waits for another between waves. A sample's values do not depend on the rest of its batch, so results

@@ -26,11 +26,11 @@ from nerfloom.kernels.networks.mlp import DENSITY_NETWORK, density_mlp, multipli
 from nerfloom.kernels.rows import gather_rows
 
 WAVES = (4, 4, 4, 4, 8, 16, 32, 128)
-"""Samples per ray in each wave of a trace; the last size repeats. They start smaller than those of a march: within one
+"""Samples per ray in each wave of a trace; the last size repeats. They start smaller than a march's waves: within one
 call a wave costs next to nothing, and fewer samples behind a surface are evaluated."""
 
 PATH, DENSITY = "ppppppqpipffppiif", "ppppippipip"
-"""Types of the arguments of compiled traces that describe a march, and of those that describe a density."""
+"""Types of the arguments of compiled traces that describe a march, and of the arguments that describe a density."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class GridDensity:
     weights: Sequence[Tensor]
     """(D_out, D_in) weights of each layer, without biases."""
     box: Tensor | None = None
-    """(2, 3) corners of the box around which space is contracted by `contract_to_unit`; None without contraction."""
+    """(2, 3) corners of the box of `contract_to_unit`, which contracts space around it; None without contraction."""
 
     def at(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the density (N,) and the outputs (N, D) of the network at `positions` (N, 3), scene units."""

@@ -135,8 +135,8 @@ _HOMES = {
 """Module that holds each name."""
 
 # By default torch's idle threads spin for milliseconds. On a busy machine that makes training up to four times slower
-# than its share of the cores would. GNU's OpenMP reads the first variable (in iterations, about 20 microseconds), those
-# of LLVM and Intel the second (in milliseconds). Both are read when torch is loaded.
+# than its share of the cores would. GNU's OpenMP reads the first variable (in iterations, about 20 microseconds),
+# LLVM's and Intel's read the second (in milliseconds). Both are read when torch is loaded.
 if "torch" not in _sys.modules and "OMP_WAIT_POLICY" not in _os.environ:
     _os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     _os.environ.setdefault("KMP_BLOCKTIME", "1")

@@ -47,9 +47,9 @@ from nerfloom.splats.table import Column, as_gaussians, as_rows, row_changes, us
 MAX_NEW_GAUSSIANS = 1_000
 """Maximum number of Gaussians in a new model."""
 NORMALS_FROM = 7 / 30
-"""Share of the budget after which normals count: 7,000 of 30,000 steps in the code of 2D Gaussian Splatting."""
+"""Share of the budget before normals count: 7,000 of 30,000 steps in the code of 2D Gaussian Splatting."""
 DISTORTION_FROM = 1 / 10
-"""Share of the budget after which the distortion counts: 3,000 of 30,000 steps there."""
+"""Share of the budget before the distortion counts: 3,000 of 30,000 steps there."""
 STRATEGIES: dict[str, Callable[[SplattingConfig], Strategy]] = {
     "adc": lambda config: DensityControl(config.steps_per_reset),
     "mcmc": lambda config: Mcmc(),
@@ -304,7 +304,7 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
     def shake(self, size: float | Tensor) -> None:
         """Add noise to the centres of Gaussians that are nearly transparent (3DGS-MCMC, equation 7).
 
-        With a memory limit, only those that the last training image may show get noise.
+        With a memory limit, only Gaussians that the last training image may show get noise.
 
         Args:
             size: the noise of a transparent Gaussian, in its standard deviations squared per extent of the scene;

@@ -45,7 +45,7 @@ class OctreeConfig(
     RANGES: ClassVar[dict[str, Range]] = {"density_rate": AT_LEAST_0, "degree": (0, MAX_DEGREE)}
     """Allowed ranges."""
     density_rate: float = 5.0
-    """Learning rate of densities, relative to that of colours."""
+    """Learning rate of densities, relative to the rate of colours."""
     degree: int = 1
     """Degree of the harmonics of colours, 0 to 3."""
 
@@ -140,7 +140,8 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
         """Construct the layout from the buffers, after these were loaded.
 
         Raises:
-            ValueError: if they are not those of an octree, or there are not as many rows of values as leaves.
+            ValueError: if they do not describe an octree, or the number of rows of values differs from the number of
+                leaves.
         """
         edge, counts = float(self.frame[3]), self.bricks.tolist()
         tables = self.densities.table, self.colors.table, self.peaks

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Opened(Loaded):
-    """A loaded run, file of Gaussians or of levels, or octree, with what `ns-render` and `ns-export` write."""
+    """A loaded run, file of Gaussians or of levels, or octree, with renders and exports as of the commands."""
 
     @classmethod
     def of(cls, loaded: Loaded) -> Opened:
@@ -49,7 +49,7 @@ class Opened(Loaded):
         Args:
             kind: pointcloud, marching-cubes, tsdf, gaussian-splat, levels, cameras, occupancy or web.
             file: file to write; its suffix is the format, such as .ply, .glb, .spz or .html.
-            regions: what is in all of these is kept, in the frame and unit of exports; none for everything.
+            regions: the export keeps their intersection, in the frame and unit of exports; none for everything.
             settings: flags of `ns-export` by name, with underscores, as in `max_megabytes=5`.
 
         Raises:

@@ -58,8 +58,8 @@ class Renderable(ABC):
 
         Args:
             poses: (M, 3, 4) camera-to-scene poses of the data, on any device.
-            training: whether they are those of all training images, in their order. Cameras of other images follow the
-                training cameras around them.
+            training: whether they are the cameras of all training images, in their order. Cameras of other images
+                follow the training cameras around them.
         """
         return poses
 
@@ -147,7 +147,7 @@ class RefinesPoses(Protocol, metaclass=SeesRegistered):
 
 @runtime_checkable
 class HasDensity(Protocol):
-    """A model whose density can be evaluated at any position."""
+    """A model with a density that can be evaluated at any position."""
 
     def density(self, points: Points) -> Tensor:
         """Return the density (N,) at `points`, in 1/length."""
@@ -155,7 +155,7 @@ class HasDensity(Protocol):
 
 @runtime_checkable
 class HasSignedDistance(Protocol):
-    """A model of a surface, whose distance can be evaluated at any position."""
+    """A model of a surface with a distance that can be evaluated at any position."""
 
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
         """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3)."""
@@ -167,7 +167,7 @@ def refined_cameras(model: Renderable, cameras: Cameras, training: bool) -> Came
     Args:
         model: the model.
         cameras: M cameras with the poses of the data.
-        training: whether they are those of all training images, in their order.
+        training: whether they are the cameras of all training images, in their order.
     """
     return replace(cameras, camera_to_worlds=model.refined_poses(cameras.camera_to_worlds, training))
 

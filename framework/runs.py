@@ -49,7 +49,7 @@ def load(
         checkpoint: checkpoint of the run; None for the newest readable one.
 
     Raises:
-        ConfigError: if config.yml is missing or invalid, or `up` or `checkpoint` does not suit what is loaded.
+        ConfigError: if config.yml is missing or invalid, or `up` or `checkpoint` does not suit the run or file.
         CheckpointError: if the checkpoint is missing or does not fit the settings.
         DataError: if the file cannot be read.
     """

@@ -12,7 +12,7 @@ from nerfloom.rendering.rendered import Picture
 POWER = 4.0
 """Power of the inverse distance."""
 MIN_VISIBILITY = 0.1
-"""Visibility, as a fraction of the best block's, below which a block has no share."""
+"""Minimum visibility of a block with a share, as a fraction of the best block's."""
 
 
 def near_shares(distances: Tensor, radii: Tensor) -> Tensor:
@@ -20,8 +20,8 @@ def near_shares(distances: Tensor, radii: Tensor) -> Tensor:
 
     A share is proportional to (1 / distance - 1 / radius)^4, and 0 beyond the radius: the weights of Franke and
     Nielson (1980). Near the centre these are Block-NeRF's inverse distances to the power of 4. They fall to 0 at the
-    radius, so pictures change continuously where a block enters or leaves. Beyond all radii, the block whose distance
-    is the smallest multiple of its radius has all.
+    radius, so pictures change continuously where a block enters or leaves. Beyond all radii, the block with the
+    smallest ratio of distance to radius has the whole share.
 
     Args:
         distances: (B,) distances of the camera from the centres.
@@ -43,7 +43,7 @@ def visible_shares(shares: Tensor, visibilities: Tensor) -> Tensor:
 
     Args:
         shares: (B,) shares by distance.
-        visibilities: (B,) visibilities in [0, 1]; those of blocks without a share do not matter.
+        visibilities: (B,) visibilities in [0, 1]; they have no effect for blocks without a share.
     """
     best = torch.where(shares > 0, visibilities, torch.zeros_like(visibilities)).max()
     if not bool(best > 0):
@@ -56,7 +56,7 @@ def blended(pictures: Sequence[Picture], shares: Sequence[float]) -> Picture:
     """Return one picture of several of the same size.
 
     Colour and opacity are means weighted by the shares. The depth is a mean weighted by share and opacity, and the
-    median depth is that of the picture with the largest share, since a mean of two surfaces is none.
+    median depth comes from the picture with the largest share, since a mean of two surfaces is none.
 
     Args:
         pictures: at least one picture; all depths in the same unit.

@@ -20,7 +20,7 @@ class Block:
     center: Vector
     """Mean position of the cameras that only this block is for."""
     radius: float
-    """Distance from the centre up to which cameras are shown the block."""
+    """Maximum distance from the centre of cameras that see the block."""
     cameras: tuple[int, ...]
     """Indices of its training images, in the order of the data format. Neighbours share images."""
 
@@ -32,4 +32,4 @@ class TrainedBlock(Block):
     run: Path
     """Folder of the run."""
     color: Affine = IDENTITY
-    """Function of its colours that makes them match those of its neighbours."""
+    """Function of its colours that makes them match its neighbours' colours."""

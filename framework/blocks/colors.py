@@ -27,7 +27,7 @@ RIDGE = 1e-3
 
 
 def fitted_color(seen: Tensor, wanted: Tensor, ridge: float = RIDGE) -> Tensor:
-    """Return the affine function (3, 4) float64 of colours that makes pixels of one picture those of another.
+    """Return the affine function (3, 4) float64 from the colours of one picture to the colours of another.
 
     It minimises the mean of |M x - y|^2, plus `ridge` times |M - I|^2.
 
@@ -74,10 +74,11 @@ def recolored_gaussians(gaussians: Gaussians, color: Affine) -> Gaussians:
 
 
 def matching_order(cameras: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
-    """Return the order in which blocks are matched: pairs of a block and an earlier one, whose colours it takes over.
+    """Return the order of matching: pairs of a block and an earlier one that it takes its colours from.
 
-    The first block is the one that shares most images with others; each next pair shares as many as any can (Prim's
-    algorithm for a largest spanning tree). A block that shares none with those before starts anew, and is in no pair.
+    The first block is the one that shares most images with others; each next pair shares the most images that any pair
+    can (Prim's algorithm for a largest spanning tree). A block that shares none with those before starts anew, and is
+    in no pair.
 
     Args:
         cameras: indices of the images of each block.

@@ -1,4 +1,4 @@
-"""Blocks of a large scene in one picture: those near the camera, of which only a few are in memory."""
+"""Blocks of a large scene in one picture: only the blocks near the camera, and only a few of them in memory."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Blocks(Renderable):
         scene: Scene,
         visibility: Callable[[int], Visibility | None] = unknown_visibility,
     ) -> None:
-        """Open the first block, whose device, rays per pixel and background are those of all.
+        """Open the first block; all others have its device, rays per pixel and background.
 
         Args:
             blocks: the blocks.
@@ -145,7 +145,7 @@ class Blocks(Renderable):
 
 
 class GaussianBlocks(Blocks):
-    """Blocks that consist of Gaussians, which can be merged into those of one scene."""
+    """Blocks that consist of Gaussians, which can be merged into one scene."""
 
     def gaussians(self, time: float | None = None) -> Gaussians:
         """Return the Gaussians of all blocks at a `time`, in the composed scene, on the CPU (`merge.merged`)."""
@@ -167,7 +167,7 @@ class GaussianBlocks(Blocks):
         return recolored_gaussians(own, self.blocks[number].color)
 
     def look(self) -> Look:
-        """Return the settings of drawing, which are those of the first block."""
+        """Return the settings of drawing, from the first block."""
         first = self.opened(0).model
         assert isinstance(first, HasGaussians)
         return first.look()

@@ -4,13 +4,13 @@
     box: [[x, y, z], [x, y, z]]      corners of the scene's region of interest, scene units
     near, far: 0.05, 1000.0          distances from a camera where the scene starts and ends, scene units
     blocks:
-    - run: runs/000/nerfacto/run     folder of the run, relative to that of the file
+    - run: runs/000/nerfacto/run     folder of the run, relative to the file's folder
       center: [x, y, z]              in the input's frame and unit, as is the radius
       radius: 25.0
       cameras: [0, 1, 2]             indices of its training images
       color: [[1, 0, 0, 0], ...]     affine function of its colours, 3 x 4
 
-The scene's frame is that of dataparser_transforms.json beside the file.
+dataparser_transforms.json beside the file has the scene's frame.
 """
 
 from __future__ import annotations

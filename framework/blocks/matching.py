@@ -1,4 +1,4 @@
-"""Search for the colours in which blocks match their neighbours, by pictures of the images that they share."""
+"""Matching of the colours of neighbouring blocks, by pictures of the images that they share."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from nerfloom.cameras.view import View
 from nerfloom.rendering.light import without_background
 
 MAX_VIEWS = 6
-"""Maximum number of images by which two blocks are matched."""
+"""Maximum number of images used to match two blocks."""
 SIDE = 48
 """Longer side of the pictures that are compared, pixels, at most twice this."""
 
 
 def matched(model: Blocks, cameras: Cameras, times: Tensor | None) -> list[TrainedBlock]:
-    """Return the blocks of a model with the colours in which they match their neighbours.
+    """Return the blocks of a model with colours that match their neighbours.
 
     The block that shares most images keeps its colours; the others follow from neighbour to neighbour.
 

@@ -1,4 +1,4 @@
-"""Gaussians of several blocks as those of one scene, without doubled borders."""
+"""Gaussians of several blocks merged into one scene, without doubled borders."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from nerfloom.splats.gaussians import COLUMNS, Gaussians
 
 
 def merged(parts: Sequence[Gaussians], centers: Tensor) -> Gaussians:
-    """Join the Gaussians of blocks. Each block keeps those that are nearer to its own centre than to another's.
+    """Join the Gaussians of blocks. Each block keeps the Gaussians that are nearer to its own centre than to another's.
 
-    So two blocks that have both learned a place do not draw it twice. What is equally near to two centres belongs to
+    So two blocks that have both learned a place do not draw it twice. A Gaussian equally near to two centres belongs to
     the first. Columns that a method added are dropped, and missing degrees of harmonics are 0.
 
     Args:

@@ -1,7 +1,7 @@
 """Division of cameras into blocks by their positions: by a grid, or by a tree that bounds the images of a block.
 
-Each camera is in one cell. A block has the cameras of its cell, and those of a margin around it, which its neighbours
-have too. Positions, lengths and blocks are in the input's frame and unit.
+Each camera is in one cell. A block has the cameras of its cell and of a margin around it, which its neighbours have
+too. Positions, lengths and blocks are in the input's frame and unit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Cell(NamedTuple):
 
 
 def grid_blocks(positions: Tensor, edge: float, overlap: float, least: int) -> list[Block]:
-    """Divide cameras by a grid of cubes, whose middle is that of the cameras' box.
+    """Divide cameras by a grid of cubes, centred in the cameras' box.
 
     Args:
         positions: (M, 3) positions of the cameras, M at least 1.
@@ -51,9 +51,9 @@ def grid_blocks(positions: Tensor, edge: float, overlap: float, least: int) -> l
 
 
 def tree_blocks(positions: Tensor, most: int, overlap: float, least: int) -> list[Block]:
-    """Divide cameras by a tree: a box whose block has too many images is cut in two with equally many cameras each.
+    """Divide cameras by a tree: a box with too many images in its block is cut in two with equally many cameras each.
 
-    A cut is across the axis along which the cameras of a box are spread most. Cameras at one position cannot be
+    A cut is across the axis with the largest spread of the cameras of a box. Cameras at one position cannot be
     divided, so their block may have more images.
 
     Args:
@@ -77,7 +77,7 @@ def tree_blocks(positions: Tensor, most: int, overlap: float, least: int) -> lis
 
 
 def in_no_block(blocks: Sequence[Block], count: int) -> list[int]:
-    """Return the indices, among `count` cameras, of those that none of the `blocks` has."""
+    """Return the indices, among `count` cameras, of cameras that none of the `blocks` has."""
     covered = {camera for block in blocks for camera in block.cameras}
     return [camera for camera in range(count) if camera not in covered]
 
@@ -104,7 +104,7 @@ def _members(points: Tensor, cell: Cell, overlap: float) -> Tensor:
     """
     margin = overlap / (2 * (1 - overlap)) * (cell.box[1] - cell.box[0])
     inside = ((points >= cell.box[0] - margin) & (points <= cell.box[1] + margin)).all(-1)
-    inside[cell.cameras] = True  # whatever rounding says
+    inside[cell.cameras] = True  # despite rounding
     return inside.nonzero()[:, 0]
 
 

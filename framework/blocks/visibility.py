@@ -1,4 +1,5 @@
-"""Visibility networks: what the training images of a block have seen, so that pictures leave out other blocks.
+"""Visibility networks: they learn which points the training images of a block see, so that pictures leave out other
+blocks.
 
 Source: Block-NeRF (Tancik et al. 2022), section 4.2, "Visibility Prediction". A small network learns the transmittance
 of a point seen from a direction. It is 1 in front of surfaces, 0 behind them, and 0 where no training image has looked.
@@ -55,7 +56,7 @@ class Visibility(nn.Module):
             self.layers = nn.ModuleList(nn.Linear(before, after) for before, after in pairwise(WIDTHS))
 
     def inputs(self, points: Tensor, directions: Tensor) -> Tensor:
-        """Return the inputs (N, C) float32 of points and the directions in which they are looked at.
+        """Return the inputs (N, C) float32 of points and viewing directions.
 
         Args:
             points: (N, 3) positions in the input's frame.

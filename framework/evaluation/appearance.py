@@ -86,7 +86,7 @@ def fitted_appearance(model: Renderable, dataset: Dataset, index: int, backgroun
 
 
 def nearest_camera(scene: Scene, view: View) -> int:
-    """Return the training image whose camera is nearest to that of a view.
+    """Return the training image with the camera nearest to a view's.
 
     Cameras are compared by their positions and by the points half the box's edge in front of them, so that directions
     count too.
@@ -204,7 +204,7 @@ def _fit(appearance: Appearance, error: Callable[[], Tensor], start: Tensor) -> 
     """Return the vector (D,) with the smallest error and pull, found from a start (D,).
 
     The appearance's first `size` parameters belong to an image; others are shared, and stay as they are. L-BFGS adapts
-    to parameters of any unit, and to those that depend on each other, such as the entries of an affine function.
+    to parameters of any unit, and to parameters that depend on each other, such as the entries of an affine function.
     """
     own, shared = start.detach().split([appearance.size, len(start) - appearance.size])
     own = own.clone().requires_grad_()

@@ -96,7 +96,7 @@ def timed_view(model: Renderable, view: View, background: Tensor) -> tuple[Pictu
 def floaters(picture: Picture, dataset: Dataset, index: int) -> float | None:
     """Return the percentage of a view's sparse points with matter in front of them.
 
-    These are points that the image sees according to the reconstruction's tracks, and whose pixel has a median depth
+    These are points that the image sees according to the reconstruction's tracks, but with a median depth of the pixel
     below `CLEAR_SHARE` of their distance. Half of such a pixel's light is stopped in space that should be empty.
     This is defined for every method that renders depth.
 

@@ -1,7 +1,7 @@
 """Frames of a long render, kept on disk until its files are written, so that a stopped render can continue.
 
 They are in FILE.frames/KEY/ beside the rendered file or folder. The key is a hash of everything that the frames depend
-on, so frames of one command are never used for another. render.json holds what was hashed.
+on, so frames of one command are never used for another. render.json holds the hashed facts.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FACTS = "render.json"
 SUFFIX = ".frames"
 """Suffix of the folder of frames, appended to the name of the rendered file."""
 TIMED = 2
-"""The frame that tells how long the others take. The first also prepares what all of them use."""
+"""The frame that tells how long the others take. The first also prepares the data that all of them use."""
 PIECE = 2**24
 """Number of bytes of a file hashed at a time."""
 
@@ -100,7 +100,7 @@ class Frames:
 
 
 def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
-    """Return `count` frames for `output`, with those of an earlier, stopped run that had the same `facts`.
+    """Return `count` frames for `output`, with the frames of an earlier, stopped run that had the same `facts`.
 
     Raises:
         ConfigError: if the folder of the frames cannot be written.

@@ -1,6 +1,6 @@
 """Metrics of a reconstructed surface against a reference: distances both ways, F-scores, and normals.
 
-With S the points of the reconstruction and R those of the reference, each drawn evenly by area:
+With S the points of the reconstruction and R the points of the reference, each drawn evenly by area:
 
 - accuracy is the mean distance from S to the reference, completeness the mean distance from R to the reconstruction;
 - the Chamfer distance is the mean of the two;
@@ -120,9 +120,9 @@ class Views:
     placement: Placement
     """Placement of the surfaces' frame in the cameras'."""
     kept: Shown
-    """The pixels of their images that count for the reconstruction: those that masks keep."""
+    """The pixels of their images that count for the reconstruction: masks keep them."""
     opaque: Shown
-    """The pixels that count for the reference: those of `kept` that are not transparent."""
+    """The pixels that count for the reference: they are `kept` and not transparent."""
     least: int = 1
     """Number of cameras that have to see a point."""
 

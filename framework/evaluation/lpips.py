@@ -113,7 +113,7 @@ def distance(layers: list[Layer], prediction: Tensor, target: Tensor, kept: Tens
     Args:
         layers: AlexNet's layers.
         prediction, target: (H, W, 3) colours in [0, 1], at least 31 x 31 pixels, on the layers' device.
-        kept: (H, W) bool, the pixels over which a layer's distances are averaged after interpolation between positions;
+        kept: (H, W) bool, the pixels of the mean of a layer's distances, which are interpolated between positions;
             if None, the mean is over positions.
     """
     total = 0.0

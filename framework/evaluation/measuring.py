@@ -5,7 +5,7 @@ where the transmittance falls to one half.
 
 The error is a standard deviation and has three parts: the error of triangulation from all photographs that see a point
 (`cameras/triangulation.py`), half a pixel of the sharpest photograph for the choice of the point, and the error of the
-scale. It does not contain errors that photographs share, such as those of poses and lenses.
+scale. It does not contain errors that photographs share, such as errors of poses and lenses.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def surface_point(model: Renderable, view: View, column: float, row: float) -> T
 def seeing_cameras(model: Renderable, cameras: Cameras, point: Tensor, time: float | None = None) -> Tensor:
     """Return the indices (K,) of the cameras that see a point: it is inside their image, and nothing is in front of it.
 
-    At most `MAX_CAMERAS` of those that have it inside their image are tried.
+    At most `MAX_CAMERAS` cameras with the point inside their image are tried.
 
     Args:
         model: the model in evaluation mode.
@@ -116,7 +116,7 @@ def seeing_cameras(model: Renderable, cameras: Cameras, point: Tensor, time: flo
 def located(model: Renderable, cameras: Cameras, point: Tensor, time: float | None = None) -> Tensor:
     """Return the covariance (3, 3) of a `point` found in a picture; infinite if fewer than two cameras see it.
 
-    `cameras` are those of M photographs of `model`, on the CPU; `time` in [0, 1] is that of a moving scene.
+    `cameras` belong to M photographs of `model`, on the CPU; `time` in [0, 1] is the moment of a moving scene.
     """
     seeing = seeing_cameras(model, cameras, point, time)
     jacobians = projection_jacobians(cameras[seeing], point)

@@ -121,13 +121,13 @@ def orbit(
 ) -> Cameras:
     """Return cameras on a horizontal circle, looking at its centre; the path is closed.
 
-    Height and radius are the means over the given cameras, and intrinsics are those of the first camera.
+    Height and radius are the means over the given cameras, and intrinsics come from the first camera.
 
     Args:
         cameras: M cameras.
         center: (3,) centre, scene units.
         along: (F,) fraction of the path at each frame, from `fractions`.
-        arc: part of the circle on which the cameras swing once back and forth, slowly at its ends; None for the whole
+        arc: part of the circle; the cameras swing on it once back and forth, slowly at its ends; None for the whole
             circle.
         radius: another radius of the circle, scene units. The height changes alike, so that the elevation stays.
     """
@@ -169,7 +169,7 @@ class Walk:
 def shortest_order(cameras: Cameras, closed: bool = True) -> Tensor:
     """Return the order (M,) int64 of a short tour past cameras, each once (`tour`).
 
-    Both ways and turns count: a turn by a radian is as long as the cameras' distance from their mean position.
+    Distances and turns count: a turn by a radian equals the cameras' distance from their mean position.
 
     Args:
         cameras: M cameras.
@@ -204,7 +204,7 @@ def interpolate(cameras: Cameras, along: Tensor, walk: Walk) -> Cameras:
 
     A pose is the mean of nearby poses of the walk, weighted by a Gaussian; its rotation is the one closest to the mean
     matrix. No mean is taken across a jump of the walk, because the mean could lie inside the subject: the path jumps
-    there too. Intrinsics are those of the first camera.
+    there too. Intrinsics come from the first camera.
 
     Args:
         cameras: M cameras.
@@ -274,7 +274,7 @@ def spiral(cameras: Cameras, along: Tensor, focus: float, radius: float | None =
 
     The path is LLFF's (Mildenhall et al. 2019): two turns in the mean camera's image plane, while it moves once back
     and forth, and ends where it starts. If the cameras do not look the same way, the first camera replaces the mean
-    camera. Intrinsics are those of the first camera.
+    camera. Intrinsics come from the first camera.
 
     Args:
         cameras: M cameras.

@@ -21,7 +21,7 @@ SUFFIXES = (".ply", ".obj", ".glb")
 def read_mesh(file: Path) -> Surface:
     """Read a mesh. Unusable vertices and faces are left out and counted.
 
-    Normals at vertices are those in a PLY file. A GLB file's parts are placed by its scene and joined. Nothing else is
+    Normals at vertices come from a PLY file. A GLB file's parts are placed by its scene and joined. Nothing else is
     read, such as materials or textures beside the file.
 
     Args:
@@ -54,7 +54,7 @@ def read_points(file: Path) -> Surface:
 
 
 def _said(surface: Surface, file: Path) -> Surface:
-    """Return the usable part of a surface, and say what is left out."""
+    """Return the usable part of a surface, and report the rest."""
     found, notes = usable(surface, str(file))
     if notes:
         say(f"{file}: left out: {', '.join(notes)}")
@@ -99,5 +99,5 @@ def _triangles(file: Path, kind: str) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(faces))
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
-    except Exception as error:  # trimesh reports damage as whatever comes up
+    except Exception as error:  # trimesh reports damage by any exception
         raise DataError(f"cannot read {file} as a mesh: {one_line(error)}") from error

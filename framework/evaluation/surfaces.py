@@ -19,11 +19,11 @@ from nerfloom.geometry.triangles import area_vectors, draw_on_triangles, nearest
 DENSE = 800_000
 """Default number of points on a mesh where nearest faces are looked for."""
 CANDIDATES = 8
-"""Number of nearest points on a mesh whose faces are compared exactly."""
+"""Number of nearest points on a mesh; their faces are compared exactly."""
 UNIT = 1e-6
 """Maximum deviation of a normal's length from 1."""
 AT_ONCE = 2**14
-"""Number of positions whose nearest points are looked for at once."""
+"""Number of positions in one search for nearest points."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Surface:
     def at(self, faces: Tensor, weights: Tensor) -> Samples:
         """Return points of a mesh, with normals.
 
-        The normals are those at the vertices, interpolated, where there are any; otherwise those of the faces.
+        The normals are interpolated from the vertices, where there are any; otherwise they belong to the faces.
 
         Args:
             faces: (N,) face of each point.

@@ -1,6 +1,6 @@
-"""A short tour through points: the order in which a video passes cameras.
+"""A short tour through points, as an order for a video that passes cameras.
 
-It is found by 2-opt moves (Croes 1958, "A method for solving traveling-salesman problems"), each of which reverses a
+It is found by 2-opt moves (Croes 1958, "A method for solving traveling-salesman problems"), and each move reverses a
 part of the tour. They start from the shorter of two tours: the given order, and the one that goes on to the nearest
 point that is left.
 """
@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 MAX_SWEEPS = 100
-"""Maximum number of rounds in which each edge of a tour is tried."""
+"""Maximum number of rounds; each round tries all edges of a tour."""
 LEAST_GAIN = 1e-9
 """A move counts if it shortens the tour by more than this fraction of its length."""
 
 
 def tour(points: Tensor, closed: bool = True) -> Tensor:
-    """Return a short order in which to visit points, each once. It is never longer than the given order.
+    """Return the order of a short tour that visits each point once. It is never longer than the given order.
 
     Args:
         points: (M, D) positions, at least one.
@@ -54,7 +54,7 @@ def _by_nearest(places: np.ndarray) -> np.ndarray:
 
 
 def _lengths(places: np.ndarray, weights: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the lengths of edges from points `start` to points `end`; those of a point of weight 0 are 0."""
+    """Return the lengths of edges from points `start` to points `end`; 0 for a point of weight 0."""
     return np.linalg.norm(places[start] - places[end], axis=-1) * weights[start] * weights[end]
 
 

@@ -34,7 +34,7 @@ class Judged(NamedTuple):
 class ViewFiles:
     """Writer of the files of the evaluated `views`, and `with_worst` of the worst one, into `folder` unless None.
 
-    `names` are those of all images.
+    `names` has the names of all images.
     """
 
     def __init__(self, folder: Path | None, names: Sequence[str], views: Collection[int], with_worst: bool) -> None:

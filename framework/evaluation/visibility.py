@@ -46,11 +46,11 @@ class Sightings:
     """Numbers of cameras that see each of N points."""
 
     inside: Tensor
-    """(N,) number of cameras whose image contains the point."""
+    """(N,) number of cameras with the point inside their image."""
     shown: Tensor
-    """(N,) number of those that show the point at a pixel that counts."""
+    """(N,) number of these that show the point at a pixel that counts."""
     seen: Tensor
-    """(N,) number of those from which the point is not hidden."""
+    """(N,) number of these that see the point, not hidden."""
 
 
 def count_sightings(points: Samples, occluders: Samples, cameras: Cameras, shown: Shown, title: str) -> Sightings:
@@ -149,7 +149,7 @@ class _DepthBuffer:
         return cls(camera, width, max_pool2d(-near, 3, 1, 1).reshape(-1), first)
 
     def behind(self, at: _Projected, steepest: float) -> Tensor:
-        """Return the distance (N,) beyond which each of several points is hidden, scene units.
+        """Return the maximum distance (N,) of a visible point towards each of several points, scene units.
 
         Args:
             at: the points.

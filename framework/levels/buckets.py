@@ -45,7 +45,7 @@ class Buckets:
 
     def __init__(self, folder: Path, sample: np.ndarray, count: int, degree: int, most: int) -> None:
         self.folder, self.count, self.degree, self.most = folder, count, degree, most
-        # Half of `most` on average, because medians of a sample are not those of all.
+        # Half of `most` on average, because medians of a sample differ from medians of all.
         self.depth = (-(-2 * count // most) - 1).bit_length()
         self.axes, self.values = splits(sample, self.depth)
 

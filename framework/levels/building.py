@@ -67,7 +67,7 @@ def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size:
             too coarse for these coordinates.
         chunk_size: maximum number of Gaussians in a chunk.
         bits: bits of each number but the centres.
-        memory: maximum memory for Gaussians, MB (1e6 bytes), besides that of the stream.
+        memory: maximum memory for Gaussians, MB (1e6 bytes), besides the stream's.
 
     Raises:
         FlagError: if the chunk size or the memory is out of range, or too small for the Gaussians.

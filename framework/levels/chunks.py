@@ -14,7 +14,7 @@ class ChunkCache:
     Args:
         read: reads a chunk, given its index.
         sizes: size of each chunk in memory, bytes.
-        capacity: maximum size of all chunks in memory, bytes, at least that of each chunk.
+        capacity: maximum size of all chunks in memory, bytes, at least the size of each chunk.
     """
 
     def __init__(self, read: Callable[[int], Gaussians], sizes: Sequence[int], capacity: int) -> None:

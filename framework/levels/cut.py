@@ -1,4 +1,4 @@
-"""The cut of a tree of Gaussians for a view: the coarsest nodes whose error on the image is small enough."""
+"""The cut of a tree of Gaussians for a view: the coarsest nodes with an error on the image that is small enough."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def cut_of(nodes: Nodes, sizes: Tensor, seen: Tensor, level_error: float, most: 
 
     Args:
         nodes: M nodes.
-        sizes: (M,) error of each node on the image, pixels, at most that of the node above.
+        sizes: (M,) error of each node on the image, pixels, at most the error of the node above.
         seen: (M,) bool, whether the view may show a node; it may then show the node above, too.
         level_error: requested level error, pixels; 0 for all Gaussians of the leaves.
-        most: maximum number of Gaussians, at least that of the root.
+        most: maximum number of Gaussians, at least the root's number.
     """
     # A node is in the cut of error e if lower <= e < upper.
     lower = torch.where(nodes.is_leaf, -math.inf, sizes)
@@ -48,7 +48,7 @@ def cut_of(nodes: Nodes, sizes: Tensor, seen: Tensor, level_error: float, most: 
 
 
 def _total_up_to(limits: Tensor, values: Tensor, counts: Tensor) -> Tensor:
-    """Return, for each limit, the sum of the counts whose value does not exceed it."""
+    """Return, for each limit, the sum of the counts with a value up to it."""
     order = values.argsort()
     start = values.new_full((1,), -math.inf)  # so that there is a value if there is no node
     sums = torch.cat([counts.new_zeros(1), counts[order]]).cumsum(0)

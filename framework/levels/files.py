@@ -12,7 +12,7 @@
 
 All but the means are float32 or float16, by `bits`; all numbers are little endian. The header has
 
-    version, degree, bits  1; degree of the harmonics, whose number is K = (degree + 1)^2 - 1; 32 or 16
+    version, degree, bits  1; degree of the harmonics, K = (degree + 1)^2 - 1 in number; 32 or 16
     origin                 x, y, z in the frame of the input
     look                   antialiased, blur, sort: the settings of drawing
     count, crc32           of each node: its number of Gaussians, and the CRC-32 of its chunk without the zeros
@@ -71,7 +71,7 @@ Bits = Literal[16, 32]
 
 @dataclass(frozen=True)
 class LevelsFile:
-    """An open file of levels, whose chunks are on disk."""
+    """An open file of levels, with its chunks on disk."""
 
     path: Path
     """The file."""
@@ -86,7 +86,7 @@ class LevelsFile:
     look: Look
     """The settings of drawing."""
     starts: Sequence[int]
-    """Position of each chunk in the file, and last that of the header, bytes."""
+    """Position of each chunk in the file, and last of the header, bytes."""
     checksums: Sequence[int]
     """CRC-32 of each chunk."""
 
@@ -208,7 +208,7 @@ def row_size(degree: int, bits: Bits) -> int:
 
 
 def chunk_starts(counts: Sequence[int], degree: int, bits: Bits) -> list[int]:
-    """Return the position of each chunk and, last, that of the header.
+    """Return the position of each chunk and, last, of the header.
 
     Args:
         counts: number of Gaussians of each node.

@@ -26,7 +26,7 @@ from nerfloom.splats.transform import quaternion
 GROUP = 4
 """Number of Gaussians that one merged Gaussian stands for."""
 KNUD_THOMSEN = 1.6075
-"""Exponent of Knud Thomsen's formula of the surface of an ellipsoid, whose relative error is at most 1.1 %."""
+"""Exponent of Knud Thomsen's formula of the surface of an ellipsoid; its relative error is at most 1.1 %."""
 TINY = 1e-300
 """Lower limit of weights, surfaces and variances, which may underflow."""
 FLAT = 1e-14
@@ -36,8 +36,8 @@ FLAT = 1e-14
 def halved(gaussians: Gaussians, errors: Tensor) -> tuple[Gaussians, Tensor]:
     """Return about half as many Gaussians for the same space, and their errors.
 
-    Gaussians near each other form groups of `GROUP`. Two thirds of the groups are merged, those that become smallest.
-    The others stay as they are: large Gaussians, and those far from others.
+    Gaussians near each other form groups of `GROUP`. Two thirds of the groups are merged: the ones that become
+    smallest. The others stay as they are: large Gaussians, and those far from others.
 
     Args:
         gaussians: N Gaussians without further columns, all drawable.

@@ -19,7 +19,7 @@ EDGE_POINTS = 33
 SPARE = 0.02
 """Relative enlargement of the range of directions, since a lens bends edges between these positions."""
 MIN_DEPTH = 1e-3
-"""Minimum depth of a unit direction, whose tangents would be infinite at 90 degrees from the optical axis."""
+"""Minimum depth of a unit direction, because tangents are infinite at 90 degrees from the optical axis."""
 
 
 def tangents(camera: Cameras, blur: float) -> Tensor:

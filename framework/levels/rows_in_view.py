@@ -19,7 +19,7 @@ from nerfloom.splats.table import Columns
 CHUNK = 1024
 """Number of rows of a chunk."""
 MEASURED = 2**18
-"""Maximum number of rows whose boxes are computed at a time."""
+"""Maximum number of rows in a computation of boxes."""
 STEP_SIZE = 256
 """Memory of a Gaussian in a step besides its parameters and their gradient, bytes: its record and the gradient of that,
 its entries in lists of tiles, and parameters after their activation."""
@@ -31,7 +31,7 @@ class RowsInView:
     """The rows of tables that images may show, and the memory that these rows take.
 
     Args:
-        tables: place of the tables, whose memory can be released.
+        tables: place of the tables; their memory can be released.
         limit: memory for the rows of a step, and for rows of earlier steps, bytes.
         chunk: number of rows of a chunk.
     """
@@ -51,7 +51,7 @@ class RowsInView:
     def of(self, columns: Columns, extent: Tensor, camera: SplatCamera, directions: Tensor, learns: bool) -> Tensor:
         """Return the rows (K,) int64 of the Gaussians that an image may show, ascending.
 
-        If these rows and those in memory would exceed the limit, the memory of all rows is released. If these rows
+        If these rows and the rows in memory would exceed the limit, the memory of all rows is released. If these rows
         alone exceed it, a line says so.
 
         Args:
@@ -75,7 +75,7 @@ class RowsInView:
         return (self.chunk * chunks[:, None] + torch.arange(self.chunk)).flatten()
 
     def _measured(self, columns: Columns, extent: Tensor) -> Boxes:
-        """Return the boxes of all chunks, after computing those that are missing or may have changed."""
+        """Return the boxes of all chunks, after computing all that are missing or may have changed."""
         values = columns["means"].values
         everything = self.boxes is None or values._version != self._version  # which a loaded checkpoint changes
         if self.boxes is None or everything:
@@ -89,7 +89,7 @@ class RowsInView:
         for some in self._stale.nonzero()[:, 0].split(max(MEASURED // self.chunk, 1)):
             rows = self._rows(some).clamp(max=len(values) - 1)  # the last Gaussian fills up the last chunk
             means, logits, log_scales = (columns[name].read(extent, rows) for name in ("means", "logits", "log_scales"))
-            # What is not finite is not drawn. It is at the origin here, so that it hides no other Gaussian.
+            # Gaussians that are not finite are not drawn. It is at the origin here, so that it hides no other Gaussian.
             centers = means.nan_to_num(nan=0.0).double().view(len(some), self.chunk, 3)
             low[some], high[some] = centers.amin(1), centers.amax(1)
             reach[some] = reaches(logits, log_scales).nan_to_num(nan=0.0).view(len(some), self.chunk).amax(1)

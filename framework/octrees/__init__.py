@@ -1,1 +1,1 @@
-"""Octrees whose leaves have density and colour: their values in bytes, pictures of them, and their files."""
+"""Octrees with density and colour in their leaves: their values in bytes, pictures of them, and their files."""

@@ -2,9 +2,9 @@
 
 A cell of twice the edge stands for eight cells. Rays along an axis cross these in four rows of two cells, and the mean
 of the rows' transmittances is the transmittance of the larger cell along this axis. A leaf has one density for all
-directions: that of the axis along which it hides most. So a closed surface stays closed whichever way it lies, a thin
-post hides as much as it covers, and the mean depth of thin matter stays the same. The larger cell's colour is the mean
-of its cells' colours, weighted by their opacities.
+directions: the density along the axis where it hides most. So a closed surface stays closed in every orientation, a
+thin post hides as much as it covers, and the mean depth of thin matter stays the same. The larger cell's colour is the
+mean of its cells' colours, weighted by their opacities.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def halved(octree: Octree) -> Octree:
 def with_levels(octree: Octree) -> Octree:
     """Return an octree with coarser levels, down to a single leaf. The finest level stays as it is.
 
-    A box around others keeps its leaves, and has larger ones for what is in the others too.
+    A box around others keeps its leaves, and gets larger ones from the others.
 
     Args:
         octree: the octree, as in its file.

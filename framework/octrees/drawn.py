@@ -1,4 +1,4 @@
-"""Renderables that show an octree, and fixed octrees, such as those of a file."""
+"""Renderables that show an octree, and fixed octrees, such as from a file."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class DrawsOctree(RendersRays):
             for some in pixels.reshape(-1).split(max(self.rays_at_once // per_pixel, 1)):
                 rays = view.camera.pixel_rays(some, self.scene.near, self.scene.far, None, offsets)
                 radii = rays.pixel_radii
-                if radii is not None:  # that of parallel rays does not grow with the distance
+                if radii is not None:  # the width of a pixel of parallel rays does not grow with the distance
                     radii = None if view.camera.model == "orthographic" else radii / per_pixel**0.5
                 rendered = self.render(replace(rays, camera_indices=None, pixel_radii=radii), background)
                 parts.append(rendered.to_pixels(per_pixel, self.outputs))

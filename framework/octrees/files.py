@@ -4,7 +4,7 @@
     size                   (3,) bricks along each axis
     origin, cell           corner of the first cell, and a cell's edge, scene units
     bricks                 (V,) number of bricks with leaves in each of V boxes; each box has the same centre, twice the
-                           edges and as many cells as the one before, whose inside it leaves out
+                           edges and as many cells as the one before, and leaves out its inside
     places                 (B, 3) uint16 coordinates of the bricks, box by box, in ascending order
     masks                  (B, 8) uint64 leaves of each octant (`kernels/octree/layout.py`)
     codes, table           (L,) uint8 and (256 V,): the optical depth of a cell's edge is the table's of box and code

@@ -37,7 +37,7 @@ class Grid:
         return cls(low, cell, (x, y, z))
 
     def around(self) -> Grid:
-        """Return a grid with the same centre, twice the edges and as many cells, for what is outside of this one."""
+        """Return a grid with the same centre, twice the edges and as many cells, for the space outside of this one."""
         half = BRICK / 2 * self.cell * torch.tensor(self.size, dtype=torch.float64)
         return Grid(self.origin - half, 2 * self.cell, self.size, self.level + 1)
 

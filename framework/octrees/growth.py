@@ -32,7 +32,7 @@ def visible(peaks: Tensor, least: float, most: int) -> Tensor:
     Args:
         peaks: (L,) largest weight of each leaf on training rays.
         least: smallest weight of a leaf that stays. If no leaf has it, nothing is known yet, and all qualify.
-        most: maximum number of leaves; those with the largest weights stay.
+        most: maximum number of leaves; the ones with the largest weights stay.
     """
     kept = (peaks >= least).nonzero()[:, 0]
     kept = kept if len(kept) else torch.arange(len(peaks), device=peaks.device)
@@ -40,7 +40,7 @@ def visible(peaks: Tensor, least: float, most: int) -> Tensor:
 
 
 def split(layout: OctreeLayout, cells: Tensor) -> tuple[OctreeLayout, Tensor]:
-    """Return the layout whose leaves are the eighths of some cells.
+    """Return the layout with the eighths of some cells as leaves.
 
     Args:
         layout: the grid of the cells.

@@ -1,4 +1,4 @@
-"""An octree with values in its leaves: what a file holds."""
+"""An octree with values in its leaves, as a file holds it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Octree:
 
     @property
     def scene(self) -> Scene:
-        """The scene as far as the octree knows it, without cameras.
+        """The scene with the facts that the octree has, without cameras.
 
         It starts at a camera itself: `near` is for the training cameras, and others may stand closer.
         """

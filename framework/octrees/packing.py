@@ -40,8 +40,7 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
         coefficients: (L, 3 K) coefficients of the harmonics.
         bits: number of bits of a value, at most 8; fewer take the same memory and show the loss.
 
-    Returns:
-        The leaves, and what they have lost.
+    Returns: The leaves, and their losses.
     """
     steps = 2**bits - 1
     codes, table = packed_depths(depths, bits)
@@ -72,7 +71,7 @@ def packed_depths(depths: Tensor, bits: int = 8) -> tuple[Tensor, Tensor]:
 
 
 def _range(coefficients: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the quantiles (3 K,) between which coefficients (L, 3 K) are stored."""
+    """Return the quantiles (3 K,) that bound the stored coefficients (L, 3 K)."""
     count = len(coefficients)
     if not count:
         return coefficients.new_zeros(coefficients.shape[1]), coefficients.new_zeros(coefficients.shape[1])

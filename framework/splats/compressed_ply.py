@@ -10,7 +10,7 @@ element `vertex` with four 32-bit words a Gaussian; and, for harmonics of degree
     packed_color      8 bits each of red, green, blue and opacity; between min_r ... and max_r ..., else 0 and 1
     f_rest_k          256 (f / 8 + 1/2), rounded down; 0 and 255 stand for -4 and 4
 
-Colours are 0.5 + DC f of the coefficient f of degree 0. The order of f_rest is that of other PLY files.
+Colours are 0.5 + DC f of the coefficient f of degree 0. f_rest has the same order as in other PLY files.
 """
 
 from __future__ import annotations

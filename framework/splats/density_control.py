@@ -129,7 +129,7 @@ class DensityControl(Strategy):
 
 
 def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
-    """Return the absolute gradient (N,) of each Gaussian's image position, for an image whose longer side is 2 units.
+    """Return the absolute gradient (N,) of each Gaussian's image position, for an image with a longer side of 2 units.
 
     Args:
         gradient: (N, RECORD) gradient of the records; two columns hold `blend`'s sums of absolute gradients over
@@ -140,7 +140,7 @@ def image_gradients(gradient: Tensor, longer_side: int) -> Tensor:
 
 
 def grown(gaussians: Gaussians, gradients: Tensor, most: int, extent: float) -> Change | None:
-    """Clone or split Gaussians with large gradients; drop transparent ones and those that are not finite.
+    """Clone or split Gaussians with large gradients; drop transparent Gaussians and any that are not finite.
 
     Args:
         gaussians: N Gaussians.

@@ -27,11 +27,11 @@ EWA_ANGLE = math.radians(89)
 """Largest angle from the optical axis for elliptical weighted averaging, which shows less than 90 degrees. Images of a
 fisheye that show more are drawn by the unscented transform, like panoramas."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-"""From a camera's axes (x right, y up, looking along -z) to those of splatting (x right, y down, z forward)."""
+"""From a camera's axes (x right, y up, looking along -z) to the axes of splatting (x right, y down, z forward)."""
 
 
 def smallest_depth(scene: Scene) -> float:
-    """Return the depth, scene units, below which the centres of Gaussians are not drawn."""
+    """Return the minimum depth of the centres of drawn Gaussians, scene units."""
     return max(0.2 * scene.near, 1e-3)
 
 
@@ -91,7 +91,7 @@ def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
 def _widest_angle(
     coefficients: tuple[float, ...], intrinsics: tuple[float, float, float, float], width: int, height: int
 ) -> float:
-    """Return the largest angle, radians, between a fisheye's axis and what an image shows: at a corner, or the lens's
+    """Return the largest angle, radians, from a fisheye's axis that an image shows: at a corner, or the lens's
     reach."""
     fx, fy, cx, cy = intrinsics
     across = torch.tensor([-cx, width - cx, -cx, width - cx], dtype=torch.float64) / fx

@@ -1,4 +1,4 @@
-"""Renderables that draw Gaussians, and fixed Gaussians, such as those of a file."""
+"""Renderables that draw Gaussians, and fixed Gaussians, such as from a file."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class Order:
 
 
 Written = tuple[str, list[str]]
-"""What was removed to fit the size, empty if nothing, and sentences about other losses."""
+"""Description of the parts removed to fit the size, empty if none, and sentences about other losses."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Format:
     ending: str
     """Suffix of its files, or their whole name."""
     starts: tuple[bytes, ...] = ()
-    """What its files begin with; empty if only the ending tells."""
+    """First bytes of its files; empty if only the ending identifies them."""
     read: Callable[[Path], Splats] | None = None
     """Reads a file; None if the format is not read."""
     write: Callable[[Path, Order], Written] | None = None
@@ -95,7 +95,7 @@ FORMATS = (
     Format(".splatv", program="antimatter15/splaTV"),
     Format(".rad", program="Spark"),
 )
-"""Every format. Those that are neither read nor written have a message of their own."""
+"""Every format. Formats that are neither read nor written have a message of their own."""
 SUFFIXES = tuple(each.ending for each in FORMATS if each.write is not None and each.ending.startswith("."))
 """Suffixes of files that can be written."""
 READ = tuple(each.ending for each in FORMATS if each.read is not None)
@@ -156,17 +156,17 @@ def write_gaussians(
     look: Look = OURS,
     spz_version: SpzVersion = 2,
 ) -> list[str]:
-    """Write Gaussians to a file in the format of its suffix, and return what was lost.
+    """Write Gaussians to a file in the format of its suffix, and return the losses.
 
     Args:
         file: path of the file, with a suffix of `SUFFIXES`; the path of a meta.json makes a folder of the format SOG.
-        gaussians: N Gaussians on the CPU; for a .glb file in a frame whose y is up (`Placement.y_up`).
+        gaussians: N Gaussians on the CPU; for a .glb file in a frame with y up (`Placement.y_up`).
         max_megabytes: maximum size of the file in millions of bytes; None for any.
         look: the settings of drawing.
         spz_version: version of an SPZ file.
 
     Returns:
-        Sentences about what was removed to fit the size, and about what else the format does not hold.
+        Sentences about the parts removed to fit the size, and about other parts that the format does not hold.
 
     Raises:
         ConfigError: if the format cannot hold the Gaussians, no file fits the size, or a package is missing, which SPZ

@@ -28,11 +28,11 @@ DOUBT = 1.05
 """A choice is not tried if its estimated size exceeds the limit by more than this ratio."""
 
 Encode = Callable[[Gaussians], tuple[bytes, list[str]]]
-"""Returns the content of a file of Gaussians, and sentences about what is lost in it."""
+"""Returns the content of a file of Gaussians, and sentences about its losses."""
 
 
 def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tuple[Gaussians, str]:
-    """Return Gaussians that fit into a PLY file of limited size, and a description of what was removed.
+    """Return Gaussians that fit into a PLY file of limited size, and a description of the removed parts.
 
     Args:
         gaussians: N Gaussians.
@@ -45,7 +45,7 @@ def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
     for degree in range(gaussians.degree, -1, -1):
         if ply_size(len(gaussians), _terms(degree), look) <= most_bytes:
             return with_degree(gaussians, degree), _changes(gaussians, degree, BITS, len(gaussians))
-    # Not less than what fits: the header is longest for N.
+    # An upper bound of the number that fits: the header is longest for N.
     header = ply_size(len(gaussians), 0, look) - len(gaussians) * (row := ply_size(1, 0) - ply_size(0, 0))
     count = math.floor((most_bytes - header) / row)
     if count < 1:
@@ -65,7 +65,7 @@ def fitted_spz(
         version: version of the format.
 
     Returns:
-        The content, sentences about losses, and a description of what was removed.
+        The content, sentences about losses, and a description of the removed parts.
 
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.
@@ -95,7 +95,7 @@ def fitted(gaussians: Gaussians, most_bytes: float | None, encode: Encode) -> tu
         encode: returns the content of a file of given Gaussians, and sentences about losses.
 
     Returns:
-        The content, the sentences, and a description of what was removed.
+        The content, the sentences, and a description of the removed parts.
 
     Raises:
         ConfigError: if not even one Gaussian fits, or the format cannot hold them.

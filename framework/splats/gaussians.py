@@ -26,7 +26,7 @@ COLUMNS = ("means", "log_scales", "rotations", "logits", "colors", "harmonics")
 class Gaussians:
     """N Gaussians of 3D Gaussian Splatting (Kerbl et al. 2023), before their activations.
 
-    The parameters are named columns: six for drawing, and those that a method adds.
+    The parameters are named columns: six for drawing, and any that a method adds.
     """
 
     means: Tensor
@@ -142,7 +142,7 @@ class HasGaussians(Protocol):
 
 @runtime_checkable
 class HasGaussianParts(HasGaussians, Protocol):
-    """A model whose Gaussians are in several parts, not all of them in memory."""
+    """A model with Gaussians in several parts, not all of them in memory."""
 
     def gaussian_parts(self, time: float | None = None) -> Iterator[Gaussians]:
         """Yield the Gaussians of `HasGaussians.gaussians` part by part, on the CPU. Degrees of harmonics may differ.

@@ -34,7 +34,7 @@ from nerfloom.splats.look import OURS, Look, comments
 
 EXTENSION = "KHR_gaussian_splatting"
 MAX_BYTES = 2**32 - 1
-"""Maximum size of a GLB file, whose header states it in 32 bits."""
+"""Maximum size of a GLB file: the header states it in 32 bits."""
 MAX_LOG_SCALE = 88.0
 """Maximum logarithm of a standard deviation: its exponential is finite in float32."""
 FLOAT, UNSIGNED_SHORT = 5126, 5123
@@ -46,12 +46,12 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def encoded_glb(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[str]]:
-    """Return the content of a GLB file, and sentences about what other programs cannot know from it.
+    """Return the content of a GLB file, and sentences about facts that other programs cannot read from it.
 
     All numbers are float32, so nothing is rounded beyond it.
 
     Args:
-        gaussians: N finite Gaussians on the CPU, in a frame whose y is up.
+        gaussians: N finite Gaussians on the CPU, in a frame with y up.
         look: the settings of drawing.
 
     Raises:

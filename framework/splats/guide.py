@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from nerfloom.data.pixels.batch import ViewBatch
 
 GUIDED_UNTIL = 0.5
-"""Share of the budget during which distances are used. Their weight falls linearly to 0."""
+"""Share of the budget that uses distances, from the start. Their weight falls linearly to 0."""
 
 GUIDE = {True: (0.1, "captures leave room for floaters"), False: (0.0, "the scene ends at its box")}
 """Weight of a field's distances, and the reason, for unbounded and bounded scenes."""

@@ -1,19 +1,19 @@
 """Gaussians in KSPLAT files, which GaussianSplats3D writes.
 
-The format, of version 0.1, is that of https://github.com/mkkellogg/GaussianSplats3D (src/loaders/SplatBuffer.js). A
+Version 0.1 of the format is documented by https://github.com/mkkellogg/GaussianSplats3D (src/loaders/SplatBuffer.js). A
 header of 4,096 bytes states the number of sections and of Gaussians, a compression level, and the range of harmonics.
 A header of 1,024 bytes for each section follows, then the sections. A section has the lengths of its buckets that are
 not full, the buckets' centres, and the Gaussians, bucket by bucket, of
 
-    position     3 x float32 | 3 x 16 bits, in which p stands for a bucket's centre + (p - range) block / (2 range)
+    position     3 x float32 | 3 x 16 bits, where p stands for a bucket's centre + (p - range) block / (2 range)
     scale        3 x float32 | 3 x float16     standard deviations
     rotation     4 x float32 | 4 x float16     a quaternion w, x, y, z
     colour       3 x 8 bits                    255 (0.5 + DC f) of the coefficient f of degree 0, rounded down
     opacity      1 x 8 bits                    255 sigmoid(logit), rounded down
     harmonics    3K x float32 | float16 | 8 bits between the ends of the header's range
 
-at compression level 0 | 1 and 2, harmonics at level 0 | 1 | 2. These are of degree 2 at most; those of degree 1 come
-first, and in each degree all of red before all of green before all of blue. Axes are those of PLY files.
+at compression level 0 | 1 and 2, harmonics at level 0 | 1 | 2. These are of degree 2 at most; degree 1 comes first, and
+in each degree all of red before all of green before all of blue. The axes are the same as in PLY files.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def read_ksplat(file: Path) -> Gaussians:
     """Read Gaussians from a KSPLAT file.
 
     Gaussians that are not finite are removed, with a message on the terminal. Opacities of 0 and 1 become 1/1020 and
-    1019/1020, whose logits are finite.
+    1019/1020, because their logits must be finite.
 
     Args:
         file: path of the file.
@@ -211,7 +211,7 @@ def _harmonics(header: _Header, stored: np.ndarray) -> Tensor:
 
 
 def _together(parts: list[Gaussians]) -> Gaussians:
-    """Return all Gaussians; those of lower degrees get harmonics of 0."""
+    """Return all Gaussians; Gaussians of lower degrees get harmonics of 0."""
     terms = max(part.harmonics.shape[2] for part in parts)
     return Gaussians.joined([
         replace(part, harmonics=pad(part.harmonics, (0, terms - part.harmonics.shape[2]))) for part in parts

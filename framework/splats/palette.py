@@ -1,8 +1,8 @@
 """Few values in place of many: a codebook of numbers, and a palette of vectors, for files of Gaussians.
 
 **A codebook** has 256 numbers, and values become the nearest of them. Half of its numbers are spread evenly over the
-range of the values, and half as the values are. So the largest error is the range / 255, whatever the values are, and
-it is smaller where they are dense.
+range of the values, and half as the values are. So the largest error is at most the range / 255, and it is smaller
+where values are dense.
 
 **A palette** is found by k-means (Lloyd 1982) in two levels: vectors are divided into groups, each group into parts.
 With K vectors in the palette, a step compares a vector with some 2 sqrt(K) centres instead of K. The start is drawn

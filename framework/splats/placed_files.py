@@ -47,12 +47,12 @@ def write_placed(
         gaussians: N Gaussians on the CPU, with centres in float64.
         look: the settings of drawing.
         scale: the unit of their coordinates.
-        placement: placement of their frame in a scene whose up is +z.
+        placement: placement of their frame in a scene with +z up.
         max_megabytes: maximum size of the file in millions of bytes; None for any.
         spz_version: version of SPZ files.
 
     Returns:
-        Sentences for the user about what was lost, and about the local origin.
+        Sentences for the user about losses and the local origin.
 
     Raises:
         ConfigError: if the format cannot hold the Gaussians, or no file fits the size.

@@ -34,7 +34,7 @@ def placed_gaussians(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, S
         up: the direction in that frame that becomes +z.
 
     Returns:
-        The placement of the file's frame in the scene's, and a scene without cameras, whose box is from -1 to 1. It is
+        The placement of the file's frame in the scene's, and a scene without cameras and with a box from -1 to 1. It is
         unbounded, with a black background, if more than `OUTSIDE` of the Gaussians are farther than 1 from the origin.
 
     Raises:
@@ -42,7 +42,7 @@ def placed_gaussians(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, S
     """
     finite = gaussians[gaussians.finite()]
     if not len(finite):
-        raise DataError("the file has no Gaussians whose numbers are finite: export it again")
+        raise DataError("the file has no Gaussian with finite numbers: export it again")
     dense = finite[torch.sigmoid(finite.logits) >= FAINT]
     means = (dense if len(dense) else finite).means.double().cpu()
     middle = means.median(0).values

@@ -1,9 +1,9 @@
 """Gaussians in PLY files, in the layout of the code of 3D Gaussian Splatting (Kerbl et al. 2023).
 
 A vertex is a Gaussian, and its properties are parameters before their activations: centre x, y, z; normals nx, ny, nz,
-which are 0 and ignored by readers; f_dc_0 to f_dc_2, the coefficients of degree 0; f_rest_0 to f_rest_(3K-1), those of
-higher degrees, all of red before all of green before all of blue; opacity (before the sigmoid); scale_0 to scale_2
-(logarithms); rot_0 to rot_3 (a quaternion w, x, y, z).
+which are 0 and ignored by readers; f_dc_0 to f_dc_2, the coefficients of degree 0; f_rest_0 to f_rest_(3K-1), the
+coefficients of higher degrees, all of red before all of green before all of blue; opacity (before the sigmoid); scale_0
+to scale_2 (logarithms); rot_0 to rot_3 (a quaternion w, x, y, z).
 
 Mip-Splatting's files also have a property `filter_3D`: the standard deviation of a smoothing filter in space, which
 is a part of the Gaussian (Yu et al. 2024, section 4.1). With f for it, scales are sqrt(s^2 + f^2), and opacity is that
@@ -145,7 +145,7 @@ def _parts(file: Path, vertex: PlyElement, most: int) -> Iterator[Gaussians]:
 
 
 def _described(file: Path, header: PlyHeader, vertex: PlyElement) -> Look:
-    """Return the settings of drawing, and say what reading the vertices of a file changes."""
+    """Return the settings of drawing, and report changes made when reading the vertices of a file."""
     if sum(name.startswith("f_rest_") for name in vertex.names) > 3 * DEGREES[MAX_DEGREE]:
         say(f"{file}: harmonics above degree {MAX_DEGREE} are left out")
     if _filters(vertex):

@@ -16,7 +16,7 @@ from nerfloom.splats.rasteriser import Projected, Rasteriser
 class PreparedGaussians:
     """Gaussians that are prepared when they are drawn a second time.
 
-    Preparing takes as long as a few pictures; after a step of training a viewer draws only one.
+    Preparing takes the time of a few pictures; after a step of training a viewer draws only one.
 
     Args:
         gaussians: the Gaussians; they must not change.

@@ -22,7 +22,7 @@ GRADIENT_WEIGHT, OPACITY_WEIGHT = 0.5, 0.5
 
 
 class Relocation(Strategy):
-    """Dead Gaussians move to those with a large sampling score, and a few are added each time."""
+    """Dead Gaussians move to Gaussians with a large sampling score, and a few are added each time."""
 
     changes_per_doubling = Mcmc.changes_per_doubling
 
@@ -53,5 +53,5 @@ def sampling_scores(gradients: Tensor, opacities: Tensor) -> Tensor:
 
 
 def _relative(values: Tensor) -> Tensor:
-    """Return values (N,) divided by the mean of those that are not NaN; zeros stay zeros."""
+    """Return values (N,) divided by their mean without NaNs; zeros stay zeros."""
     return values / values.nanmean().clamp(min=1e-20)

@@ -25,7 +25,7 @@ def octaves_at(progress: float, share: float, most: int) -> int:
     """Return the number of halvings of the images at a point of the run.
 
     Images are halved once during `share` of the budget, twice in its first half, three times in its first quarter, and
-    so on. Each size takes as much time as all smaller ones together.
+    so on. Each size takes the same time as all smaller ones together.
 
     Args:
         progress: share of the budget that is spent.
@@ -177,7 +177,7 @@ def enlarged(image: Tensor, whole: Tensor, octaves: int) -> Tensor:
 
     Args:
         image: (H >> octaves, W >> octaves, C) the reduced image.
-        whole: (H, W, C) the whole one, whose last rows and columns fill what reducing left out.
+        whole: (H, W, C) the whole one; its last rows and columns fill the border that reducing left out.
         octaves: number of halvings of the image.
     """
     if octaves == 0:

@@ -23,7 +23,7 @@ MAX_STEPS_PER_SECOND = 100
 MAX_GAUSSIANS, MAX_RATE = 1_000_000, 8.0
 """Largest number of Gaussians and largest factor of learning rates that a budget chooses."""
 LARGE_IMAGE = 250_000
-"""Number of pixels above which training begins with reduced images."""
+"""Maximum number of pixels of an image that training begins with at full size; larger images are reduced at first."""
 LONG_RUN, NEVER = 15_000, 10**9
 """Minimum length of a run with resets of opacity, steps, and a period that is never reached. Recovery from a reset
 takes a thousand steps."""
@@ -100,11 +100,11 @@ class SplattingConfig(
     """Adapt the share of reduced images and --steps-per-move to measured step times. Default: with --max-seconds in one
     process, unless --reduced-until or --steps-per-move is given."""
     strategy: Literal["adc", "mcmc", "relocation"] = "adc"
-    """How Gaussians are added and removed. adc: drop transparent Gaussians; clone or split those with large gradients
-    of the image position (adaptive density control of 3DGS). mcmc: move transparent Gaussians to opaque ones
-    (3DGS-MCMC). relocation: move them to those that are opaque or have large gradients (FreeTimeGS)."""
+    """How Gaussians are added and removed. adc: drop transparent Gaussians; clone or split Gaussians with large
+    gradients of the image position (adaptive density control of 3DGS). mcmc: move transparent Gaussians to opaque ones
+    (3DGS-MCMC). relocation: move them to Gaussians that are opaque or have large gradients (FreeTimeGS)."""
     growth_end: float = 0.8
-    """Share of the budget after which no Gaussian is added or moved."""
+    """Share of the budget until the last Gaussian is added or moved."""
     steps_per_move: Auto[int] = AUTO
     """Steps between two changes of the number of Gaussians. Default: 100, or down to 20 in runs that are too short to
     reach --num-gaussians otherwise."""
@@ -124,8 +124,8 @@ class SplattingConfig(
     """Weight of the mean of each Gaussian's smallest scale, in scene extents, in the loss. It makes Gaussians flat, as
     in PGSR."""
     normal_loss_mult: float = 0.0
-    """Weight of the disagreement between the normals of Gaussians and those of the surface at the drawn distances, as
-    in 2DGS. It counts after 7/30 of the budget. Such steps draw a second image, of normals."""
+    """Weight of the disagreement between the normals of Gaussians and of the surface at the drawn distances, as in
+    2DGS. It counts after 7/30 of the budget. Such steps draw a second image, of normals."""
     distortion_loss_mult: float = 0.0
     """Weight of the spread of Gaussians along each ray, as in 2DGS. It counts after 1/10 of the budget. Such steps draw
     a further image."""

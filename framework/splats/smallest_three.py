@@ -1,7 +1,7 @@
 """Quaternions by their three smallest components. Files leave the largest out, as it follows from unit length.
 
-q and -q are the same rotation, so the largest component can be made positive, and is the root of what the squares of
-the others leave of 1. The others are at most sqrt(1/2).
+q and -q are the same rotation, so the largest component can be made positive. It is then the root of 1 minus the
+squares of the others. These are at most sqrt(1/2).
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ has the number of Gaussians, numbers that decode the images, and the images' nam
     shN_centroids       the palette: 64 entries a row, K pixels each, whose R, G, B are indices of the coefficients of
                         red, green and blue in a codebook of 256
 
-Images are WebP without loss (other formats without loss are allowed: PNG is read too). Axes are those of PLY files.
-`antialias` of meta.json says whether the Gaussians were trained with antialiasing; newer programs read `model` instead.
-The settings of `nerfloom.splats.look` are in `extras`, which the format leaves to applications.
+Images are WebP without loss (other formats without loss are allowed: PNG is read too). The axes are the same as in PLY
+files. `antialias` of meta.json says whether the Gaussians were trained with antialiasing; newer programs read `model`
+instead. The settings of `nerfloom.splats.look` are in `extras`, which the format leaves to applications.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ META = "meta.json"
 COMMENTS = "comments"
 """Entry of `extras` with the settings of drawing: lines as in a PLY file."""
 FIRST_PLACE = 252
-"""Alpha of a rotation whose largest component is w."""
+"""Alpha of a rotation with w as its largest component."""
 PER_ROW = 64
 """Entries of the palette in a row of its image."""
 MAX_ENTRIES = 1 << 16
@@ -133,7 +133,7 @@ def _from_folder(folder: Path) -> Read:
 
 
 def _parsed(file: Path, content: bytes) -> dict[str, Any]:
-    """Return what meta.json says, if it is of version 2 and has all parts."""
+    """Return the content of meta.json, if it is of version 2 and has all parts."""
     try:
         meta = json.loads(content)
     except (ValueError, RecursionError) as error:
@@ -148,7 +148,7 @@ def _parsed(file: Path, content: bytes) -> dict[str, Any]:
 
 
 def _keys(meta: dict[str, Any]) -> list[str]:
-    """Return the names of the parts, the last of which is there if there are harmonics."""
+    """Return the names of the parts; the last is only in files with harmonics."""
     return ["means", "scales", "quats", "sh0", *(["shN"] if meta.get("shN") is not None else [])]
 
 
@@ -161,7 +161,7 @@ def _names(file: Path, meta: dict[str, Any], key: str, number: int) -> list[str]
 
 
 def _is_plain(name: object) -> bool:
-    """Return whether a name is that of a file in the same folder."""
+    """Return whether a name is a file's in the same folder."""
     return isinstance(name, str) and name.isprintable() and name not in ("", ".", "..") and not set(name) & set("/\\:")
 
 

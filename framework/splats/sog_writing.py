@@ -128,7 +128,7 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 def _coded(values: Tensor) -> tuple[list[float], np.ndarray]:
     """Return a codebook and the indices of the values in it."""
     codes = codebook(values.numpy())
-    # Nine digits tell float32 apart, and are shorter than those of the same numbers in float64.
+    # Nine digits distinguish all float32 numbers, and are fewer than float64 would print.
     return [float(f"{code:.9g}") for code in codes], nearest_codes(values.numpy(), codes)
 
 
@@ -145,7 +145,7 @@ def _palette(harmonics: Tensor) -> tuple[np.ndarray, dict[str, Any], np.ndarray,
 
 
 def _webp(channels: np.ndarray, width: int, height: int) -> bytes:
-    """Return a WebP image without loss, whose first pixels are (N, 3 or 4) numbers from 0 to 255."""
+    """Return a lossless WebP image with (N, 3 or 4) numbers from 0 to 255 as its first pixels."""
     pixels = np.zeros((width * height, 4), np.uint8)
     pixels[:, 3] = 255
     pixels[: len(channels), : channels.shape[1]] = channels

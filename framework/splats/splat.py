@@ -1,6 +1,6 @@
 """Gaussians in .splat files: 32 bytes each, one after the other, without a header.
 
-The format is that of https://github.com/antimatter15/splat (convert.py and main.js):
+The format is defined by https://github.com/antimatter15/splat (convert.py and main.js):
 
     position    3 x float32
     scale       3 x float32   standard deviations

@@ -12,8 +12,8 @@ The format is described in https://github.com/nianticlabs/spz (README.md and src
     harmonics    3K x 8 bits    128 (f + 1) of degrees 1 and higher; red, green, blue of each coefficient in a row
 
 **Axes.** The README says that SPZ is RUB (x right, y up, z back) and PLY is RDF (x right, y down, z front). The axes of
-a captured scene are arbitrary; what matters is that y and z change sign between the two formats. `read_spz` returns the
-values of a PLY file of the same scene, equal to those of Niantic's library in RDF. (Some converters do not change the
+a captured scene are arbitrary, but y and z must change sign between the two formats. `read_spz` returns the values of a
+PLY file of the same scene, as Niantic's library does in RDF. (Some converters do not change the
 axes.) The sign also changes for y and z of quaternions and for harmonics that are odd in y and z together (`SIGNS`).
 
 **How they are drawn.** The lowest bit of the flags says that the Gaussians were trained with antialiasing. The other
@@ -21,7 +21,7 @@ settings of `nerfloom.splats.look` are in a place that other programs skip.
 
 **Versions.** Version 2 is written unless another is asked for, since some programs read no other. With 8 bits of x, y
 and z, w near 0 is inaccurate, and a rotation may be wrong by twelve degrees. But a Gaussian has 24 equivalent
-descriptions, since its axes can be permuted and reversed, and in one of them w is at least 0.85. That one is written;
+descriptions, since its axes can be permuted and reversed, and in one of them w is at least 0.85. This one is written;
 its error is at most one degree. In versions 3 and 4 it is at most 0.3 degrees.
 """
 
@@ -69,7 +69,7 @@ ANTIALIASED = 1
 def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OURS, version: SpzVersion = 2) -> bytes:
     """Return the content of an SPZ file.
 
-    What exceeds the format's range is clipped: standard deviations to e^-10 ... e^5.9, coefficients of degree 0 to
+    Values outside the format's range are clipped: standard deviations to e^-10 ... e^5.9, coefficients of degree 0 to
     +-3.3 and others to -1 ... 0.99. Elsewhere the error is at most half a step: 1/32 of a logarithm of a scale, 1/510
     of an opacity, 1/76 of a coefficient of degree 0, 2^-bits of a harmonic.
 
@@ -189,7 +189,7 @@ def _group() -> Tensor:
 
 
 def _largest_real_part(rotations: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit quaternions (N, 4), float64, with the largest w among those of the same Gaussians, and log scales."""
+    """Return unit quaternions (N, 4), float64, with the largest w among equivalent descriptions, and log scales."""
     unit = rotations.double()
     unit = unit / unit.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     group = _group()

@@ -11,8 +11,8 @@ ours: it holds the settings of drawing, and other programs skip it.
 array, its sizes with and without compression; then the arrays, each a Zstandard frame (RFC 8878). An empty array is
 left out.
 
-**An extension** is a 32-bit type, a 32-bit length, and content. Programs skip those that they do not know, some with a
-warning. `AXES` says that other axes are stored, and a file with them is refused. `DRAWING` is ours: in version 4 it
+**An extension** is a 32-bit type, a 32-bit length, and content. Programs skip unknown ones, some with a warning. `AXES`
+says that other axes are stored, and a file with them is refused. `DRAWING` is ours: in version 4 it
 holds the settings of drawing.
 """
 
@@ -47,7 +47,7 @@ MAX_GAUSSIANS = 10_000_000
 MAX_COUNT = 2**31 - 1
 """Maximum number of Gaussians that are read, as in Niantic's library."""
 MAX_RATIO = 1032
-"""Maximum ratio of sizes before and after compression: that of gzip. Arrays of Gaussians stay far below it."""
+"""gzip's maximum ratio of the sizes before and after compression. Arrays of Gaussians stay far below it."""
 MAX_SURPLUS = 1 << 24
 """Maximum number of bytes behind the last array of a gzip file, for extensions."""
 MAX_WINDOW = 1 << 27
@@ -169,12 +169,12 @@ def _with_gzip(file: Path) -> Packed:
     with gzip.open(file, "rb") as stream:
         start = stream.read(HEADER.size)
         if start[:4] != MAGIC:
-            raise DataError(f"{file} is not an SPZ file: what it unpacks to does not begin with {MAGIC.decode()}")
+            raise DataError(f"{file} is not an SPZ file: its unpacked content does not begin with {MAGIC.decode()}")
         if len(start) < HEADER.size:
             raise DataError(f"{file} is truncated: copy or export it again")
         _, version, count, degree, fraction, flags, _ = HEADER.unpack(start)
         if version not in (1, 2, 3):
-            raise DataError(f"{file} is SPZ of version {version}; those in gzip files are 1 to 3: export it again")
+            raise DataError(f"{file} is SPZ of version {version}; gzip files have versions 1 to 3: export it again")
         _check(file, version, count, degree, fraction, file.stat().st_size)
         needed = count * sum(widths(version, degree))
         content = stream.read(needed)
@@ -225,7 +225,7 @@ def _with_zstandard(file: Path, content: bytes) -> Packed:
 
 
 def _unpacked(file: Path, frame: bytes, size: int) -> bytes:
-    """Return the content of a Zstandard frame, which must have a size; whatever it claims, it is read in pieces."""
+    """Return the content of a Zstandard frame; the size that it states may be wrong, so it is read in pieces."""
     import zstandard
 
     content = bytearray()
@@ -241,7 +241,7 @@ def _unpacked(file: Path, frame: bytes, size: int) -> bytes:
 
 
 def _check(file: Path, version: int, count: int, degree: int, fraction: int, size: int) -> None:
-    """Refuse a header whose numbers are out of range, or that has more Gaussians than the file can hold."""
+    """Refuse a header with numbers out of range, or with more Gaussians than the file can hold."""
     if degree > 4 or fraction > 30 or count > MAX_COUNT:
         raise DataError(
             f"{file} is damaged: its header states {count:,} Gaussians of degree {degree} with {fraction} fractional"

@@ -25,7 +25,7 @@ HULL_CELLS = 128
 MAX_MEASURED = 1_000
 """Maximum number of Gaussians used to find distances from the cameras."""
 MIN_WIDE_RATIO = 0.5
-"""Ratio of image width to distance, 28 degrees, below which a lens counts as long."""
+"""Minimum ratio of image width to distance (28 degrees) of a lens that does not count as long."""
 PLACES = {
     "points": "at the points of a reconstruction",
     "field": "on the surfaces of a field",
@@ -197,8 +197,8 @@ def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Data
     """Return the initial points (N, 3) of Gaussians, scene coordinates.
 
     Args:
-        kind: points: those of a reconstruction. silhouettes: random ones on the surface of the visual hull of images
-            with alpha. random: anywhere in the scene's box.
+        kind: points: the points of a reconstruction. silhouettes: random ones on the surface of the visual hull of
+            images with alpha. random: anywhere in the scene's box.
         dataset: the images.
         count: number of random points, or maximum number of points of a reconstruction.
 

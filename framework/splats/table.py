@@ -104,7 +104,7 @@ def usual_columns(degree: int, rate: float, position_rate: float) -> dict[str, C
 
 
 def as_gaussians(columns: Columns, extent: Tensor | float = 1.0, rows: Tensor | None = None) -> Gaussians:
-    """Return the Gaussians whose parameters are in columns.
+    """Return the Gaussians with their parameters in columns.
 
     Args:
         columns: N rows of each column, by name.

@@ -37,7 +37,7 @@ def transformed(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Ten
 
 
 def transformed_in_float64(gaussians: Gaussians, rotation: Tensor, scale: float, shift: Tensor) -> Gaussians:
-    """Return `transformed` Gaussians whose centres are float64, for coordinates far from the origin.
+    """Return `transformed` Gaussians with float64 centres, for coordinates far from the origin.
 
     `gaussians`, `rotation`, `scale` and `shift` are as in `transformed`.
 
@@ -83,7 +83,7 @@ def quaternion(rotation: Tensor) -> Tensor:
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
-    """Return quaternions (..., 4) w, x, y, z of the rotation by `second` (..., 4), followed by that by `first`."""
+    """Return quaternions (..., 4) w, x, y, z of the rotation `second` (..., 4), followed by `first`."""
     w, v = first[..., :1], first[..., 1:]
     other_w, other = second[..., :1], second[..., 1:]
     v, other = torch.broadcast_tensors(v, other)

@@ -1,4 +1,4 @@
-"""Loading of a scene in blocks, whose runs are loaded when a picture needs them."""
+"""Loading of a scene in blocks; its runs are loaded when a picture needs them."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def load_blocks(file: Path, device_type: Any = "auto", data: Path | None = None,
     Args:
         file: its blocks.yml; dataparser_transforms.json beside it places the scene.
         device_type: auto, cpu, cuda or mps.
-        data: folder of the data, if it has moved; None for that of the runs.
+        data: folder of the data, if it has moved; None for the runs' folder.
         settings: changed settings of the runs, by name; None for their own value.
 
     Raises:
         ConfigError: if the file or the first run cannot be read.
         CheckpointError: if the first run has no readable checkpoint. For another run, a picture that needs it raises
             this error.
-        DataError: if the file or the placement is invalid, or lengths in the scene are not those of space (--ndc).
+        DataError: if the file or the placement is invalid, or lengths in the scene are not lengths in space (--ndc).
     """
     content, placement = read_blocks(file), read_transforms(file.parent / TRANSFORMS)
 
@@ -63,7 +63,7 @@ def load_blocks(file: Path, device_type: Any = "auto", data: Path | None = None,
 
 
 def _scene(first: Scene, content: BlockList) -> Scene:
-    """Return the composed scene, given that of the first block."""
+    """Return the composed scene, given the first block's scene."""
     return dataclasses.replace(
         first,
         box=first.box.new_tensor(content.box),
@@ -81,7 +81,7 @@ def _source(run: Run, file: Path, device_type: Any, data: Path | None) -> Run:
         run: the run of a block.
         file: file of the scene.
         device_type: device of the model.
-        data: folder of the data; None for that of the run.
+        data: folder of the data; None for the run's folder.
     """
     config = dataclasses.replace(
         run.config,

@@ -3,7 +3,7 @@
 FOLDER/
     plan.json                     method, flags and cameras of each block, so that a later call continues
     dataparser_transforms.json    from the input's frame to the composed scene's
-    runs/000/placement.json       from the input's frame to that of block 0, if the format takes a placement
+    runs/000/placement.json       from the input's frame to block 0's, if the format takes a placement
     runs/000/METHOD/run/          the run of block 0
     blocks.yml                    the scene in blocks
 """
@@ -48,7 +48,7 @@ class BlockPlan:
     blocks: tuple[Block, ...]
     """The blocks."""
     placements: tuple[Placement | None, ...]
-    """Placement of the input in each block's scene; None for that of the data format."""
+    """Placement of the input in each block's scene; None to leave it to the data format."""
     folder: Path
     """Output folder, absolute."""
     budget: str
@@ -67,7 +67,7 @@ class BlockPlan:
         return [self._job(number) for number in range(len(self.blocks))]
 
     def finished(self) -> list[TrainedBlock]:
-        """Return the blocks whose training has ended."""
+        """Return the blocks with finished training."""
         return [
             TrainedBlock(block.center, block.radius, block.cameras, self.run_of(number))
             for number, block in enumerate(self.blocks)
@@ -154,9 +154,9 @@ def positions_of(parsed: ParsedScene) -> Tensor:
 
 
 def block_placements(run: Run, parsed: ParsedScene, blocks: tuple[Block, ...]) -> tuple[Placement | None, ...]:
-    """Return the placement of the input in each block's scene; None for that of the data format.
+    """Return the placement of the input in each block's scene; None to leave it to the data format.
 
-    A scene without a box is placed by its cameras: those of a block get the room that those of all would have, around
+    A scene without a box is placed by its cameras: a block's cameras get the room that all cameras would have, around
     the block's centre. All blocks keep the rotation of the whole scene. A box stays where the format puts it.
 
     Args:

@@ -54,7 +54,7 @@ def learn_visibility(block: TrainedBlock, device_type: Any = "auto") -> Visibili
         depths.append(picture.median_depth.cpu())
         opacities.append(picture.accumulation.cpu())
         strides.append(view.stride)
-    # The network is asked for cameras as they stand in the data, whatever the block's refined poses are.
+    # The network is asked for cameras at their poses in the data, not at the block's refined poses.
     sights = Sights(parsed.cameras.to("cpu")[chosen], depths, opacities, strides)
     points, directions = queries(sights.cameras, block.radius * placement.scale, POINTS)
     labels = sights.transmittance(points, directions)
@@ -68,7 +68,7 @@ def fitted(network: Visibility, points: Tensor, directions: Tensor, labels: Tens
     Args:
         network: a new network.
         points: (N, 3) positions in the input's frame.
-        directions: (N, 3) unit directions in which they are looked at, in the input's frame.
+        directions: (N, 3) unit viewing directions, in the input's frame.
         labels: (N,) their transmittances.
     """
     inputs, random = network.inputs(points, directions), torch.Generator().manual_seed(0)

@@ -35,12 +35,12 @@ PIECE = 2**24
 MAPPED_SIZE = 2**30
 """Minimum size of a file that is mapped into memory on a CPU, instead of being read as a whole."""
 SAFE_TORCH = "2.10"
-"""First version of PyTorch whose `weights_only` reader is not known to execute code (CVE-2026-24747)."""
+"""First version of PyTorch with a `weights_only` reader that is not known to execute code (CVE-2026-24747)."""
 _NAME = re.compile(r"step-(\d{9})\.ckpt")
 
 
 class _Hashed:
-    """A file that torch writes to, and the hash of what is written.
+    """A file that torch writes to, and the hash of its content.
 
     Torch does not expect errors while it writes. So the first one is kept, and the rest is not written.
 

@@ -159,8 +159,8 @@ class FewImages:
     def _plan(self, points: Sequence[Point], report: StepReport) -> tuple[int, float]:
         """Return the pixel stride of the next evaluation and its estimated seconds.
 
-        The first evaluation uses as few pixels as possible and measures the time per ray. The second chooses the stride
-        from the available time, and all later ones keep it.
+        The first evaluation uses the smallest number of pixels and measures the time per ray. The second chooses the
+        stride from the available time, and all later ones keep it.
         """
         if not points:
             stride = pixel_stride(self._sizes, self._rays_per_pixel, 0)

@@ -61,7 +61,7 @@ def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None,
 
 
 def _candidates(path: Path) -> Iterator[Path]:
-    """Yield the folder, and its parents while the name is that of a data folder's part."""
+    """Yield the folder, and its parents while the name belongs to a part of a data folder."""
     if os.path.isdir(path):  # `Path.is_dir` raises for invalid file names
         yield path
     elif not os.path.isfile(path):

@@ -2,7 +2,8 @@
 
 KiloNeRF (Reiser et al. 2021), section 3. Densities are compared as opacities of a short length, since they have no
 bound, and colours in random directions. The paper draws the same number of points in each cell of its grid. Here most
-points are where the teacher has matter, and colours count by its opacity: what is transparent has no colour to learn.
+points are where the teacher has matter, and colours count by its opacity, because transparent points have no colour to
+learn.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from nerfloom.training.teacher import Teacher
 POINTS = 2**15
 """Number of points in a step."""
 LENGTH_SHARE = 1 / 128
-"""Length whose opacity is compared, relative to the diagonal of the box. The authors' settings have 0.021 for Lego."""
+"""Length of the compared opacity, relative to the diagonal of the box. The authors' settings have 0.021 for Lego."""
 MIN_WEIGHT = 0.01
 """Weight of the colours where the teacher is transparent; it is 1 where it is opaque."""
 CELLS, PROBES = 32, 4
 """Cells along an edge of the box, and positions in each, for finding where the teacher has matter."""
 MATTER, MATTER_SHARE = 0.01, 0.75
-"""Opacity of the length above from which there is matter, and share of the points that are drawn in such cells."""
+"""Minimum opacity of matter over the length above, and share of the points that are drawn in cells with matter."""
 
 
 @runtime_checkable
@@ -52,7 +53,7 @@ class MatterPoints:
     Args:
         teacher: a teacher with a field.
         box: (2, 3) corners of the box, the pupil's scene units.
-        length: the length whose opacity counts as matter, the pupil's scene units.
+        length: the length for opacities, the pupil's scene units.
     """
 
     def __init__(self, teacher: Teacher, box: Tensor, length: float) -> None:
@@ -100,7 +101,7 @@ def distil(model: RayModel[Any], teacher: Teacher, steps: int, seconds: float) -
     """Train the field of a model to be the field of a teacher at points in the scene's box.
 
     Args:
-        model: the pupil, whose settings have the learning rate.
+        model: the pupil; its settings have the learning rate.
         teacher: a teacher with a field.
         steps: maximum number of steps.
         seconds: maximum time; infinity for no limit.

@@ -29,7 +29,7 @@ def load_levels(
     """Load a file of levels, in the scene of its data, or without data in a scene made from the Gaussians of its root.
 
     Args:
-        file: the file, in the frame of the input, and in the unit of the input, or that of a scale beside it.
+        file: the file, in the frame of the input, and in the unit of the input, or of a scale beside it.
         data: folder of the photographs; None without.
         data_format: format of the data, with its flags; None to detect it.
         device_type: auto, cpu, cuda or mps.

@@ -73,7 +73,7 @@ class Loaded:
 
     @property
     def input_placement(self) -> Placement:
-        """Placement of the input in its own unit, whatever `scale` is."""
+        """Placement of the input in its own unit, for every `scale`."""
         return self.scale.unplaced(self.placement)
 
     @property
@@ -233,7 +233,7 @@ class Loaded:
         return replace(self, placement=scale.placed(self.input_placement), scale=scale)
 
     def keep_scale(self) -> None:
-        """Write the scale to the run's folder, where whatever loads the run finds it.
+        """Write the scale to the run's folder, where all commands find it.
 
         Raises:
             ConfigError: for a file, because its coordinates are in a unit already.
@@ -276,7 +276,7 @@ class Loaded:
         return None if given is None else refined_cameras(self.model, given, training=True)
 
     def _view(self, camera: View | Cameras) -> View:
-        """Return a view as it is, or that of one camera on the model's device."""
+        """Return a view as it is, or the view of one camera on the model's device."""
         if isinstance(camera, View):
             return camera
         if len(camera) != 1:

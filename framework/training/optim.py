@@ -31,7 +31,7 @@ class Adam:
 
     Args:
         groups: parameter groups.
-        deferred: gradients by table, for tables whose gradient autograd does not accumulate.
+        deferred: gradients that autograd does not accumulate, by table.
         lr, betas, eps: defaults for groups without their own.
         tables: place of the state of sparse groups.
     """
@@ -121,7 +121,7 @@ class Adam:
             gradient.clear()
 
     def first_bad(self) -> Tensor | None:
-        """Return the first parameter whose gradient is not finite; None if all are finite."""
+        """Return the first parameter with a gradient that is not finite; None if all are finite."""
         return next((p for p in self.parameters if not all_finite(self._gradients(p))), None)
 
     def has_gradient(self, parameter: Tensor) -> bool:
@@ -169,7 +169,7 @@ class Adam:
     def step(self, finite: bool | Tensor = True) -> None:
         """Update every parameter that has a gradient.
 
-        The state of a parameter whose shape has changed starts from zero.
+        The state of a parameter with a changed shape starts from zero.
 
         Args:
             finite: whether the step's loss and gradients are finite; () bool if still on the device. If False, the step

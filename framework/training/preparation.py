@@ -50,7 +50,7 @@ def decided(method: Method, config: Any, dataset: Dataset) -> tuple[Dataset, Tra
         The data set, possibly with a smaller box; the settings; and each decision with its reason.
 
     Raises:
-        ConfigError: if the method cannot draw the images' cameras, or a scout cannot learn what the method learns.
+        ConfigError: if the method cannot draw the images' cameras, or a scout cannot learn the method's scene.
     """
     _check_cameras(method.name, method.model.cameras, dataset)
     _check_scout(method, config, dataset.scene)
@@ -171,12 +171,12 @@ def skip_empty(config: TrainConfig, model: Model[Any], dataset: Dataset, fresh: 
     """Empty the cells of grids that silhouettes exclude or that no training image shows.
 
     Args:
-        model: the model, whose parts hold the grids.
+        model: the model; its parts hold the grids.
         dataset: the training images.
         fresh: whether training starts; if not, the grids come from a checkpoint and are not changed.
 
     Returns:
-        The data set, without pixels whose rays meet emptied cells only.
+        The data set, without pixels if their rays meet only emptied cells.
     """
     dataset = skip_by_silhouettes(config, model, dataset, fresh)
     if dataset.motion_bound is not None:

@@ -22,8 +22,8 @@ LEVELS = ("*", "*/*", "*/*/*")
 def config_file(path: Path) -> Path:
     """Return the path of a run's config.yml, or of the blocks.yml of a scene in blocks.
 
-    For a folder of runs, choose the newest and print it. Runs with a checkpoint take precedence, since a later one may
-    have ended before it learnt anything.
+    For a folder of runs, choose the newest and print it. Runs with a checkpoint take precedence, since a later run may
+    have ended before its first checkpoint.
 
     Args:
         path: the file itself, the run's folder, or a folder above it, such as ``outputs``.

@@ -2,13 +2,13 @@
 
 A rule that judges errors during training comes late. At first every error is large, so all pixels have to count. In
 that time people become fog in front of their cameras, which explains them, and which nothing removes later. A scout is
-thrown away, so it may learn what is worse for pictures but shows contradictions: colours that do not depend on the
-direction, and gradients that are scaled down near cameras, where fog forms. Afterwards every image is compared with it,
+thrown away, so its pictures may be worse if they show contradictions: its colours do not depend on the direction, and
+gradients are scaled down near cameras, where fog forms. Afterwards every image is compared with it,
 in full and at the same time, and the training begins afresh without the contradicted tiles.
 
-An error contradicts an image only if other images agree about the same place. What the scout has not learnt yet, such
-as fine texture, is wrong in most images that see it. So the error of a tile is compared with the errors at the places
-that it shows, over all images. RobustNeRF (Sabour et al. 2023) compares it with the errors of all pixels.
+An error contradicts an image only if other images agree about the same place. Detail that the scout has not learnt yet,
+such as fine texture, is wrong in most images that see it. So the error of a tile is compared with the errors at the
+places that it shows, over all images. RobustNeRF (Sabour et al. 2023) compares it with the errors of all pixels.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ TYPICAL = 0.25
 """The typical error of a place is this quantile of the errors of the tiles that show it: up to 75 % of the images may
 show something else there."""
 MIN_IMAGES = 3
-"""Minimum number of images that show a place with an error of its own; elsewhere that of all places is typical."""
+"""Minimum number of images that show a place with an error of its own; elsewhere the error of all places is typical."""
 CLEARLY = 6.0
 """A tile is contradicted if the square of its mean error is this many times the typical one, and exceeds `LEAST`^2."""
 MOST = 0.8
-"""Share of the tiles above which the user is warned."""
+"""Maximum share of the tiles without a warning."""
 
 
 class Training(Protocol):
@@ -95,7 +95,7 @@ def scout(
             may be a training itself.
         dataset: the images, on the device.
         tiles: their tiles; whether each is left out is written to them.
-        config: settings whose machine, background and precision the scout shares.
+        config: settings; the scout shares their machine, background and precision.
         settings: further settings of the scout, with its budget.
     """
     scene = dataset.scene
@@ -174,7 +174,7 @@ def compare(model: RendersRays, dataset: Dataset, tiles: Tiles) -> Comparison:
 
 
 def places(rays: Rays, depths: Tensor, solid: Tensor, scene: Scene) -> Tensor:
-    """Return the cell (R,) int64 of the place where each ray ends; one more cell is for those that end nowhere.
+    """Return the cell (R,) int64 of the place where each ray ends; one more cell is for rays that end nowhere.
 
     Args:
         rays: R rays.
@@ -192,7 +192,7 @@ def contradicted(found: Comparison, around: Tensor) -> Tensor:
     """Return which tiles (T,) bool the other images contradict.
 
     The error of a tile is the mean signed error around it. Its square is averaged over 3 x 3 tiles and compared with
-    what is typical of the places that its probes show.
+    the typical error of the places that its probes show.
 
     Args:
         found: the comparison of images with a field.

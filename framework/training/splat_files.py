@@ -38,7 +38,7 @@ def load_splats(
 
     Args:
         file: the file, in the frame of the input, or about a local origin given by an offset file beside it, and in the
-            unit of the input, or that of a scale beside it.
+            unit of the input, or of a scale beside it.
         data: folder of the photographs; None without.
         data_format: format of the data, with its flags; None to detect it.
         device_type: auto, cpu, cuda or mps.

@@ -70,7 +70,7 @@ class State:
 
 
 def agree(state: State, received: Sequence[int]) -> Sequence[int]:
-    """Copy from the first process what decides on the next step: clock, samples per ray and last evaluation.
+    """Copy from the first process the values that decide on the next step: clock, samples per ray and last evaluation.
 
     Args:
         state: the state of this process, changed in place.

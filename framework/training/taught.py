@@ -1,7 +1,7 @@
 """Batches of a teacher's views, in turns with batches of photographs.
 
-A teacher renders views between and around the training cameras, so that its rays lie within what these can see. A batch
-of its views has no image: light, exposure and poses that images have of their own are not learnt from it.
+A teacher renders views between and around the training cameras, so that its rays lie within the space that these can
+see. A batch of its views has no image: light, exposure and poses that images have of their own are not learnt from it.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ MAX_SIDE = 800
 OPAQUE = 0.95
 """Minimum opacity of a pixel for its distance to count."""
 GOLDEN = (5**0.5 - 1) / 2
-"""Fractional part of the golden ratio, whose multiples are the most evenly spread of all."""
+"""Fractional part of the golden ratio; its multiples are spread most evenly."""
 PICTURE_STREAM = -3
-"""Random stream of a whole picture, beside those of steps (`nerfloom.base.device`)."""
+"""Random stream of a whole picture, beside the streams of steps (`nerfloom.base.device`)."""
 
 
 def is_taught(step: int, share: float) -> bool:
     """Return whether a step belongs to the teacher.
 
-    The steps are spread evenly by the fractional parts of multiples of the golden ratio (Weyl 1916). So are those among
-    every second step, every fourth, and so on: what a method does at such steps only, it learns from both. No memory is
-    needed, so a resumed run goes on with the same steps.
+    The steps are spread evenly by the fractional parts of multiples of the golden ratio (Weyl 1916). So are its steps
+    among every second step, every fourth, and so on: work that a method does at such steps only learns from both. No
+    memory is needed, so a resumed run goes on with the same steps.
 
     Args:
         step: number of training steps done.
@@ -57,7 +57,7 @@ def is_taught(step: int, share: float) -> bool:
 
 
 def unseen_cameras(cameras: Cameras, near: Tensor) -> Cameras:
-    """Return random cameras between and around those of indices `near` (V,), with lenses and sizes of `cameras`."""
+    """Return random cameras between and around the cameras `near` (V,), with lenses and sizes of `cameras`."""
     poses = unseen_poses(cameras.camera_to_worlds.cpu(), near)
     return replace(cameras[near], camera_to_worlds=poses.to(cameras.camera_to_worlds))
 
@@ -131,7 +131,7 @@ class TaughtViews(BatchSource):
 
     Args:
         teacher: the teacher.
-        dataset: the training images, whose cameras say what can be seen.
+        dataset: the training images; their cameras bound the visible space.
         background: background of transparent pixels, one colour for the whole picture.
         seed: seed of the run.
     """
@@ -172,7 +172,7 @@ class MixedSource(BatchSource):
         photographs: source of the photographs.
         taught: source of the teacher's views.
         share: share of the teacher at the start; it falls linearly.
-        until: fraction of the budget, more than 0, after which the share is 0.
+        until: fraction of the budget, more than 0, until the share is 0.
     """
 
     varies = "a teacher renders some of the batches"

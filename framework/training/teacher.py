@@ -1,4 +1,4 @@
-"""A teacher: a renderable that shows a pupil in training what it has learnt, in the pupil's scene."""
+"""A teacher: a trained renderable that renders views for a pupil in training, in the pupil's scene."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from nerfloom.training.run_path import config_file
 class Teacher:
     """A renderable that is asked in the scene of a pupil.
 
-    The two scenes may place the same input differently. What is between them is one similarity, in float64, since the
+    The two scenes may place the same input differently. One similarity connects the two scenes, in float64, since the
     input may be millions of units from its origin.
 
     Args:
@@ -66,7 +66,7 @@ class Teacher:
         )
 
     def field_model(self) -> RayModel[Any]:
-        """Return the renderable, whose field can be asked at any position.
+        """Return the renderable; its field can be evaluated at any position.
 
         Raises:
             ConfigError: if it has no such field.

@@ -271,7 +271,7 @@ class Trainer:
             say(f"prepared in {seconds:.1f} s, which count as training")
 
     def _by_first(self, work: Callable[[], None]) -> None:
-        """Do work in the first process, whose state the others then take over."""
+        """Do work in the first process; the others then take over its state."""
         if processes().first:
             with alone():
                 work()

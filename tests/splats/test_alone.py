@@ -72,7 +72,7 @@ def test_half_of_them_are_near_the_middle_and_the_rest_does_not_count() -> None:
     placement, scene = placed_gaussians(stray)
     assert float(placement.points(stray.means[21:]).norm(dim=-1).median()) == pytest.approx(HALF_WITHIN, rel=0.1)
     assert scene.unbounded
-    with pytest.raises(DataError, match="no Gaussians whose numbers are finite"):
+    with pytest.raises(DataError, match="no Gaussian with finite numbers"):
         placed_gaussians(given.map(lambda values: torch.full_like(values, math.nan)))
 
 

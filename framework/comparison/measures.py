@@ -15,7 +15,7 @@ from typing import Any
 from nerfloom.comparison.plan import Conditions, PlannedRun
 
 TIME_TOLERANCE = 0.01
-"""Relative difference below which times count as equal: a run ends with the step that uses up its time."""
+"""Maximum relative difference of equal times: a run ends with the step that uses up its time."""
 Curve = tuple[tuple[float, float], ...]
 """Pairs (seconds of training, PSNR on the validation views), in order."""
 

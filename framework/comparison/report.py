@@ -40,7 +40,7 @@ class Column:
     best: Callable[[Sequence[float]], float] | None
     """`max` if higher is better, `min` if lower is better, or None."""
     same: float = 1e-9
-    """Relative difference below which two values count as equally good."""
+    """Maximum relative difference of two values that count as equally good."""
 
 
 COLUMNS = (
@@ -80,7 +80,7 @@ class Cell:
 def write_report(plan: Plan, rows: Sequence[Row], sharing: str | None = None) -> Path:
     """Write all four files of `plan` and `rows`, and return the path of report.html.
 
-    `sharing` is a sentence on what else machines did during a run; None if each run was alone.
+    `sharing` is a sentence on other work of machines during a run; None if each run was alone.
     """
     runs = [run for row in rows for run in row.runs]
     content = _content(plan, rows, runs)
@@ -166,7 +166,7 @@ def _surfaces(geometry: dict[str, Any]) -> str:
     """Return how surfaces were compared with a reference, as a sentence."""
     near = geometry["f_scores"][0]["distance"]
     return (
-        f"Surfaces are compared with {Path(geometry['reference']).name}, whose longest side is {geometry['side']:.4g}; "
+        f"Surfaces are compared with {Path(geometry['reference']).name} (longest side {geometry['side']:.4g}); "
         f"F-score at {near:.4g}, both in the input's unit."
     )
 

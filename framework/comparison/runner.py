@@ -16,7 +16,7 @@ def run_all(plan: Plan, launcher: Launcher) -> dict[PlannedRun, Failure]:
 
     Args:
         plan: the comparison.
-        launcher: what runs them.
+        launcher: runs them.
 
     Returns:
         The failed runs.

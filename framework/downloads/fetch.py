@@ -28,7 +28,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.downloads.catalogue import Source
 
 TIMEOUT = 30.0
-"""Seconds without a byte after which a connection counts as broken."""
+"""Maximum seconds without a byte; then a connection counts as broken."""
 PAUSES = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Seconds to wait before each further attempt; the sequence starts over after an attempt that received data."""
 CHUNK = 1 << 20
@@ -191,7 +191,7 @@ def _extent(status: int, headers: Message, have: int) -> tuple[int, int | None]:
 
 
 def _at_the_end(headers: Message, known: _Answered, part: Path, have: int) -> _Answered:
-    """Return what is known of a file that is completely received; raise `_Broken` if its size has changed."""
+    """Return the facts of a file that is completely received; raise `_Broken` if its size has changed."""
     if headers.get("Content-Range", "") == f"bytes */{have}":
         return known
     part.unlink()

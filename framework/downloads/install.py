@@ -39,7 +39,7 @@ def install(
         dataset: the data set.
         save_dir: folder of the data sets, created if missing.
         scenes: names of the scenes; all if empty.
-        archive: an archive downloaded by hand; None to download what is missing.
+        archive: an archive downloaded by hand; None to download missing files.
         keep_archives: whether to keep archives after unpacking.
 
     Returns:

@@ -27,7 +27,7 @@ MAX_NAME = 255
 """Maximum length of a file's or folder's name, bytes."""
 
 Place = Callable[[tuple[str, ...]], tuple[str, ...] | None]
-"""Function from the parts of an entry's path to those of the path to write; None to skip the entry."""
+"""Function from the parts of an entry's path to the parts of the path to write; None to skip the entry."""
 
 
 def names_of(archive: Path) -> list[tuple[str, ...]]:

@@ -18,7 +18,7 @@ Pixel = tuple[float, float]
 
 
 def crop_box(edited: Edited, low: Vector, high: Vector, keep: bool = True) -> Edited:
-    """Keep the Gaussians whose centres are in a box.
+    """Keep the Gaussians with centres in a box.
 
     Args:
         low: minimum corner.
@@ -32,7 +32,7 @@ def crop_box(edited: Edited, low: Vector, high: Vector, keep: bool = True) -> Ed
 
 
 def crop_sphere(edited: Edited, center: Vector, radius: float, keep: bool = True) -> Edited:
-    """Keep the Gaussians whose centres are in a ball.
+    """Keep the Gaussians with centres in a ball.
 
     Args:
         center: its centre.
@@ -46,7 +46,7 @@ def crop_sphere(edited: Edited, center: Vector, radius: float, keep: bool = True
 
 
 def crop_region(edited: Edited, file: Path, keep: bool = True) -> Edited:
-    """Keep the Gaussians whose centres are in the region of a file.
+    """Keep the Gaussians with centres in the region of a file.
 
     Args:
         file: a box or a sphere (`nerfloom.geometry.regions`).
@@ -59,7 +59,7 @@ def crop_region(edited: Edited, file: Path, keep: bool = True) -> Edited:
 
 
 def crop_polygon(edited: Edited, image: str, corners: tuple[Pixel, ...], keep: bool = True) -> Edited:
-    """Keep the Gaussians whose centres a photograph shows in a polygon, at any distance.
+    """Keep the Gaussians with centres that a photograph shows in a polygon, at any distance.
 
     Args:
         image: file name of the photograph.
@@ -76,7 +76,7 @@ def crop_polygon(edited: Edited, image: str, corners: tuple[Pixel, ...], keep: b
 
 
 def crop_mask(edited: Edited, image: str, mask: Path, keep: bool = True) -> Edited:
-    """Keep the Gaussians whose centres a photograph shows where a mask is white, at any distance.
+    """Keep the Gaussians with centres that a photograph shows where a mask is white, at any distance.
 
     Args:
         image: file name of the photograph.

@@ -12,7 +12,7 @@ from nerfloom.edit.sightings import sightings, training_views
 from nerfloom.splats.start import neighbour_distance
 
 OUTSIDE = 0.01
-"""Share of the Gaussians, at both ends of each axis, around which neighbours may be found less well."""
+"""Share of the Gaussians, at both ends of each axis, that may miss some of their nearest neighbours."""
 
 
 def drop_faint(edited: Edited, min_opacity: float = 0.02) -> Edited:
@@ -36,7 +36,7 @@ def drop_needles(edited: Edited, max_ratio: float = 20.0) -> Edited:
 
 
 def drop_isolated(edited: Edited, neighbours: int = 8, max_ratio: float = 5.0) -> Edited:
-    """Remove Gaussians far from others, in relation to their size: those of a far background are sparse, but large.
+    """Remove Gaussians far from others, in relation to their size: Gaussians of a far background are sparse, but large.
 
     Args:
         neighbours: number of nearest neighbours.
@@ -56,7 +56,7 @@ def floating(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_v
     or if that pixel has no surface.
 
     Args:
-        share: minimum share of such images among those that show it and not something before it.
+        share: minimum share of such images among the images that show it and nothing before it.
         max_opacity: maximum mean weight on its area in these images.
         min_views: minimum number of images that show it.
 
@@ -70,7 +70,7 @@ def floating(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_v
 
 
 def drop_floaters(edited: Edited, share: float = 0.5, max_opacity: float = 0.3, min_views: int = 3) -> Edited:
-    """Remove faint Gaussians that photographs see in front of the surfaces, those that `floating` returns.
+    """Remove faint Gaussians that photographs see in front of the surfaces, as `floating` returns them.
 
     Args:
         share, max_opacity, min_views: as in `floating`.

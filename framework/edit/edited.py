@@ -1,4 +1,4 @@
-"""Gaussians that are edited: what they are, where they are, and the photographs that show them."""
+"""Gaussians that are edited, their placement, and the photographs that show them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Edited:
 
     @classmethod
     def of(cls, loaded: Loaded, time: float | None = None) -> Edited:
-        """Return the Gaussians of a run or a file, without those that are not finite.
+        """Return the finite Gaussians of a run or a file.
 
         Args:
             loaded: the run or file.
@@ -116,7 +116,7 @@ class Edited:
             spz_version: version of an SPZ file.
 
         Returns:
-            Sentences about what was lost, and about the local origin.
+            Sentences about losses and the local origin.
 
         Raises:
             ConfigError: if the format cannot hold the Gaussians, or no file fits the size.

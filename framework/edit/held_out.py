@@ -44,7 +44,7 @@ class HeldOut:
     """Held-out photographs that edits are compared with."""
 
     model: Renderable
-    """The model whose Gaussians are edited."""
+    """The model with the Gaussians that are edited."""
     dataset: Dataset
     """The photographs, on its device."""
     views: tuple[int, ...]

@@ -103,11 +103,11 @@ def align_floor(
 ) -> Edited:
     """Find the floor, and turn Gaussians about its middle so that it becomes the plane z = 0.
 
-    The floor is the plane on which most opaque Gaussians have their centres, and few below.
+    The floor is the plane with the most centres of opaque Gaussians near it, and few below it.
 
     Args:
-        up: the direction that is about upwards, of any length but 0; None for that of the last `set_up` or
-            `align_floor`, or else of the scene, which the cameras of photographs tell.
+        up: the direction that is about upwards, of any length but 0; None for the up direction of the last `set_up` or
+            `align_floor`, or else of the scene, which comes from the cameras of photographs.
         max_tilt: maximum angle between it and the floor's normal, degrees.
         tolerance: maximum distance of the floor's centres from it; None for 1 % of the scene's size.
         min_opacity: minimum opacity of the Gaussians that count.

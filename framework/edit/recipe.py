@@ -57,7 +57,7 @@ RANGES: dict[str, Range] = {
     "refit_steps": (0, math.inf),
     "degree": (0, 3),
 }
-"""Allowed ranges of settings, in whatever step."""
+"""Allowed ranges of settings, in all steps."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ RATES = {
     "colors": 2.5e-3,
     "harmonics": 1.25e-4,
 }
-"""Learning rate of each column, those of 3DGS."""
+"""Learning rate of each column, as in 3DGS."""
 LAST_RATE = 0.1
 """Learning rates after the last step, relative to those at the first. They fall exponentially."""
 

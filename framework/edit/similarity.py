@@ -25,7 +25,7 @@ class Similarity(NamedTuple):
 
 
 def vector(values: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
-    """Return three coordinates `values`, or those of several points, as a tensor float64."""
+    """Return three coordinates `values`, or several points' coordinates, as a tensor float64."""
     return torch.tensor(values, dtype=torch.float64)
 
 

@@ -1,4 +1,4 @@
-"""Steps that are taken one after another, with a line on what each has removed and what it costs."""
+"""Steps that are taken one after another, each with a line on its effect and cost."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nerfloom.edit.recipe import Step
 
 
 def take_steps(edited: Edited, steps: Sequence[Step], held_out: HeldOut | None = None) -> Edited:
-    """Take `steps` from `edited`, and say what each does, and costs by `held_out`, photographs or None.
+    """Take `steps` from `edited`, and report their effects, and costs by `held_out`, photographs or None.
 
     Raises:
         ConfigError: if a step cannot be taken, or leaves no Gaussians.
@@ -40,7 +40,7 @@ def looks_different(before: Edited, after: Edited) -> bool:
 
 
 def _change(before: Edited, after: Edited) -> str:
-    """Return a description of what a step has done."""
+    """Return a description of a step's effect."""
     count, left = len(before), len(after)
     if left > count:
         return f"adds {left - count:,} to {count:,} Gaussians"

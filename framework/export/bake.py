@@ -1,6 +1,6 @@
 """Baking: turn a trained field into an octree, which a CPU draws in real time.
 
-The steps are those of PlenOctrees (Yu et al. 2021): find the cells with matter that training images see, fit harmonics
+The steps follow PlenOctrees (Yu et al. 2021): find the cells with matter that training images see, fit harmonics
 to the field's colours, then learn all leaves from the photographs. A model that is an octree already keeps its leaves.
 """
 
@@ -61,14 +61,14 @@ class Baking:
 
 
 def bake(loaded: Loaded, settings: Baking) -> Octree:
-    """Return the octree of a trained run, on the CPU, and say what was kept.
+    """Return the octree of a trained run, on the CPU, and report the kept leaves.
 
     Args:
         loaded: the run.
         settings: size, resolution and time.
 
     Raises:
-        ConfigError: if an octree cannot show what the run shows.
+        ConfigError: if an octree cannot represent the run.
     """
     model = loaded.model
     layout, depths, coefficients = (
@@ -82,7 +82,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
 
 
 def _as_learnt(model: DrawsOctree, loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tensor]:
-    """Return the leaves of a model that is an octree, on the CPU, without those that do not fit into the file.
+    """Return the leaves of a model that is an octree, on the CPU, as far as they fit into the file.
 
     They are the layout, the optical depths (L,) and the coefficients (L, 3 K).
     """
@@ -133,7 +133,7 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
 
 
 def _bakeable(loaded: Loaded) -> RayModel[Any]:
-    """Return the run's model; refuse what an octree cannot show."""
+    """Return the run's model; refuse a model that an octree cannot represent."""
     model, name = loaded.model, loaded.method
     if not isinstance(model, RayModel):
         raise ConfigError(f"{name} has no field to bake; take a run of a method that casts rays")
@@ -152,7 +152,7 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
 
 
 def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
-    """Return cells with matter, their raw densities (L, 1), and what training images see of them."""
+    """Return cells with matter, their raw densities (L, 1), and how training images see them."""
     search = MatterSearch(model)
     grids = search.grids(resolution)
     layout, depths = search.layout(grids)

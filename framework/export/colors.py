@@ -57,7 +57,7 @@ def seen_colors(model: RendersRays, vertices: Tensor, normals: Tensor, spacing: 
 def spread_colors(colors: Tensor, faces: Tensor) -> Tensor:
     """Return colours (V, 3); vertices without colour get the mean colour of their neighbours.
 
-    Colours spread along edges until no vertex can be reached. Those that none reaches have the mean of all.
+    Colours spread along edges until no vertex can be reached. Points that none reaches have the mean of all.
 
     Args:
         colors: (V, 3), NaN for a vertex without.

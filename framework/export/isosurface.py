@@ -28,7 +28,7 @@ MAX_VERTICES = 40_000_000
 def isosurface(lattice: Lattice, edge: int, blocks: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Return the surface between positive and negative values.
 
-    It has a hole where a cell has a corner about which nothing is known.
+    It has a hole where a cell has an unknown corner.
 
     Args:
         lattice: where values are taken.

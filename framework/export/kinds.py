@@ -1,4 +1,4 @@
-"""Exports by name, in the frame and units of the input: what `ns-export` and `run.export` write."""
+"""Exports by name, in the frame and units of the input, for `ns-export` and `run.export`."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ class Kind(NamedTuple):
     suffixes: tuple[str, ...]
     """Suffixes that its file may have."""
     write: Callable[..., None]
-    """Function of what is exported, the file and settings that writes the file."""
+    """Function of a run or file, the export's file and settings that writes the export."""
     is_cropped: bool = False
     """Whether the function also takes regions."""
 
 
 def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequence[Region] = ()) -> None:
-    """Write an export of a run or a file, and say what was written.
+    """Write an export of a run or a file, and report it.
 
     Args:
-        loaded: what is exported.
+        loaded: the run or file to export.
         name: kind of export, a key of `KINDS`.
         path: file to write.
         settings: settings of that kind.
-        regions: what is in all of these is kept, in the frame and unit of exports; none for everything.
+        regions: the export keeps their intersection, in the frame and unit of exports; none for everything.
 
     Raises:
         ConfigError: if the kind, the file's suffix or a setting does not fit, or there is nothing to write.

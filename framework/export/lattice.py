@@ -1,4 +1,4 @@
-"""The lattice on which a surface is searched: points at equal distances in a box, evaluated block by block.
+"""The lattice for the search of a surface: points at equal distances in a box, evaluated block by block.
 
 The box may be turned against the scene's axes: a box given in the input's frame is parallel to the input's axes.
 """
@@ -53,7 +53,7 @@ class Lattice:
         return torch.cartesian_prod(*ranges).view(-1, 3)
 
     def block_points(self, block: Tensor, edge: int) -> tuple[Tensor, tuple[int, int, int]]:
-        """Return the lattice points of a block, those on all its faces included.
+        """Return the lattice points of a block, including all its faces.
 
         Args:
             block: (3,) index of the block.

@@ -49,7 +49,7 @@ class Cleaning:
     min_views: int = 0
     """Minimum number of training cameras that see a face; 0 for any (`default_min_views`)."""
     regions: tuple[Region, ...] = ()
-    """What is in all of these is kept, scene coordinates; none for everything on the lattice."""
+    """Regions; the mesh keeps their intersection, scene coordinates; none for everything on the lattice."""
 
     def check(self) -> None:
         """Raise ConfigError if a number is out of range."""
@@ -148,7 +148,7 @@ def _onto(model: Renderable, lattice: Lattice, vertices: Tensor) -> tuple[Tensor
 
 
 def _colors(model: Renderable, lattice: Lattice, time: float) -> ColorFunction:
-    """Return the function that colours vertices by what the model renders along their normals."""
+    """Return the function that colours vertices by the model's renders along their normals."""
 
     def colors(vertices: Tensor, normals: Tensor) -> Tensor:
         if not isinstance(model, RendersRays):

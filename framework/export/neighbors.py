@@ -13,7 +13,7 @@ from nerfloom.base.console import track
 NEIGHBORS = 20
 """Number of nearest neighbours."""
 CHUNK = 2**16
-"""Number of points whose neighbours are looked up at once."""
+"""Number of points in one look-up of neighbours."""
 
 
 def mean_distances(points: Tensor) -> Tensor:
@@ -23,7 +23,7 @@ def mean_distances(points: Tensor) -> Tensor:
 
 
 def inliers(points: Tensor, std_ratio: float) -> Tensor:
-    """Return the points (K,) bool whose mean distance to their neighbours is not unusual.
+    """Return the points (K,) bool with a usual mean distance to their neighbours.
 
     It is unusual if it exceeds the mean over all points by more than some standard deviations (Rusu et al. 2008).
 

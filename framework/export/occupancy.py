@@ -72,7 +72,7 @@ def innermost(grid: SkipsCells) -> Tensor:
 def cell_centers(grid: SkipsCells, placement: Placement) -> Tensor:
     """Return the centres (K, 3) float64 of the occupied cells of `grid`, in the frame of the input of `placement`.
 
-    Of nested boxes, these are the cells of the smallest.
+    With nested boxes, these are the cells of the smallest.
     """
     cells, matrix = innermost(grid).nonzero(), box_frame(grid, placement)
     return (cells.double() + 0.5) / grid.resolution @ matrix[:3, :3].T + matrix[:3, 3]

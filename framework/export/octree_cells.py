@@ -25,7 +25,7 @@ PROBES = 4
 COARSE = 64
 """Octants along the longest edge for finding the box of the matter."""
 OCTANTS_AT_ONCE = 4096
-"""Octants whose cells are evaluated together."""
+"""Number of octants with cells evaluated together."""
 MAX_BOXES = 8
 """Maximum number of boxes around one another in an unbounded scene."""
 OPAQUE = 20.0
@@ -52,8 +52,8 @@ class MatterSearch:
     def grids(self, resolution: int) -> list[Grid]:
         """Return the grids to search: the box of all matter or, in an unbounded scene, boxes around one another.
 
-        The largest box ends before rays do. It is at most `resolution` / 4 times as large as the smallest: cameras in
-        the smallest box see what is farther away in the same direction, up to about a cell.
+        The largest box ends before rays do. It is at most `resolution` / 4 times as large as the smallest: beyond it,
+        all cameras in the smallest box see a point in the same direction, up to about a cell.
 
         Args:
             resolution: cells along the longest edge.
@@ -117,7 +117,7 @@ class MatterSearch:
     def cells(self, grid: Grid) -> tuple[Tensor, Tensor]:
         """Return the cells (N, 3) int64 with matter, and the optical depth (N,) of their edges.
 
-        The density is that of a cell's centre. Cells that a smaller grid covers are left out.
+        The density is evaluated at a cell's centre. Cells that a smaller grid covers are left out.
         """
         octants, within = self.octants(grid), torch.cartesian_prod(*[torch.arange(OCTANT)] * 3)
         found = [(torch.zeros(0, 3, dtype=torch.int16), torch.zeros(0))]

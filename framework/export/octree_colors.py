@@ -24,13 +24,13 @@ from nerfloom.ray_model import RayModel
 MAX_VIEWS = 48
 """Maximum number of cameras to fit colours from."""
 DIRECTIONS = {0: 4, 1: 8, 2: 14, 3: 24}
-"""Number of directions in which the field's colour is evaluated for a leaf, by the degree of its harmonics."""
+"""Number of directions for the field's colour of a leaf, by the degree of its harmonics."""
 RIDGE = 0.03
 """Penalty of harmonics that depend on the direction, relative to the sum of the weights, because directions are few."""
 LEAVES_AT_ONCE = 2**14
-"""Leaves whose colours are evaluated together."""
+"""Number of leaves with colours evaluated together."""
 STOP = 1e-3
-"""Transmittance below which rays end."""
+"""Rays end below this transmittance."""
 RAYS_AT_ONCE = 2**18
 """Rays that are traced together."""
 Colors = Callable[[Tensor, Tensor], Tensor]
@@ -48,7 +48,7 @@ class Seen:
     positions: Tensor
     """(V, 3) positions of their cameras."""
     pixels: PixelSet
-    """Pixels, of all images, whose rays meet a leaf."""
+    """Pixels, of all images, with rays that meet a leaf."""
 
     def part(self, kept: Tensor) -> Seen:
         """Return the visibility of the leaves `kept` (N,) int64."""
@@ -89,7 +89,7 @@ def fitted_colors(colors: Colors, centers: Tensor, seen: Seen, degree: int) -> T
     Args:
         colors: the colours, of a field or of other harmonics.
         centers: (L, 3) centres of the leaves.
-        seen: what training images see of the leaves; weights are those of the fit.
+        seen: how training images see the leaves; the fit uses its weights.
         degree: degree of the harmonics, 0 to 3.
     """
     out = torch.zeros(len(centers), 3 * (degree + 1) ** 2)

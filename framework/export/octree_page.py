@@ -4,7 +4,7 @@ The data are compressed by gzip. Numbers are little endian:
 
     0     b"OCT1"
     4     uint32     degree of the harmonics; bricks along x, y and z; bricks with leaves, B; leaves, L
-    28    float32    corner of the first cell, x, y, z; edge of a cell; transmittance at which rays end; rotation from
+    28    float32    corner of the first cell, x, y, z; edge of a cell; transmittance where rays end; rotation from
                      the octree's axes to the page's, row by row
     84    float32    256 optical depths of a cell's edge; 3 K scales; 3 K offsets
           uint64     (B, 8) leaves of each octant (`kernels/octree/layout.py`)
@@ -41,12 +41,12 @@ def make_octree_page(
     Args:
         octree: the octree, on the CPU.
         turn: (3, 3) rotation from the octree's frame to the page's, where z is up.
-        cameras: M cameras in the octree's frame, on the CPU, that see what has to be kept.
+        cameras: M cameras in the octree's frame, on the CPU; matter that they see is kept.
         facts: further data of the page, in its frame.
         max_megabytes: maximum size of the page, in millions of bytes.
 
     Returns:
-        The page, the octree in it, and sentences about what was removed to fit it.
+        The page, the octree in it, and sentences about parts removed to fit it.
 
     Raises:
         ConfigError: if the limit is above MAX_MEGABYTES, or no leaf fits.

@@ -44,7 +44,7 @@ def is_too_fine(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> bo
 
 
 def chosen(largest: Tensor, max_bytes: float, degrees: Sequence[int]) -> tuple[int, Tensor]:
-    """Return the degree of harmonics, and the leaves (N,) int64 that fit, in order: those with the largest weights.
+    """Return the degree of harmonics, and the leaves (N,) int64 that fit, in order: the ones with the largest weights.
 
     Args:
         largest: (L,) largest weight of each leaf.
@@ -80,12 +80,12 @@ def fitted_octree(
 
     Args:
         octree: the octree, on the CPU.
-        cameras: M cameras, also on the CPU, that see what has to be kept.
+        cameras: M cameras, also on the CPU; matter that they see is kept.
         max_bytes: maximum size of the file.
         encode: function that returns the content of the file.
 
     Returns:
-        The content, the octree in it, and a description of what was removed; empty for nothing.
+        The content, the octree in it, and a description of the removed parts; empty for none.
 
     Raises:
         ConfigError: if no leaf is visible, or fits.

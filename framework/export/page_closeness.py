@@ -24,15 +24,15 @@ MAX_VIEWS = 5
 
 @dataclass(frozen=True)
 class Closeness:
-    """Metrics of what a page shows, compared with the model; both are drawn by Nerfloom."""
+    """Metrics of a page, compared with the model; Nerfloom draws both."""
 
     views: str
     """The compared views, as text."""
     method: float
     """PSNR against the method's own pictures, dB."""
     photographs: float | None
-    """PSNR against the photographs, dB; None if they are of other moments, or have a lens with which the page's scene
-    cannot be drawn."""
+    """PSNR against the photographs, dB; None if they are of other moments, or the page's scene cannot be drawn with
+    their lens."""
     method_itself: float | None
     """PSNR of the method's own pictures against the photographs, dB; None likewise."""
 
@@ -47,7 +47,7 @@ class Closeness:
 def closeness(
     model: Renderable, page: ScenePage, cameras: Cameras, dataset: Dataset | None, moment: float | None
 ) -> Closeness:
-    """Compare what a page shows with the model that it represents.
+    """Compare a page with the model that it represents.
 
     Args:
         model: the model.

@@ -1,4 +1,4 @@
-"""The two kinds of web pages: of Gaussians, and of an octree; and the pictures that show what is in them."""
+"""The two kinds of web pages: of Gaussians, and of an octree; and pictures of their content."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ BEYOND_THE_BOX = "a page traces octrees of one box, and this scene extends beyon
 
 @dataclass(frozen=True)
 class ScenePage:
-    """A page, and what it shows as Nerfloom draws it."""
+    """A page, and its content as Nerfloom draws it."""
 
     text: str
     """Content of the page."""
     words: str
-    """What it shows, in words."""
+    """Description of its content."""
     costs: list[str]
-    """Sentences about what was removed to fit its size."""
+    """Sentences about parts removed to fit its size."""
     draw: Callable[[Cameras], Tensor]
     """Function from one camera in the scene's frame, on the model's device, to the colours (H, W, 3) that it sees."""
     lenses: Container[str]
@@ -52,12 +52,12 @@ def gaussian_page(
 
     Args:
         loaded: the run or file.
-        gaussians: Gaussians in the scene's frame. Those that are not finite are dropped, and their number is said.
+        gaussians: Gaussians in the scene's frame. All that are not finite are dropped and counted.
         look: how they are drawn.
         facts: further data of the page.
         turn: (3, 3) rotation from the scene's frame to the page's.
         most: maximum size of the page, in millions of bytes.
-        regions: the page shows what is in all of these, in the frame of exports.
+        regions: the page shows their intersection, in the frame of exports.
 
     Raises:
         ConfigError: if there is nothing to show, or nothing fits.
@@ -84,7 +84,7 @@ def octree_page(
     Args:
         loaded: the run or file.
         octree: its octree, or one that was baked from it, on the CPU.
-        cameras: M pinhole cameras in the scene's frame that see what has to be kept.
+        cameras: M pinhole cameras in the scene's frame; matter that they see is kept.
         facts, turn, most, regions: as in `gaussian_page`.
 
     Raises:

@@ -16,7 +16,7 @@ from nerfloom.training.loaded import Loaded
 
 
 def export_gaussians(loaded: Loaded, path: Path, settings: SplatSettings, regions: Sequence[Region] = ()) -> None:
-    """Write the Gaussians of a run or a file, and say what was lost and how they are drawn.
+    """Write the Gaussians of a run or a file, and report losses and how they are drawn.
 
     Args:
         loaded: the run or file.

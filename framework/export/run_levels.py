@@ -27,7 +27,7 @@ from nerfloom.training.loaded import Loaded
 
 
 def export_levels(loaded: Loaded, path: Path, settings: LevelsSettings, regions: Sequence[Region] = ()) -> None:
-    """Write the Gaussians of a run or a file to a file of levels, and say what was left out.
+    """Write the Gaussians of a run or a file to a file of levels, and report omissions.
 
     Args:
         loaded: the run or file.
@@ -59,7 +59,7 @@ def _parts(model: HasGaussians, moment: float | None, placement: Placement, most
 
 
 def export_file_levels(file: Path, path: Path, settings: LevelsSettings, regions: Sequence[Region] = ()) -> None:
-    """Write a file of Gaussians to a file of levels, and say what was left out. The file is read part by part.
+    """Write a file of Gaussians to a file of levels, and report omissions. The file is read part by part.
 
     Args:
         file: the file of Gaussians, in the frame of the input, or about a local origin given by an offset file beside

@@ -32,7 +32,7 @@ def export_level_set(
         loaded: the run.
         path: file to write.
         settings: settings of the mesh.
-        regions: what is in all of these is kept, in the frame of exports; none for the scene's box.
+        regions: the mesh keeps their intersection, in the frame of exports; none for the scene's box.
 
     Raises:
         ConfigError: if a setting is out of range, the method has no density, or there is no surface.
@@ -108,7 +108,7 @@ def _prepared(
 
 
 def _write(mesh: Mesh, placement: Placement, path: Path, start: float) -> None:
-    """Write a mesh, in a .glb file with y up, and say what it is."""
+    """Write a mesh, in a .glb file with y up, and report its size."""
     write_mesh(path, in_input(mesh, placement.y_up() if path.suffix.lower() == ".glb" else placement))
     counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, {closedness(mesh).sentence()}"
     say(f"{counts}; {path.stat().st_size / 1e6:.1f} MB after {time.monotonic() - start:.1f} s: {path}")

@@ -64,7 +64,7 @@ def export_page(
         path: file to write.
         settings: settings of the page.
         splatting: the method that fits Gaussians to a field.
-        regions: the page shows what is in all of these, in the frame of exports; it is then not compared.
+        regions: the page shows their intersection, in the frame of exports; it is then not compared.
 
     Raises:
         ConfigError: if the settings do not fit the run, or there is nothing to show.
@@ -120,7 +120,7 @@ def export_page(
 
 
 def kind_of(model: Renderable) -> str:
-    """Return what the page of `model` shows if no setting says it, a key of `SCRIPTS`."""
+    """Return the kind of the page of `model` if no setting says it, a key of `SCRIPTS`."""
     if isinstance(model, DrawnLevels):
         return "levels"
     return "octree" if isinstance(model, DrawnOctree) else "gaussians"
@@ -137,7 +137,7 @@ def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequenc
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
-    """Return the cameras of a page and their names: those of the photographs, or some around a scene without."""
+    """Return the cameras of a page and their names: of the photographs, or some around a scene without."""
     if dataset is None:
         cameras = around(model.scene)
         return cameras, [f"view {number + 1}" for number in range(len(cameras))]
@@ -163,7 +163,7 @@ def check_url(url: str | None) -> None:
     """Check that `url` is the address of a web page, or None.
 
     Raises:
-        FlagError: with what an address begins with.
+        FlagError: with the beginnings of valid addresses.
     """
     if url is not None and not url.startswith(("https://", "http://")):
         raise FlagError(f"--url is {shown(url)}; it must begin with https:// or http://")
@@ -223,7 +223,7 @@ def moment_of(moving: bool, asked: float | None) -> float | None:
 
 
 def _at(dataset: Dataset, moment: float | None) -> Dataset:
-    """Return a data set whose images are all taken at one moment."""
+    """Return a data set with the images of one moment."""
     return dataset if moment is None else replace(dataset, times=torch.full((len(dataset),), moment).to(dataset.device))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 PageKind = Literal["gaussians", "octree"]
-"""What a web page shows."""
+"""Content of a web page."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +65,7 @@ class LevelsSettings:
     bits: Literal[16, 32] = 32
     """Bits of each number but positions, which have 32. 16 halves the file and the time to read it."""
     build_memory: float = 2000.0
-    """Maximum memory for building, MB (1e6 bytes), besides that of a run that is loaded."""
+    """Maximum memory for building, MB (1e6 bytes), besides the memory of a loaded run."""
     time: float | None = None
     """Time of a moving scene, 0 to 1. Default: 0."""
 
@@ -75,8 +75,8 @@ class WebSettings:
     """A page that shows the scene's Gaussians or octree, or ones that are made from a field."""
 
     kind: PageKind | None = None
-    """What the page shows. octree: a run is baked, as by ns-bake; gaussians: they are fitted to what has none. Default:
-    the octree of an octree's file, else Gaussians."""
+    """Content of the page. octree: a run is baked, as by ns-bake; gaussians: they are fitted to a run without any.
+    Default: the octree of an octree's file, else Gaussians."""
     max_megabytes: float = 30.0
     """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians or leaves last."""
     fit_seconds: float = 60.0
@@ -86,7 +86,7 @@ class WebSettings:
     title: str | None = None
     """Heading of the page and of its link previews. Default: the run's names."""
     start_view: str | None = None
-    """Training photograph, by its file name, from whose camera the page starts. Default: the first one."""
+    """Training photograph, by its file name; the page starts at its camera. Default: the first one."""
     url: str | None = None
     """Address that the page will have, as in https://example.org/cup/scene.html; link previews need it to find their
     picture."""
@@ -121,14 +121,14 @@ class MarchingCubesSettings(MeshSettings):
     """
 
     isosurface_threshold: float | None = None
-    """Density of the surface, per scene unit. Default: the density at which 1/32 of the scene's box is half opaque."""
+    """Density of the surface, per scene unit. Default: the density that makes 1/32 of the scene's box half opaque."""
     time: float = 0.0
     """Time of a moving scene, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TsdfSettings(MeshSettings):
-    """A mesh of what the training cameras see, from their fused depth images; works with every method."""
+    """A mesh of the surfaces that the training cameras see, from their fused depth images; works with every method."""
 
     truncation: float = 4.0
     """Depth images count up to this distance from the surface, cells; larger is smoother, smaller keeps thin

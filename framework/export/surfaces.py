@@ -57,7 +57,7 @@ def found_surfaces(
     Returns:
         The points; fewer than `count`, possibly none, if rays end on no surface.
     """
-    # instant-ngp's settings and rates are those of its few seconds; nerfacto's are not (docs/notes/splatting.md).
+    # instant-ngp's settings and rates suit a few seconds; nerfacto's do not (docs/notes/splatting.md).
     limit = None if dataset.scene.unbounded or seconds == math.inf else seconds
     settings = replace(
         method.config,

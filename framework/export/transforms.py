@@ -16,7 +16,7 @@ from nerfloom.export.cameras import SPLITS, PosedFiles, coefficients, rational
 OPENCV = {"k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2", "k3": "k3", "k4": "k7"}
 """Coefficient of the file -> coefficient of `LENSES["opencv"]`; the file's k4 is the r^8 term."""
 RATIONAL = {name: name for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")}
-"""The same for COLMAP's FULL_OPENCV, whose k4 to k6 are the denominator's."""
+"""The same for COLMAP's FULL_OPENCV, with k4 to k6 in the denominator."""
 FISHEYE = {name: name for name in ("k1", "k2", "k3", "k4")}
 """The same for a fisheye lens."""
 POINTS = "sparse_pc.ply"

@@ -25,9 +25,9 @@ from nerfloom.renderable import Renderable
 BLOCK = 16
 """Cells along an edge of a block."""
 BLOCKS_AT_ONCE = 48
-"""Number of blocks whose points are projected at once."""
+"""Number of blocks with points projected at once."""
 OPAQUE = 0.5
-"""Minimum opacity of a pixel that shows a surface; others show empty space as far as the scene goes."""
+"""Minimum opacity of a pixel that shows a surface; others show empty space up to the scene's far end."""
 MIN_WEIGHT = 0.05
 """Weight of a view that sees the surface at a right angle to its normal; one that looks along the normal weighs 1."""
 MAX_PIXELS = 30_000_000
@@ -36,7 +36,7 @@ MAX_PIXELS = 30_000_000
 
 @dataclass(frozen=True)
 class DepthView:
-    """A view whose depth and colours were rendered, on the CPU."""
+    """A view with its rendered depth and colours, on the CPU."""
 
     camera: Cameras
     """One camera, for the full image."""

@@ -73,7 +73,7 @@ class PageFacts:
     background: tuple[float, float, float]
     """Colour behind everything, 0 to 1."""
     near: float
-    """Gaussians whose centre has a smaller depth, and parts of an octree at a smaller distance, are not drawn, scene
+    """Minimum depth of the centre of a drawn Gaussian, and minimum distance of drawn parts of an octree, scene
     units."""
     look: Look | None
     """How Gaussians are drawn; None for an octree."""
@@ -85,13 +85,13 @@ class PageFacts:
     unit_length: float = 1.0
     """Length of a scene unit, in `unit`."""
     unit: str = ""
-    """Name of the unit of lengths; empty for that of the input."""
+    """Name of the unit of lengths; empty for the input's unit."""
     relative_error: float | None = 0.0
     """Standard deviation of `unit_length`, as a fraction of it; None if it is not known."""
     photographed: bool = True
-    """Whether `cameras` are those of photographs, which determine how precise a length is."""
+    """Whether `cameras` belong to photographs, which determine how precise a length is."""
     start: int = 0
-    """Number of the camera, of `cameras`, from which the page starts."""
+    """Number of the camera, of `cameras`, where the page starts."""
     url: str = ""
     """Address that the page will have; empty if unknown."""
     picture: str = ""
@@ -145,7 +145,7 @@ def shown_cameras(count: int, start: int) -> list[int]:
 
     Args:
         count: number of all cameras.
-        start: number of the camera from which the page starts.
+        start: number of the camera where the page starts.
     """
     if count <= MAX_CAMERAS:
         return list(range(count))
@@ -189,7 +189,7 @@ def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
 
 
 def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> tuple[str, list[str]]:
-    """Return a web page of Gaussians of limited size, and sentences about what was removed to fit it.
+    """Return a web page of Gaussians of limited size, and sentences about parts removed to fit it.
 
     Args:
         gaussians: N Gaussians on the CPU, in a frame where z is up.

@@ -1,6 +1,6 @@
-// Levels of detail: for a view, the coarsest chunks of Gaussians whose error on the screen is small enough. They are
-// loaded from the folder beside the page, coarse ones first. What is not there yet is drawn by a coarser chunk above it.
-// A chunk is a node of a tree (framework/levels/nodes.py), in which each node follows those below it.
+// Levels of detail: for a view, the coarsest chunks of Gaussians with an error on the screen that is small enough. They
+// are loaded from the folder beside the page, coarse ones first. A coarser chunk above replaces a chunk that is not
+// loaded yet. A chunk is a node of a tree (framework/levels/nodes.py), where each node follows the nodes below it.
 
 const LEVEL_ERROR = 1; // pixels: largest standard deviation of a merged Gaussian on the screen
 const AT_ONCE = 4; // requests
@@ -8,7 +8,7 @@ const MOST = { mouse: 1000000, finger: 300000 }; // Gaussians that are drawn, on
 const WAIT = 10000; // milliseconds before a chunk that could not be loaded is asked for again
 const EVERY = 100; // milliseconds between two choices of chunks while the view moves
 
-/** Return the scene of a page of levels, whose coarsest chunk is `first`. */
+/** Return the scene of a page of levels with `first` as its coarsest chunk. */
 function levelsOf(first, facts, here) {
   const levels = facts.levels, tree = treeOf(levels), root = tree.count - 1;
   const most = matchMedia("(pointer: coarse)").matches ? MOST.finger : MOST.mouse;
@@ -69,7 +69,7 @@ function levelsOf(first, facts, here) {
     canvas.addEventListener("pointerdown", () => { message.hidden = true; }, { once: true });
   }
 
-  /** Choose what is drawn and loaded for a view. */
+  /** Choose the chunks to draw and to load for a view. */
   function choose(view) {
     const now = performance.now();
     const [width, height] = plain ? view.lens.slice(4)
@@ -118,14 +118,14 @@ function levelsOf(first, facts, here) {
   };
 }
 
-/** Return the tree of a page: children of each node, and what a camera sees of each. */
+/** Return the tree of a page: children of each node, and their view by a camera. */
 function treeOf({ counts, parents, boxes, reach, errors }) {
   const children = counts.map(() => []);
   parents.forEach((parent, node) => { if (parent >= 0) children[parent].push(node); });
   const corners = boxes.map((box) => [0, 1, 2, 3, 4, 5, 6, 7].map((k) => [0, 1, 2].map((axis) => box[axis + 3 * ((k >> axis) & 1)])));
   return {
     count: counts.length, counts, parents, children,
-    /** Return whether an image may show each node or what is below it, with Gaussians up to `border` pixels outside
+    /** Return whether an image may show each node or its descendants, with Gaussians up to `border` pixels outside
      * (framework/levels/on_image.py). */
     inView(camera, width, height, border) {
       const [right, down, forward] = [0, 3, 6].map((k) => camera.turn.slice(k, k + 3)), limits = [];

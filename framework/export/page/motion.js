@@ -1,5 +1,5 @@
-// A phone that is turned turns the view about what it looks at, as if one walked around the scene with it: for phones
-// whose browser has no augmented reality, since every one has an orientation sensor.
+// Turning a phone turns the view about the point that it looks at, as if the viewer walked around the scene with it:
+// for phones with browsers without augmented reality, since every phone has an orientation sensor.
 
 const UPRIGHT = 1.4; // radians: above it, the direction that a phone looks along has no reliable compass angle
 

@@ -1,4 +1,4 @@
-// An octree whose leaves have density and colour, traced by WebGL 2: a ray a pixel, or several from afar, from leaf to
+// An octree with density and colour in its leaves, traced by WebGL 2: a ray a pixel, or several from afar, from leaf to
 // leaf and over the largest known empty block around it. It walks as framework/kernels/octree/walk.h does, and shades as
 // trace.cpp; no ray needs a stack.
 
@@ -7,7 +7,7 @@ const HEAD = 84; // bytes before the first array
 const CODES = 256; // densities
 const CELLS_PER_PIXEL = 3, MOST_RAYS = 4; // wider pixels get up to 4 x 4 rays: one would show one of many leaves
 
-/** Return the scene of a page: what it is made of, `follow` and `drawer`. */
+/** Return the scene of a page: how many `things` it shows, `follow` and `drawer`. */
 function sceneOf(raw, facts) {
   const octree = octreeOf(raw);
   return {
@@ -44,7 +44,7 @@ function octreeOf(raw) {
   if (raw.length !== codes + count * (1 + 3 * terms)) refuse("they are not as long as their header says");
   const numbers = (at, many) => Array.from({ length: many }, (_, i) => view.getFloat32(at + 4 * i, true));
   const [origin, [cell, limit], turn] = [numbers(28, 3), numbers(40, 2), numbers(48, 9)];
-  // Of each harmonic, red, green and blue.
+  // Red, green and blue of each harmonic.
   const mixed = (values) => values.map((_, i) => values[(i % 3) * terms + Math.floor(i / 3)]);
   const scales = mixed(numbers(HEAD + 4 * CODES, 3 * terms)), offsets = mixed(numbers(masks - 12 * terms, 3 * terms));
   const rowsOf = (texels) => Math.max(Math.ceil(texels / ROW), 1);

@@ -8,7 +8,7 @@ const HEADER = 16; // bytes of an SPZ file of version 2 (framework/splats/spz.py
 const TEXEL = 16; // bytes
 
 /** Return the scene of a page: how many `things` it shows, `follow` and `drawer`. Gaussians are sorted by a worker, or
- * `here`. A page of levels has those of its coarsest level, and loads others (levels.js). */
+ * `here`. A page of levels contains its coarsest level, and loads others (levels.js). */
 function sceneOf(raw, facts, here) {
   const gaussians = gaussiansOf(raw);
   if (facts.levels) return levelsOf(gaussians, facts, here);
@@ -73,7 +73,7 @@ const texelsOf = (degree) => 2 + Math.ceil((3 * ((degree + 1) ** 2 - 1)) / TEXEL
 
 /** Return the Gaussians of an unpacked SPZ file: centres (N x 3, scene coordinates), and a table for the GPU.
  *
- * The table has 2 texels of four 32-bit words a Gaussian, and more for its harmonics, whose bytes stay as they are:
+ * The table has 2 texels of four 32-bit words a Gaussian, and more for its harmonics, with unchanged bytes:
  *     x, y, z as float32; colour and opacity, 8 bits each
  *     three scales, 8 bits each; three components of the quaternion, 8 bits each; two words of 0
  */
@@ -353,7 +353,7 @@ function sorter() {
   };
 }
 
-/** Return a sorter that works in a worker, whose `sort` is given a function that takes the order; in the page itself
+/** Return a sorter that works in a worker. Its `sort` takes a function that receives the order; in the page itself
  * where workers are refused. */
 function sortingElsewhere(here) {
   const chunks = new Map();
@@ -413,7 +413,7 @@ onmessage = ({ data: { add, remove, sort } }) => {
   };
 }
 
-/** Return the surface at a position of a picture, or null: as far away as the Gaussian that makes the ray half opaque. */
+/** Return the surface at a position of a picture, or null: at the Gaussian that makes the ray half opaque. */
 function surfaceAt(chunks, { look, near }, view, width, height, x, y) {
   const camera = cameraOf(view, width, height), { right, down, forward } = axesOf(view);
   const byte = (word, k) => (word >>> (8 * k)) & 255, crossed = [];

@@ -1,6 +1,6 @@
-// The data of a page: base64, and what gzip has compressed.
+// The data of a page: base64, and gzip.
 
-/** What the page cannot show; its message is for people. */
+/** An error about a page that cannot be shown; its message is for people. */
 class Refused extends Error {}
 
 /** Return the bytes of base64 text. */
@@ -16,7 +16,7 @@ function bytesOf(text) {
   return bytes;
 }
 
-/** Return what gzip has compressed; by the browser if it can, else by `inflate`. */
+/** Return the content of a gzip file, unpacked by the browser if it can, else by `inflate`. */
 async function gunzip(bytes, plain) {
   const damaged = "The data in this page are damaged or truncated. Copy or export the page again.";
   if (bytes.length < 18 || bytes[0] !== 0x1f || bytes[1] !== 0x8b || bytes[2] !== 8) throw new Refused(damaged);

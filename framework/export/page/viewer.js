@@ -1,10 +1,10 @@
-// The page: a camera that mouse, fingers and keys move, and what stands around the picture.
+// The page: a camera that mouse, fingers and keys move, and the controls around the picture.
 //
 // In the address, behind a #: camera=N starts at the Nth camera; plain=1 shows nothing but that camera's picture, pixel
 // by pixel; spin=1 turns around the scene; quality=full draws every pixel and quality=fast a quarter of them; sort=here
 // and inflate=here do without worker and DecompressionStream.
 //
-// What the scene is made of is the matter of splats.js, with levels.js, or octree.js: sceneOf(raw, facts, here) returns
+// The content of the scene is the matter of splats.js, with levels.js, or octree.js: sceneOf(raw, facts, here) returns
 // how many `things` there are, follow(view, changed), true if it can be drawn, and drawer(gl), which has
 // draw(camera, background) and surfaceAt(view, width, height, x, y).
 
@@ -277,7 +277,7 @@ function show(gl, scene, facts) {
     return drawn.surfaceAt(view, box.width, box.height, x - box.left, y - box.top);
   }
 
-  /** Turn about what is seen at a position of the page. */
+  /** Turn about the point seen at a position of the page. */
   function centre(x, y) {
     const point = surface(x, y), { forward } = axesOf(view);
     if (!point) return;

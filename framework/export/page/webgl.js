@@ -1,4 +1,4 @@
-// What both kinds of scene are drawn with: harmonics in the language of shaders, programs, and textures of numbers.
+// Shared by both kinds of scene: harmonics in the language of shaders, programs, and textures of numbers.
 
 const HARMONICS = [
   "-0.4886025119029199 * d.y", "0.4886025119029199 * d.z", "-0.4886025119029199 * d.x",

@@ -15,7 +15,7 @@ UNPACKED = "unpacked"
 
 
 def check_archive(archive: Path, place: Place, needs: str) -> None:
-    """Check that a zip file `archive` has what it `needs`, a file with a `place`, before anything is written.
+    """Check that a zip file `archive` has the file that it `needs`, with a `place`, before anything is written.
 
     Raises:
         DataError: if it has none, is damaged, or has an unsafe path.

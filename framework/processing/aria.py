@@ -1,9 +1,9 @@
 """Recordings of Project Aria glasses: images of the colour camera, placed by Machine Perception Services (MPS).
 
-The images are those that `vrs extract-all` writes: STREAM/STREAM-NUMBER-SECONDS.jpg, where the stream 214-1 is the
-colour camera and the seconds are those of the device. Of MPS are read (its documentation, Data Formats):
+The images come from `vrs extract-all`: STREAM/STREAM-NUMBER-SECONDS.jpg, where the stream 214-1 is the colour camera
+and the seconds come from the device's clock. These files of MPS are read (its documentation, Data Formats):
 
-- closed_loop_trajectory.csv: poses of the device in a world whose gravity is stated, by time in microseconds;
+- closed_loop_trajectory.csv: poses of the device in a world with stated gravity, by time in microseconds;
 - online_calibration.jsonl: a line for each moment, with lens and place of each camera on the device;
 - semidense_points.csv.gz, if it is there: points of the world with standard deviations.
 
@@ -41,7 +41,7 @@ STREAM, LABEL = "214-1", "camera-rgb"
 IMAGE = re.compile(r"(\d+-\d+)-\d+-(\d+\.\d+)")
 """Name of an image without ending: stream, number and seconds."""
 FOLDERS = ("", "slam", "trajectory")
-"""Folders below that of the results where its files may be."""
+"""Folders below the results' folder that may have its files."""
 FULL, HALF, BORDER = 2880, 1408, 32
 """Side of the colour camera's full images, which calibrations are for, and of half images, pixels; and the border of
 full images that half ones lack."""

@@ -17,7 +17,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
     """Convert an `image` of any mode to RGB, or to RGBA if a pixel is transparent.
 
     Raises:
-        DataError: for floating-point images, whose white level is unknown.
+        DataError: for floating-point images, because their white level is unknown.
     """
     if image.mode == "F":
         raise DataError("floating-point pixels; convert it to an 8-bit PNG")

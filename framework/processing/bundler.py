@@ -102,7 +102,7 @@ def _lines(file: Path) -> list[str]:
 
 
 def _counts(lines: list[str], file: Path) -> tuple[int, int]:
-    """Return the numbers of cameras and points, for which there are lines enough."""
+    """Return the numbers of cameras and points, and check that there are enough lines for them."""
     words = lines[1].split() if len(lines) > 1 else []
     if len(words) != 2 or not all(word.isdecimal() and len(word) < 10 for word in words):
         raise DataError(f"{file}: its second line is not the number of cameras and of points")

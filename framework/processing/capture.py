@@ -25,7 +25,7 @@ fit."""
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A camera whose pose is known."""
+    """A camera with a known pose."""
 
     name: str
     """Name of its image as the program writes it, made relative by `relative_name`; the ending may be missing."""
@@ -42,7 +42,7 @@ class Capture:
     program: str
     """Name of the program, for messages."""
     cameras: list[PosedCamera]
-    """The cameras whose pose and lens are known."""
+    """The cameras with known pose and lens."""
     left_out: Counter[str]
     """Number of further cameras by the reason why they cannot be used, such as "not aligned"."""
     points: np.ndarray | None = None
@@ -63,7 +63,7 @@ class Capture:
 def relative_name(name: str) -> str:
     """Return the name of an image as a relative path with slashes, without drive and parent folders.
 
-    Programs write full paths of the machine that they ran on. What is outside of the folder of the photographs must not
+    Programs write full paths of the machine that they ran on. Files outside of the folder of the photographs must not
     be read.
 
     Args:

@@ -44,7 +44,7 @@ def pairs(database: Path) -> set[tuple[str, str]]:
 
 
 def connected(database: Path) -> int:
-    """Return the number of pairs in the `database` whose matches fit a geometry."""
+    """Return the number of pairs in the `database` with matches that fit a geometry."""
     return rows(database, "two_view_geometries", "SUM(rows > 0)")
 
 

@@ -70,5 +70,5 @@ def extract(state: Reconstruction, prepared: list[PreparedImage], images: Path, 
 
 
 def _parameters(flags: ColmapFlags, width: int) -> str:
-    """Return COLMAP's parameters of a camera whose lens is known, as that of views is; "" otherwise."""
+    """Return COLMAP's parameters of a camera with a known lens, such as of views; "" otherwise."""
     return "" if flags.camera_type == "perspective" else camera_parameters(width, flags.view_angle)

@@ -12,7 +12,7 @@ from nerfloom.base.errors import DataError
 UNUSABLE = (KeyError, TypeError, ValueError, OverflowError)
 """Errors raised if a number in a file is missing or is something else."""
 LARGEST = 1e30
-"""Maximum magnitude of `bounded` numbers, whose products are still finite."""
+"""Maximum magnitude of `bounded` numbers, so that their products are finite."""
 MAX_SIDE = 10**9
 """Maximum width or height that a file may state, pixels."""
 MAX_ROUNDING = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 BLOCK = 16
-"""Side of the squares whose mean brightness is compared between frames, pixels."""
+"""Side of the squares for comparing mean brightness between frames, pixels."""
 MAX_REPEAT_DIFFERENCE = 0.003
 """Maximum difference between repeated frames, as a fraction of their contrast. In videos encoded by x264 and MPEG-4,
 repeated frames differed by up to 0.0025, and frames moved by half a pixel by 0.004 or more."""

@@ -16,7 +16,7 @@ def is_near_surface(position: np.ndarray) -> bool:
 
 
 def east_north_up(position: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) from geocentric axes to those of a place: x east, y north, z up.
+    """Return the rotation (3, 3) from geocentric axes to local axes at a place: x east, y north, z up.
 
     Up is the normal of the ellipsoid through the position, which differs from the plumb line's by arc seconds.
 

@@ -210,7 +210,7 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dic
 
 
 def in_parallel(work: Callable[[T], R], items: Iterable[T], title: str, total: int) -> list[R]:
-    """Apply `work` to all `items` in threads, with a bar of `title` and `total`; interrupts cancel what is left."""
+    """Apply `work` to all `items` in threads, with a bar of `title` and `total`; interrupts cancel the rest."""
     pool = ThreadPoolExecutor()
     try:
         return list(track(pool.map(work, items), title, total=total))

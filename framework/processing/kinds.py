@@ -1,4 +1,4 @@
-"""Kinds of input, and the way from each to a data folder: what `ns-process-data` and `nerfloom.process` take."""
+"""Kinds of input of `ns-process-data` and `nerfloom.process`, and the way from each to a data folder."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _check_input(flags: OutputFlags) -> None:
 
 
 def _is_finished(flags: ColmapFlags) -> bool:
-    """Return whether a run is resumed whose poses are finished; write the masks that it lacks.
+    """Return whether a run with finished poses is resumed; write the masks that it lacks.
 
     Raises:
         ConfigError: if COLMAP is missing.

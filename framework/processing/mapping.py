@@ -30,7 +30,7 @@ def reconstruct(state: Reconstruction, names: list[str], matching: str, turned: 
         state: the reconstruction, with matches.
         names: names of all images.
         matching: the rule for selecting pairs.
-        turned: fraction of image pairs between which the camera only rotated; if it is large, more pairs cannot help.
+        turned: fraction of image pairs with a camera that only rotated; if it is large, more pairs cannot help.
 
     Returns:
         The number of registered images of each model.

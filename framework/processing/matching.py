@@ -24,7 +24,7 @@ def choose_matching(method: str, count: int, exhaustive_limit: int, ordered: boo
     Args:
         method: the user's choice, possibly auto.
         count: number of images.
-        exhaustive_limit: maximum number of images whose pairs auto all matches.
+        exhaustive_limit: maximum number of images for auto to match all pairs.
         ordered: whether the images were taken one after the other, in the order of their names.
     """
     if method != "auto":
@@ -63,7 +63,7 @@ def pairs_of(left: list[str], names: list[str], state: Reconstruction) -> list[t
 
 
 def match(state: Reconstruction, pairs: list[tuple[str, str]], count: int, rule: str) -> None:
-    """Match `pairs` of names of `count` images in `state`, without those in the database; `rule` describes them."""
+    """Match `pairs` of names of `count` images in `state` that are not in the database; `rule` describes them."""
     known = database.pairs(state.database)
     missing = [pair for pair in pairs if pair not in known]
     kept = f", {len(pairs) - len(missing)} of them reused" if len(missing) < len(pairs) else ""

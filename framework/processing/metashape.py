@@ -62,8 +62,8 @@ class _Aligned:
 def read_capture(file: Path) -> Capture:
     """Read the cameras of a chunk.
 
-    Of several components, which are not aligned with each other, the one with the most cameras is taken, unless all are
-    georeferenced.
+    If there are several components, which are not aligned with each other, the one with the most cameras is taken,
+    unless all are georeferenced.
 
     Args:
         file: cameras.xml.
@@ -91,7 +91,7 @@ def read_capture(file: Path) -> Capture:
 
 
 def similarity_of(transform: Element | None, where: str) -> Similarity:
-    """Return the map that a `transform` element describes, `where` in messages; what is missing is the identity.
+    """Return the map that a `transform` element describes, `where` in messages; missing parts are the identity.
 
     Raises:
         DataError: if a number is invalid.

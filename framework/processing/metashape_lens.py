@@ -26,7 +26,7 @@ FISHEYES = ("fisheye", "equidistant_fisheye")
 TYPES = ("frame", *FISHEYES, "spherical")
 """Types of sensors that are supported."""
 COEFFICIENTS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-"""Numbers of a calibration; those that are missing are 0."""
+"""Numbers of a calibration; missing ones are 0."""
 SIDES = ("width", "height")
 """Attributes of a resolution."""
 MAX_DISPLACEMENT = 0.5
@@ -38,7 +38,7 @@ POSITIONS = 33
 
 
 class UnsupportedSensor(Exception):
-    """An error for a sensor whose lens cannot be used; its text follows a number of cameras, such as "of X sensors"."""
+    """An error for a sensor with an unusable lens; its text follows a number of cameras, such as "of X sensors"."""
 
 
 def lens_of(sensor: Element, where: str) -> Lens:

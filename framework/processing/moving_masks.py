@@ -1,4 +1,4 @@
-"""Masks of moving things: a scout finds what other images contradict, as for `--robust scout`."""
+"""Masks of moving things: a scout finds tiles that other images contradict, as for `--robust scout`."""
 
 from __future__ import annotations
 

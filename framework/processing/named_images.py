@@ -65,7 +65,7 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
 
 
 def images_as_named(capture: Capture) -> PlacedImages:
-    """Return the images of a capture whose cameras have the paths of their images as names.
+    """Return the images of a capture with paths of images as the names of its cameras.
 
     Raises:
         DataError: if it has no camera.

@@ -1,7 +1,7 @@
 """Reconstructions of OpenSfM, which OpenDroneMap keeps in the folder opensfm of a project: reconstruction.json.
 
 Conventions are in "Geometric Models" of OpenSfM's documentation. A shot's rotation (axis times angle) and translation
-lead from the world, whose z is up, to the camera (x right, y down, z forward). A position in an image is in units of
+lead from the world, with z up, to the camera (x right, y down, z forward). A position in an image is in units of
 the image's longer side L, from its centre: u L + w / 2, where the first pixel's centre is at 0.5.
 """
 
@@ -54,7 +54,7 @@ def find_reconstruction(project: Path) -> Path:
 
 
 def read_capture(file: Path) -> Capture:
-    """Read the reconstruction with the most shots in `file`; those of others are not connected and left out.
+    """Read the reconstruction with the most shots in `file`; shots of others are not connected and left out.
 
     Raises:
         DataError: if the file is not such a reconstruction, or has an invalid number.
@@ -138,7 +138,7 @@ def _camera(name: str, shot: Any, lenses: dict[str, Any], where: str) -> PosedCa
 
 
 def _numbers(camera: dict[str, Any], kind: str, where: str) -> dict[str, float]:
-    """Return focal lengths, principal point and coefficients of a camera; what is missing is 0 or the other focal."""
+    """Return focal lengths, principal point and coefficients of a camera; missing ones are 0 or the other focal."""
     try:
         focal = camera.get("focal", camera.get("focal_x"))
         numbers = {key: bounded(camera.get(key, focal)) for key in ("focal_x", "focal_y")}

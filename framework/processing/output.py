@@ -79,7 +79,7 @@ def is_unfinished(output: Path) -> bool:
 
 
 def lacks_masks(flags: ColmapFlags) -> bool:
-    """Return whether a finished run has no masks although `flags` ask for masks of what moves."""
+    """Return whether a finished run has no masks although `flags` ask for masks of moving things."""
     return flags.mask_moving and b'"mask_path"' not in (flags.output_dir / FINISHED).read_bytes()
 
 

@@ -1,4 +1,4 @@
-"""Perspective views of panoramas whose poses are not known, as images for COLMAP."""
+"""Perspective views of panoramas with unknown poses, as images for COLMAP."""
 
 from __future__ import annotations
 

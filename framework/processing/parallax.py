@@ -23,7 +23,7 @@ NO_PARALLAX = (
 
 
 def share_that_turned(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return the fraction of pairs whose matches are explained by a camera rotation alone, with one focal length.
+    """Return the fraction of pairs with matches that a camera rotation alone explains, with one focal length.
 
     The focal length that explains most pairs is used. Pairs with little motion are left out.
 

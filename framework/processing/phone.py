@@ -60,7 +60,7 @@ def write_folder(
             image may have another size.
         output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
-        applied: (3, 4) transform from the phone's frame to that of the poses.
+        applied: (3, 4) transform from the phone's frame to the poses' frame.
         z_is_up: whether z is up in the frame of the poses, as the phone has measured; otherwise the up direction is
             estimated from the poses.
         crop: pixels to cut off at each side.

@@ -63,7 +63,7 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
     """Return where a file of a zip file belongs in the folder of an export; None for files that are not needed.
 
-    `parts` are those of its path in the zip file; the folder keyframes may be inside another one.
+    `parts` belong to its path in the zip file; the folder keyframes may be inside another one.
     """
     inside = parts[parts.index("keyframes") :] if "keyframes" in parts else ()
     return inside if len(inside) == 3 and inside[1] in FOLDERS and parts[0] != "__MACOSX" else None

@@ -84,7 +84,7 @@ def write_capture(
 def _with_lenses(
     prepared: Iterable[PreparedImage], placed: dict[Path, PosedCamera], frame: np.ndarray, images: Path
 ) -> tuple[list[_Posed], list[str]]:
-    """Return the images whose size fits their camera, and messages about the others, which are removed."""
+    """Return the images with sizes that fit their cameras, and messages about the others, which are removed."""
     posed: list[_Posed] = []
     misfits: list[str] = []
     for image in prepared:
@@ -104,7 +104,7 @@ def _listed(left_out: Counter[str]) -> str:
 
 
 def _models_to_cut(models: set[str], whole: bool) -> set[str]:
-    """Return the models of lenses whose images are cut into views, so that one model remains."""
+    """Return the models of lenses with images to cut into views, so that one model remains."""
     if whole and PANORAMA in models and len(models) > 1:
         raise DataError("--panoramas whole: there are images of other lenses, too, and a data folder has one model")
     if len(models) == 1:
@@ -135,7 +135,7 @@ def _view_names(taken: list[str], wide: list[_Posed], views: Views) -> list[list
     """Return a name for each view of each image, different from the names that are taken.
 
     Views of one direction follow each other, as in `panoramas.view_names`: every eighth image by name is held out, and
-    of eight views of each image that would always be the first, so that no image showed what is ahead.
+    with eight views of each image the first would always be held out, so that no image showed this direction.
     """
     count = len(views.directions)
     wanted = [Path(name) for name in taken]

@@ -3,10 +3,10 @@
 Its columns are name, x, y, alt, heading, pitch, roll, f, px, py, k1 to k4, t1 and t2; RealityScan calls some of them
 yaw, f_35mm, px_norm and py_norm. With L the longer side of an image, pixels:
 
-- The focal length is f L / 36, f being that of a picture 36 mm wide. The principal point is px L and py L from the
-  image's centre: the templates of calibration.xml write `f*36`, `px` and `py`, and in pixels `f*scale` and
+- The focal length is f L / 36, f being the focal length for a picture 36 mm wide. The principal point is px L and py L
+  from the image's centre: the templates of calibration.xml write `f*36`, `px` and `py`, and in pixels `f*scale` and
   `px*scale+0.5*width`.
-- Radial coefficients are those of Brown's model. Templates for OpenCV write k1, k2, t2, t1, k3, k4; so t1 is OpenCV's
+- Radial coefficients are Brown's. Templates for OpenCV write k1, k2, t2, t1, k3, k4; so t1 is OpenCV's
   p2, and t2 its p1.
 - With heading, pitch and roll 0 the camera looks straight down, and north is up in the image. The rotation from the
   camera with OpenGL axes is Rz(-heading) Rx(pitch) Ry(roll); angles are in degrees.
@@ -40,7 +40,7 @@ LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 
 
 EXPORT = "export 'Internal/External camera parameters' from RealityCapture"
-"""What to do."""
+"""Advice for the user."""
 
 
 def read_capture(file: Path) -> Capture:

@@ -3,8 +3,8 @@
 A recording is a zip file with rgbd/N.jpg and metadata, which holds the same JSON. Its depth images are compressed by
 LZFSE, and are not read.
 
-Poses are in the axes of the images as they are stored, portrait or landscape. The world's frame is that of the first
-camera, whose inclination is not recorded (the app's author, github.com/marek-simonik/record3d, issue 27).
+Poses are in the axes of the images as they are stored, portrait or landscape. The world's frame is the first camera's,
+and its inclination is not recorded (the app's author, github.com/marek-simonik/record3d, issue 27).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def lenses_of(metadata: dict[str, Any], count: int, path: Path) -> list[Lens]:
-    """Return the lens of each pose: its own if the export has one for each, otherwise that of the whole capture (K).
+    """Return the lens of each pose: its own if the export has one for each, otherwise the whole capture's (K).
 
     Args:
         metadata: content of metadata.json; K is stored column by column.

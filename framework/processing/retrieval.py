@@ -41,7 +41,7 @@ def similar_pairs(descriptors: np.ndarray, neighbors: int, apart: int = 0) -> li
     Args:
         descriptors: (N, D) unit vectors (`global_descriptors`); an image without features is 0 and in no pair.
         neighbors: number of similar images.
-        apart: images whose indices differ by at most this are left out, because they are matched anyway.
+        apart: pairs with indices that differ by at most this are left out, because they are matched anyway.
     """
     count = len(descriptors)
     similarity = descriptors @ descriptors.T

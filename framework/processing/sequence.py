@@ -1,4 +1,4 @@
-"""Detection of photographs whose names show that they were taken one after the other."""
+"""Detection of photographs with names that show that they were taken one after the other."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ class ColmapFlags(ViewFlags):
     camera_model: CameraModel = "OPENCV"
     """Lens model: OPENCV has distortion k1, k2, p1, p2; OPENCV_FISHEYE is for angles of view over about 120 degrees."""
     camera_sharing: Literal["auto", "single", "per-image"] = "auto"
-    """Which images share a camera. auto: those in a folder with equal size, device and focal length."""
+    """Which images share a camera. auto: images in a folder with equal size, device and focal length."""
     matching_method: Matching = "auto"
     """Which images are matched. auto: for videos and numbered photographs, neighbours and loops, and more if some
     images remain; for others, all pairs up to --exhaustive-limit images, then retrieval."""

@@ -31,7 +31,7 @@ class Summary:
     pairs: int
     """Number of matched image pairs."""
     turned: float
-    """Fraction of image pairs between which the camera only rotated (`parallax.share_that_turned`)."""
+    """Fraction of image pairs with a camera that only rotated (`parallax.share_that_turned`)."""
     seconds: dict[str, float]
     """Seconds by stage."""
 

@@ -102,7 +102,7 @@ def content(frames: list[Frame], applied: np.ndarray, points: str | None, more: 
 
     Args:
         frames: at least one; a lens that all share is written at the top, otherwise each frame has its own.
-        applied: (3, 4) transform from the original frame (COLMAP's or the phone's) to that of `frames`.
+        applied: (3, 4) transform from the original frame (COLMAP's or the phone's) to the frame of `frames`.
         points: name of the point cloud in the same folder, or None.
         more: further entries at the top.
 

@@ -67,7 +67,7 @@ def turned(right: float, up: float) -> np.ndarray:
 
 
 def view_lens(lens: Lens, angle: float) -> Lens:
-    """Return the lens of views of `angle` degrees of an image of `lens`; pixels at the centre are as large as there.
+    """Return the lens of views of `angle` degrees of an image of `lens`, with the same size of pixels at the centre.
 
     Raises:
         DataError: if views would be too large.
@@ -103,12 +103,12 @@ def cut(image: np.ndarray, lens: Lens, views: Views) -> Iterator[View]:
 
 
 def positions(lens: Lens, view: Lens, rotation: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where an image shows what the pixels of a view look at.
+    """Return the positions in an image of the pixels of a view.
 
     Args:
         lens: lens of the image.
         view: lens of the view.
-        rotation: (3, 3) from the view's camera to that of the image, OpenGL axes.
+        rotation: (3, 3) from the view's camera to the image's, OpenGL axes.
         rows: R rows of the view.
 
     Returns:

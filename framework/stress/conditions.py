@@ -23,7 +23,7 @@ from nerfloom.testing.ball import RADIUS
 MAX_LOSS = 2.0
 """Default maximum loss of PSNR, dB; compare the loss of `another-seed`."""
 MAX_LOSS_OF_OTHER_PICTURES = 5.0
-"""Maximum loss of PSNR, dB, if the test views show more or less of the ball than those of the plain run.
+"""Maximum loss of PSNR, dB, if the test views show more or less of the ball than the plain run's views.
 
 If test views are easier than the plain ones (all white, black or transparent), or show the same part of the ball (4
 degrees), the maximum is `MAX_LOSS`.

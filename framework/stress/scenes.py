@@ -181,7 +181,7 @@ def with_photographs(
     Args:
         dataset: the data set.
         pixels: (P, 3 or 4) uint8 pixels of all images.
-        cameras: cameras of the images; if None, those of `dataset`.
+        cameras: cameras of the images; if None, the cameras of `dataset`.
         kept: pixels that count; None for all.
     """
     cameras = dataset.cameras if cameras is None else cameras

@@ -67,7 +67,7 @@ class Trial:
     refused: bool = False
     """Whether the error is one for users (NerfloomError)."""
     learnt: float | None = None
-    """PSNR minus that of images of the background alone, dB; None if there is no PSNR."""
+    """PSNR minus the PSNR of images of the background alone, dB; None if there is no PSNR."""
 
 
 class StressedSource(BatchSource):

@@ -112,7 +112,7 @@ def moved(views: Views, scale: float = 1.0, shift: float = 0.0, placed: bool = F
         views: the images.
         scale: new units per old unit.
         shift: displacement along each axis, new units.
-        placed: whether cameras are placed like those of captures.
+        placed: whether cameras are placed as in captures.
     """
     factor, offset = scale, torch.full((3,), shift, dtype=torch.float64)
     if placed:

@@ -1,1 +1,1 @@
-"""Pictures and videos of a run or a file along a path: what `ns-render` and `run.render_path` make."""
+"""Pictures and videos of a run or a file along a path, for `ns-render` and `run.render_path`."""

@@ -46,9 +46,9 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
     Frames are kept beside the output until it is complete, so that a stopped render can continue.
 
     Args:
-        loaded: what is rendered.
+        loaded: the run or file to render.
         name: name of the path, a key of `PATHS`.
-        output: file, whose suffix is the format (.mp4, .gif, .webp, .png), or a folder of images.
+        output: file, with the format as suffix (.mp4, .gif, .webp, .png), or a folder of images.
         settings: settings of the path.
 
     Raises:
@@ -85,7 +85,7 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
 
 
 def _views(name: str, settings: PathSettings, loaded: Loaded, output: Path) -> Views:
-    """Return what is rendered, at its final size."""
+    """Return the run or file, at its final image size."""
     views = VIEWS[name](settings, loaded)
     sizes = torch.stack([views.cameras.widths, views.cameras.heights])
     if int(sizes.min()) < 1:
@@ -186,7 +186,7 @@ def _write(
 
 
 def _colored_range(settings: PathSettings, frames: Frames, name: str, unit: str | None) -> tuple[float, float]:
-    """Return and print the ends of the colours of output `name` in `frames`; `settings` give those of distances."""
+    """Return and print the ends of the colours of output `name` in `frames`; `settings` give the ends of distances."""
     given = settings.depth_near_plane, settings.depth_far_plane
     near, far = (None, None) if unit is None else given
     if near is None or far is None:

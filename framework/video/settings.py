@@ -69,7 +69,7 @@ class PathSettings(FileSettings, ViewSettings):
         """Refuse settings that contradict each other, or `output`, or are out of range.
 
         Raises:
-            FlagError: with what is wrong.
+            FlagError: with the fault.
         """
         outputs = self.rendered_output_names
         if (self.fps is not None and not 0 < self.fps <= 1000) or self.downscale_factor < 1:
@@ -109,14 +109,14 @@ class PathSettings(FileSettings, ViewSettings):
 
 @dataclass(frozen=True)
 class LensSettings(PathSettings):
-    """Settings of paths whose images can have another size."""
+    """Settings of paths with images that can have another size."""
 
     width: int | None = None
-    """Width of the images, pixels. Default: that of the photographs, or what --height makes it."""
+    """Width of the images, pixels. Default: from the photographs, or by --height."""
     height: int | None = None
     """Height of the images, pixels. Default: likewise."""
     fov: float | None = None
-    """Vertical field of view, degrees. Default: that of the photographs, or of the path's file."""
+    """Vertical field of view, degrees. Default: from the photographs, or the path's file."""
 
     def check(self, output: Path) -> None:
         super().check(output)
@@ -158,7 +158,7 @@ class FramesSettings(LensSettings):
 
 @dataclass(frozen=True)
 class FlightSettings(FramesSettings):
-    """Settings of paths on which a camera moves."""
+    """Settings of paths of a moving camera."""
 
     ease: bool = False
     """Start and end at rest. Default: even speed, so that a loop has no halt."""
@@ -168,7 +168,7 @@ def check_radius(radius: float | None) -> None:
     """Refuse a `radius` that is not positive and finite; None is accepted.
 
     Raises:
-        FlagError: with what is wrong.
+        FlagError: with the fault.
     """
     if radius is not None and not 0 < radius < 1e9:
         raise FlagError(f"--radius is {radius:g}; it must be above zero")
@@ -181,8 +181,8 @@ class CameraPathSettings(LensSettings):
     camera_path_filename: Path = Path("camera_path.json")
     """File of the cameras, of ns-viewer, of nerfstudio's viewer or its Blender add-on."""
     frame: Literal["scene", "exports"] = "scene"
-    """Frame of the file's cameras. scene: the run's own, as viewers write them; exports: that of exported meshes and
-    points, for cameras placed around these in another program."""
+    """Frame of the file's cameras. scene: the run's own, as viewers write them; exports: the frame of exported meshes
+    and points, for cameras placed around these in another program."""
     dataparser_transforms: Path | None = None
     """dataparser_transforms.json of the path's run, if that run placed the same input differently."""
 
@@ -253,7 +253,7 @@ class DatasetSettings(PathSettings):
     """Each camera of a split, in a folder OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png."""
 
     rendered_output_names: tuple[str, ...] = ("rgb", "gt-rgb")
-    """Outputs, each in a folder: those of other paths, gt-rgb: the photograph, and error: the difference from it."""
+    """Outputs, each in a folder: as of other paths, gt-rgb: the photograph, and error: the difference from it."""
     fps: float = 4.0
     """Frames per second of a video."""
     split: Literal["train", "val", "test"] = "test"

@@ -103,7 +103,7 @@ def camera_path_views(settings: CameraPathSettings, loaded: Loaded) -> Views:
 
 
 def path_views(settings: FramesSettings, loaded: Loaded, cameras: Cameras, moment: float | None = None) -> Views:
-    """Return the views of F `cameras` as large as the images of `loaded`, by `settings`.
+    """Return the views of F `cameras` with the image size of `loaded`, by `settings`.
 
     `moment` is the time of all frames of a moving scene; None if it runs from 0 to 1.
     """
@@ -115,7 +115,7 @@ def path_views(settings: FramesSettings, loaded: Loaded, cameras: Cameras, momen
 
 
 def learnt_cameras(parsed: ParsedScene) -> Cameras:
-    """Return the cameras of a scene, `parsed`, as large as the images that are learnt from."""
+    """Return the cameras of a scene, `parsed`, with the size of the training images."""
     return parsed.cameras.scaled(1 / parsed.downscale_factor)
 
 
@@ -232,4 +232,4 @@ VIEWS: dict[str, Callable[[Any, Loaded], Views]] = {
     "time": _one_camera,
     "dataset": dataset_views,
 }
-"""Name of a path -> function of its settings and what is rendered."""
+"""Name of a path -> function of its settings and the run or file."""

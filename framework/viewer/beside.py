@@ -38,7 +38,7 @@ def draw_beside(
 
     Args:
         loaded: the first run, left of the divider.
-        second: the second run, whose scene may be placed in another way; None for the first alone.
+        second: the second run, possibly with another placement of its scene; None for the first alone.
         request: the view, in the frame of the first run's scene.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
@@ -59,7 +59,7 @@ def draw_beside(
 
 
 def joined(left: Arrays, right: Arrays, divider: float) -> Arrays:
-    """Join arrays (H, W, ...) of the picture `left` of the fraction `divider` to those of the picture `right` of it."""
+    """Join arrays (H, W, ...) of the picture `left` of the fraction `divider` with the picture `right` of it."""
     found = {}
     for (name, one), other in zip(left.items(), right.values(), strict=True):
         column = round(divider * one.shape[1])

@@ -18,7 +18,7 @@ from nerfloom.viewer.request import Request
 ROUGH_QUALITY, FINE_QUALITY = 70, 95
 """JPEG quality of coarse and of finished pictures."""
 RENEWAL = 1.0
-"""Seconds after which a finished picture is redrawn if the model has changed."""
+"""Seconds until a finished picture is redrawn if the model has changed."""
 Show = Callable[[np.ndarray, int], None]
 """Function that sends a picture (H, W, 3) uint8 to the browser, as a JPEG of a given quality. It does not
 keep the array, which changes with the next piece."""

@@ -16,21 +16,21 @@ from nerfloom.rendering.rendered import Picture
 from nerfloom.splats.gaussians import RendersGaussians
 from nerfloom.viewer.request import Crop
 
-BY_RAYS = "Only what is inside the box is rendered, so its walls hide nothing."
-BY_CENTERS = "Only Gaussians whose centre is inside the box are drawn, so its walls hide nothing."
-BY_DEPTH = "Pixels whose surface is outside the box are hidden, with everything behind them."
+BY_RAYS = "Only matter inside the box is rendered, so its walls hide nothing."
+BY_CENTERS = "Only Gaussians with their centre inside the box are drawn, so its walls hide nothing."
+BY_DEPTH = "Pixels with their surface outside the box are hidden, with everything behind them."
 
 
 @dataclass(frozen=True)
 class CroppedCameras(Cameras):
-    """Cameras whose rays start and end where they enter and leave a box, and between two distances."""
+    """Cameras with rays that start and end where they enter and leave a box, and between two distances."""
 
     crop: Crop | None = None
     """The box and the distances; None for whole rays."""
 
     @classmethod
     def of(cls, cameras: Cameras, crop: Crop) -> CroppedCameras:
-        """Return `cameras` whose rays end at the `crop`."""
+        """Return `cameras` with rays that end at the `crop`."""
         return cls(**{field.name: getattr(cameras, field.name) for field in fields(Cameras)}, crop=crop)
 
     def pixel_rays(
@@ -59,7 +59,7 @@ def without_outside(picture: Picture, rays: Rays, crop: Crop, background: Tensor
         rays: H * W whole rays of the pixels' centres.
         crop: the box and the distances.
         background: (3,) colour.
-        by_depth: whether to hide pixels whose surface, at the median depth, lies outside, with everything behind it.
+        by_depth: whether to hide pixels with a surface, at the median depth, outside, with everything behind it.
             For methods that cast no rays.
     """
     inside = cropped(rays, crop)

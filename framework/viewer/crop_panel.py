@@ -29,7 +29,7 @@ ARROW = 70.0
 FILE = "crop.yaml"
 """Name of the region's file in a run's folder."""
 Face = tuple[int, int]
-"""Axis of a face's normal, and 0 for the face of the minimum corner or 1 for that of the maximum corner."""
+"""Axis of a face's normal, and 0 for the face of the minimum corner or 1 for the maximum corner."""
 FACES: tuple[Face, ...] = tuple(product(range(3), range(2)))
 """All faces."""
 
@@ -186,12 +186,12 @@ def middle(box: Box, face: Face) -> Vector:
 
 
 def dragged(box: Box, face: Face, place: float, thinnest: float) -> Vector:
-    """Return the corner of a box whose face has been dragged.
+    """Return the corner of a box after a face has been dragged.
 
     Args:
         box: a box that is parallel to the axes.
         face: axis and side.
-        place: coordinate along that axis to which it has been dragged.
+        place: new coordinate of the face along that axis.
         thinnest: minimum length of an edge. One that is shorter already may stay so, or the face would jump.
     """
     axis, side = face

@@ -48,7 +48,7 @@ class ExportPanel:
     ) -> None:
         self._loaded, self._request, self._crop = loaded, request, crop
         gui = client.gui
-        gui.add_markdown(f"What is in the crop box, at the time that is shown, into the folder {FOLDER} of the run.")
+        gui.add_markdown(f"Exports the inside of the crop box, at the time shown, into the folder {FOLDER} of the run.")
         first = "gaussian-splat .ply" if isinstance(loaded().model, HasGaussians) else "pointcloud .ply"
         self._kind = gui.add_dropdown("What", list(CHOICES), initial_value=first)
         gui.add_button("Export").on_click(lambda _: self._export())
@@ -77,7 +77,7 @@ class ExportPanel:
             self._note.content = f"Cannot export: {plain(error.strerror or str(error))}."
 
     def _flags(self, name: str, suffix: str) -> list[object]:
-        """Return the flags of ns-export for a kind of export, a suffix, and what is shown."""
+        """Return the flags of ns-export for a kind of export, a suffix, and the picture's time and crop."""
         loaded, kind, request = self._loaded(), KINDS[name], self._request()
         flags: list[object] = ["--device-type", loaded.model.device.type]
         data = loaded.run.config.data

@@ -31,7 +31,7 @@ class FloaterPanel:
 
     Args:
         client: the browser.
-        queue: holds the model, and runs what is to be done between pictures.
+        queue: holds the model, and runs work between pictures.
         request: function that returns the browser's request; None if its camera is invalid.
     """
 

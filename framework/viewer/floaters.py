@@ -30,20 +30,20 @@ class Floaters(NamedTuple):
 
 
 def can_find(loaded: Loaded) -> bool:
-    """Return whether `find_floaters` suits what is loaded: Gaussians, or a method that casts rays, with photographs."""
+    """Return whether `find_floaters` suits a run: Gaussians, or a method that casts rays, with photographs."""
     model = loaded.model
     return loaded.source is not None and not model.scene.warped and isinstance(model, (HasGaussians, RendersRays))
 
 
 def find_floaters(loaded: Loaded, time: float | None) -> Floaters:
-    """Return what floats in front of surfaces that photographs see. Photographs are not decoded.
+    """Return the matter that floats in front of surfaces that photographs see. Photographs are not decoded.
 
-    These are the Gaussians that the step `drop_floaters` of ns-edit removes. Of a method without Gaussians it is the
+    These are the Gaussians that the step `drop_floaters` of ns-edit removes. For a method without Gaussians it is the
     matter in front of points of the reconstruction, in training images that see them: where ns-eval counts floaters,
     but in held-out images.
 
     Args:
-        loaded: what `can_find` accepts.
+        loaded: a run that `can_find` accepts.
         time: time in [0, 1] of a scene that moves; None for 0.
 
     Raises:

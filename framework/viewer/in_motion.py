@@ -13,7 +13,7 @@ SHARED = ("rgb", "depth", "accumulation")
 
 
 def is_shared(request: Request) -> bool:
-    """Return whether a file shows what a `request` asks for, with arrays of the same names as the run's."""
+    """Return whether a file can show the picture of a `request`, with arrays of the same names as the run's."""
     return request.output in SHARED and not request.overlay and request.divider is None
 
 

@@ -1,4 +1,4 @@
-"""Keys of the page, besides those that move the camera. Ctrl-K lists all of them."""
+"""Keys of the page, besides the keys that move the camera. Ctrl-K lists all of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Key(NamedTuple):
-    """A key, and what it does."""
+    """A key, and its action."""
 
     key: str
     """Upper-case letter other than W, A, S, D, Q and E, which move the camera."""

@@ -36,7 +36,7 @@ class MeasurePanel:
 
     Args:
         client: the browser.
-        queue: holds the model and its scale, and runs what is to be done between pictures.
+        queue: holds the model and its scale, and runs work between pictures.
         request: function that returns the browser's request; None if its camera is invalid.
     """
 

@@ -137,7 +137,7 @@ class Page:
             self._curve.data = data
 
     def _place_camera(self) -> Vector:
-        """Place the initial camera at the first training camera, with the same view direction; return what is up."""
+        """Place the initial camera at the first training camera, with the same view direction; return the up axis."""
         model = self._queue.loaded.model
         scene, poses = model.scene, training_poses(model)
         if poses is None or not len(poses) or scene.warped:
@@ -149,7 +149,7 @@ class Page:
         else:
             pose, mean = poses[0].cpu(), poses[:, :, 1].mean(0).cpu()
             up = torch.tensor([0.0, 0.0, 1.0]) if float(mean[2]) > 0.5 * float(mean.norm()) else mean
-            seen = looked_at(poses) if scene.unbounded else None  # a capture orbits what its cameras look at
+            seen = looked_at(poses) if scene.unbounded else None  # a capture orbits the point that its cameras look at
             middle = (scene.box.mean(0).cpu() if seen is None else seen.float()) - pose[:, 3]
             distance = max(float(-(middle @ pose[:, 2])), 0.1 * float(middle.norm()), 1e-3)
             position, center = pose[:, 3], pose[:, 3] - distance * pose[:, 2]

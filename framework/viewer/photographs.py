@@ -40,7 +40,7 @@ class Photographs:
 
     Args:
         run: the run, with the folder and the format of its data; None for none.
-        model: function that returns the model that is looked at now, in whose scene the cameras stand.
+        model: function that returns the model shown now; the cameras are in its scene.
     """
 
     def __init__(self, run: Run | None, model: Callable[[], Renderable]) -> None:
@@ -80,7 +80,7 @@ class Photographs:
         return self._given.ndc if isinstance(self._given, NdcCameras) else None
 
     def chosen(self) -> list[int]:
-        """Return the indices of the images whose cameras are shown, at most `MAX_SHOWN`, evenly spaced."""
+        """Return the indices of the images with cameras shown, at most `MAX_SHOWN`, evenly spaced."""
         return [] if self._given is None else spread(len(self._given), MAX_SHOWN)
 
     def name(self, index: int) -> str:
@@ -144,7 +144,7 @@ class Photographs:
     def truth(self, view: View, rgb: Tensor, background: Tensor) -> Tensor | None:
         """Return the photograph's colours in the pixels of a view from the photograph's position.
 
-        Seen from one position, a direction has the same colour in every picture, whatever its distance. So the view's
+        Seen from one position, a direction has the same colour in every picture, at all distances. So the view's
         pixels are projected into the photograph, through its lens. Pixels outside it keep the rendered colour.
 
         Args:

@@ -65,7 +65,7 @@ class Request:
     time: float | None = None
     """Time in [0, 1]; None for a static scene. A moving scene beside a static one is then shown at time 0."""
     appearance: int | None = None
-    """Training image whose appearance to use; None for the mean."""
+    """Training image that gives the appearance; None for the mean."""
     background: tuple[float, float, float] | None = None
     """Colour behind the scene, 0 to 1; None for the evaluation background."""
     crop: Crop | None = None

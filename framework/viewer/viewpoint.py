@@ -22,7 +22,7 @@ SLIDER = (5.0, 140.0)
 Move = Callable[[Tensor, float, "float | None"], None]
 """Function of a pose (3, 4), a field of view in radians and a time, if there is one, that moves a browser's camera."""
 SCENE = "scene"
-"""Entry of the list of up directions: that of the scene."""
+"""Entry of the list of up directions: the scene's."""
 AXES: dict[str, Vector] = {
     "z": (0.0, 0.0, 1.0),
     "-z": (0.0, 0.0, -1.0),
@@ -41,7 +41,7 @@ class Viewpoint:
         self._client = client
         self._ups = {SCENE: up, **AXES}
         gui = client.gui
-        self._fov = gui.add_slider("Field of view", *SLIDER, 0.1, FIRST_FOV, hint="From top to bottom, degrees.")
+        self._fov = gui.add_slider("Field of view", *SLIDER, 0.1, FIRST_FOV, hint="Vertical field of view, degrees.")
         self._fov.on_update(lambda _: self._zoom())
         self._up = gui.add_dropdown("Up", list(self._ups), hint="The camera orbits about this axis.")
         self._up.on_update(lambda _: self.level())

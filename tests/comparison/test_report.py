@@ -115,7 +115,7 @@ def test_surfaces_have_columns_and_say_how_they_were_compared(tmp_path: Path) ->
     assert row[head.index("F-score, %")] == "40.0"
     assert row[head.index("normals, °")] == "6.00"
     assert row[head.index("faces")] == "1,234"
-    assert "Surfaces are compared with reference.ply, whose longest side is 2; F-score at 0.005, both in" in text
+    assert "Surfaces are compared with reference.ply (longest side 2); F-score at 0.005, both in" in text
     (csv_row, _) = csv.DictReader(io.StringIO((comparison.folder / "results.csv").read_text()))
     assert csv_row["chamfer"] == "0.25"
 

@@ -59,7 +59,7 @@ def measure(
         target: the time to reach this PSNR is reported, dB.
         variants: flags of ns-train for each variant.
         method: name of the method.
-        kind: what the variants are called in the results. If the method refuses the flag of this name, since the data
+        kind: name of the variants in the results. If the method refuses the flag of this name, since the data
             does not support it, the variant's row has the error message instead of results.
 
     Returns:

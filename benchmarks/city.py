@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from nerfloom.base.errors import FlagError
 
 METHOD = "nerfacto"
-"""Method of the blocks, whose results are used."""
+"""Method of the blocks with the results used."""
 RENDERED = 200 * 200
 """Number of pixels of the pictures in methods-procedural.json."""
 COMMAND_LIMIT = 2**21
@@ -64,7 +64,7 @@ class Constants(NamedTuple):
     looked: int
     """Number of training images that a visibility network learns from."""
     matched: int
-    """Maximum number of images by which two blocks are matched."""
+    """Maximum number of images used to match two blocks."""
     coarse: int
     """Shorter side of the picture with rays for visibility, pixels."""
     shares: int
@@ -124,7 +124,7 @@ def measured(results: Path) -> Measured:
     """Return the measured values in a folder of results.
 
     Args:
-        results: folder with methods-procedural.json (`ns-bench methods`) and city.json, either of which may be missing.
+        results: folder with methods-procedural.json (`ns-bench methods`) and city.json, either may be missing.
             city.json may have values by the names of `Measured`, which take precedence.
     """
     runs = _read(results / "methods-procedural.json").get("runs", [])
@@ -193,7 +193,7 @@ def rows(c: City, k: Constants, m: Measured) -> list[Row]:
 
 
 def _kept(c: City, stride: int) -> int:
-    """Return the number of pixels of an image whose rows and columns have a distance of `stride` pixels."""
+    """Return the number of pixels of an image with rows and columns `stride` pixels apart."""
     return math.prod(len(range(stride // 2, side, stride)) for side in (c.width, c.height))
 
 

@@ -181,7 +181,7 @@ def mean_place(tau: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Matter whose density is an isotropic Gaussian."""
+    """Matter with an isotropic Gaussian as density."""
 
     center: Triple
     """Position of the peak."""
@@ -213,7 +213,7 @@ class Gaussian:
 
 
 class Blobs(ClosedForm):
-    """Overlapping Gaussians whose densities add up; each emits its own colour.
+    """Overlapping Gaussians with densities that add up; each emits its own colour.
 
     Args:
         gaussians: the Gaussians.

@@ -44,7 +44,7 @@ STEPS_BEFORE_RENDERING = 300
 
 @dataclass(frozen=True)
 class Row:
-    """A condition under which speed is measured."""
+    """A condition of a measurement of speed."""
 
     name: str
     """Name of the condition."""

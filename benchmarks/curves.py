@@ -1,7 +1,7 @@
 """PSNR against training seconds of several methods: a run from scratch for every budget and seed.
 
 Schedules and sizes depend on the budget, so the curve of one long run would underestimate what a method reaches in a
-shorter time. Runs are those of a comparison (`nerfloom.comparison`), in a folder for each budget. Existing runs
+shorter time. The runs are a comparison's (`nerfloom.comparison`), in a folder for each budget. Existing runs
 are kept, so a stopped benchmark can continue, and methods, budgets and seeds can be added.
 """
 

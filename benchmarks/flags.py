@@ -29,8 +29,8 @@ class QuadratureFlags:
 class CurvesFlags:
     """Train methods from the start for each of several budgets, with several seeds; report PSNR against seconds.
 
-    Results and picture are written after each budget. What is in --run-dir is kept: the same command goes on where it
-    was stopped, and one with further methods, budgets or seeds trains these alone."""
+    Results and picture are written after each budget. The content of --run-dir is kept: the same command goes on where
+    it was stopped, and one with further methods, budgets or seeds trains these alone."""
 
     data: Path | None = None
     """Folder of the data set; the embedded scene if not given."""
@@ -42,7 +42,7 @@ class CurvesFlags:
     seeds: int = 3
     """Number of runs of each method with each budget."""
     views: int = 50
-    """Maximum number of held-out views on which PSNR is measured, evenly spaced."""
+    """Maximum number of held-out views for PSNR, evenly spaced."""
     run_dir: Path | None = None
     """Folder of the runs; outputs/curves-DATA if not given."""
     output_dir: Path = RESULTS
@@ -84,7 +84,7 @@ class OperationsFlags:
     methods: tuple[str, ...] = ()
     """Names of methods; all built-in ones if not given."""
     before: int = 16
-    """Training steps before those that are counted."""
+    """Training steps before the counted ones."""
     steps: int = 8
     """Training steps that are counted."""
     output: Path = RESULTS / "operations.json"

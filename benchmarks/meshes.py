@@ -44,7 +44,7 @@ EYES = 20
 
 @runtime_checkable
 class KnowsItsSurface(Protocol):
-    """A data format whose scene has an exact surface."""
+    """A data format for a scene with an exact surface."""
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Return the distance (N,) from `points` (N, 3) of the input to the nearest surface, negative inside."""

@@ -74,7 +74,7 @@ FACTORIES = {
     torch.arange, torch.as_tensor, torch.empty, torch.eye, torch.full, torch.from_numpy, torch.linspace, torch.ones,
     torch.rand, torch.randint, torch.randn, torch.randperm, torch.tensor, torch.zeros,
 }  # fmt: skip
-"""Functions whose result is on the host unless a device is named."""
+"""Functions with a result on the host unless a device is named."""
 FROM_VALUES = {torch.tensor, torch.as_tensor, Tensor.new_tensor}
 """Functions that copy values from Python to a device."""
 TO_HOST = {Tensor.cpu, Tensor.numpy, Tensor.tolist}
@@ -83,7 +83,7 @@ CPU_ONLY = "framework/kernels/argument_checks.py"
 """File of checks that other devices leave out."""
 PACKAGES = Path(__file__).parents[1]
 OURS = tuple(str(PACKAGES / name) for name in ("framework", "methods"))
-"""Folders of the code whose places are named."""
+"""Folders of code with named places."""
 MAX_REPORTED = 5
 """Number of places with the most waits to report."""
 

@@ -31,7 +31,7 @@ class PoseErrors:
 
 
 def pose_errors(estimated: Tensor, given: Tensor) -> PoseErrors:
-    """Compare camera-to-world poses whose frames differ by an unknown similarity transform.
+    """Compare camera-to-world poses in frames that differ by an unknown similarity transform.
 
     Args:
         estimated: (M, 3 or 4, 4).

@@ -32,8 +32,8 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
     """Return all columns.
 
     Args:
-        sizes: sizes of images whose PSNR is shown, such as 1/2.
-        images: heading of a column -> name of the held-out image whose PSNR it shows.
+        sizes: sizes of images with PSNR shown, such as 1/2.
+        images: heading of a column -> name of the held-out image with the PSNR to show.
     """
 
     def of_run(name: str) -> Callable[[Result], float | None]:
@@ -130,7 +130,7 @@ def estimate(row: Row, done: Sequence[tuple[Row, Result]]) -> float:
     """Return the estimated seconds of a row: loading, training and evaluation, as in finished rows.
 
     Args:
-        done: finished rows. Those with the same method and data are used, otherwise any with the same data.
+        done: finished rows. Results with the same method and data are used, otherwise any with the same data.
     """
     near = [(other, found) for other, found in done if other.data == row.data]
     same = [(other, found) for other, found in near if other.method == row.method] or near

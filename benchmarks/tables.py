@@ -84,7 +84,7 @@ class Table:
     Args:
         name: name of the table: its file's, without `.yml`.
         rows: the rows, seed by seed.
-        images: heading of a column -> name of the held-out image whose PSNR to show.
+        images: heading of a column -> name of the held-out image with the PSNR to show.
     """
 
     name: str
@@ -201,7 +201,7 @@ def run_rows(rows: Sequence[Row], root: Path, file: Path, launcher: Launcher) ->
         rows: the rows.
         root: folder of the folders of all data, which is left out of the results.
         file: the table's results.
-        launcher: what runs them.
+        launcher: runs them.
 
     Returns:
         Name of each failed row -> reason.

@@ -30,7 +30,7 @@ class Times:
     """Seconds of a viewer's pictures of one run."""
 
     run: str
-    """Name of the run's folder of experiments, which is that of its data if nothing else was given."""
+    """Name of the run's folder of experiments; by default the data's name."""
     method: str
     """Name of the method."""
     width: int
@@ -54,7 +54,8 @@ class Times:
 
 
 def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
-    """Measure the pictures of a trained run for one browser whose camera turns, then rests until it is finished.
+    """Measure the pictures of a trained run for one browser with a camera that turns, then rests until the picture is
+    finished.
 
     Args:
         run: the run's folder.

@@ -1,8 +1,8 @@
 """Renders: transforms_{train,val,test}.json as written by Blender scripts, for NeRF-Synthetic and any other scene.
 
 NeRF-Synthetic (Mildenhall et al. 2020) states an angle of view, and its cameras look at the origin from 4.03 units
-away; box, near and far are those of its paper. Any other scene is placed in the same box, whatever its units and
-position (`nerfloom.dataparsers.region`). Normals beside images, as in Shiny Blender (Verbin et al. 2022), are true ones
+away; box, near and far come from its paper. Any other scene is placed in the same box, for all units and positions
+(`nerfloom.dataparsers.region`). Normals beside images, as in Shiny Blender (Verbin et al. 2022), are true ones
 to judge a method's by.
 """
 
@@ -47,7 +47,7 @@ class Blender(DataParser):
     """Factor for camera positions, and so for the scene."""
     half_size: float | None = None
     """Half the side of the cube around the origin that holds the scene, in the input's units. Default: 1.5 for
-    NeRF-Synthetic; for other data, a cube from silhouettes or from what the cameras look at."""
+    NeRF-Synthetic; for other data, a cube from silhouettes or around the point that the cameras look at."""
     near: float | None = None
     """Distance from a camera where the scene starts, in the input's units. Default: 2 for NeRF-Synthetic, otherwise
     from cameras and cube."""
@@ -136,7 +136,7 @@ def _training(path: Path, others: Renders) -> Renders:
 
 
 def _is_nerf_synthetic(renders: Renders) -> bool:
-    """Return whether the cameras are those of NeRF-Synthetic, looking at the origin."""
+    """Return whether the cameras are as in NeRF-Synthetic, looking at the origin."""
     images = renders.images
     origins, ahead = images.poses[:, :3, 3], -images.poses[:, :3, 2]
     depths = -(origins * ahead).sum(-1)  # of the origin

@@ -12,7 +12,7 @@ ROUNDING = 1e-10
 
 
 def camera_spread(poses: Tensor, points: Tensor | None) -> float | None:
-    """Return the distance between cameras, as a fraction of the distance of what they see.
+    """Return the distance between cameras, as a fraction of the distance of the scene.
 
     Args:
         poses: (M, 3 or 4, 4) camera-to-world.
@@ -36,7 +36,7 @@ def camera_spread(poses: Tensor, points: Tensor | None) -> float | None:
 
 def warning(spread: float) -> str:
     """Return a warning about cameras with too little `spread`."""
-    where = "in one position" if spread == 0 else f"within {spread:.2%} of the distance of what they see"
+    where = "in one position" if spread == 0 else f"within {spread:.2%} of the distance of the scene"
     return (
         f"warning: all cameras stand {where}, as if one had turned on the spot: distances are unknown, and "
         "views from elsewhere will be wrong; take photographs from different positions"

@@ -27,8 +27,8 @@ from nerfloom.geometry.lenses import LENSES
 MAX_SIDE = 1600
 """Images with a longer side above this, pixels, are reduced by default."""
 MAX_MAGNITUDE = 1e9
-"""Maximum of focal lengths, principal points (pixels) and boxes (scene units), beyond which float32 may overflow; focal
-lengths must also exceed its inverse."""
+"""Maximum of focal lengths, principal points (pixels) and boxes (scene units), because float32 may overflow beyond it;
+focal lengths must also exceed its inverse."""
 ASPECT_TOLERANCE = 0.03
 """Relative difference between the aspect ratios of an image and its camera that rounded sizes can explain."""
 
@@ -44,7 +44,7 @@ def captured_scene(
     division: Division | None = None,
     applied: Applied | None = None,
 ) -> ParsedScene:
-    """Return the images of one split, placed together with those of the others.
+    """Return the images of one split, placed together with the images of the others.
 
     Missing image files are reported once and left out before any decision.
 
@@ -231,7 +231,7 @@ def _box(flags: Captured, region: StatedRegion | None, placement: Placement) -> 
 
 
 def _object_distances(flags: Captured, cameras: Cameras, box: Tensor) -> tuple[float, float]:
-    """Return near and far for an object in `box`, within those of the flags."""
+    """Return near and far for an object in `box`, within the near and far flags."""
     near, far = distances(cameras, box.double())
     near, far = max(near, flags.near or 0.0), min(far, flags.far)
     if near >= far:

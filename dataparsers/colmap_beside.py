@@ -31,8 +31,8 @@ def tracks_beside(
 ) -> Tracks | None:
     """Return the tracks of the model beside a transforms.json, in the file's frame and for its images.
 
-    A model that cannot be read, or whose poses differ from the file's, is not used, and this is reported. Images whose
-    own pose differs are left out.
+    A model that cannot be read, or has other poses than the file, is not used, and this is reported. Images with
+    another pose are left out.
 
     Args:
         folder: the data folder.

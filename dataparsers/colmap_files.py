@@ -1,4 +1,4 @@
-"""Validation of COLMAP's binary files: whether they hold as many records as they state.
+"""Validation of COLMAP's binary files: whether they hold the number of records that they state.
 
 pycolmap trusts the count at the beginning of a file. From a truncated file it creates cameras from uninitialised
 memory, or reads without end. So each file is traversed once, record by record, before it is read.
@@ -39,7 +39,7 @@ def check_binary(folder: Path) -> None:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the names of the images in the model in `folder`, as far as they can be read. Never raises."""
+    """Return the readable names of the images in the model in `folder`. Never raises."""
     names: list[str] = []
     try:
         if not (folder / "images.bin").is_file():

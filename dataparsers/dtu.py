@@ -42,7 +42,7 @@ ENTRY = re.compile(r"(world_mat|scale_mat|camera_mat)_(\d{1,9})")
 LARGEST_ENTRY = 4096
 """Maximum size of such an array's entry in the file, bytes; a 4x4 matrix takes 256."""
 SIMILAR = 1e-3
-"""Maximum relative deviation of a scale_mat from a similarity transform, and between those of two views."""
+"""Maximum relative deviation of a scale_mat from a similarity transform, and between the scale_mats of two views."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def read_intrinsics(
 ) -> Intrinsics:
     """Return the intrinsics stated in a transforms file.
 
-    A frame's own values take precedence over those of all frames, and a focal length over an angle of view. The
+    A frame's own values take precedence over values for all frames, and a focal length over an angle of view. The
     principal point defaults to the image's centre. The focal length along one axis defaults to that along the other.
 
     Args:
@@ -163,7 +163,7 @@ def _focal_of_angle(source: dict[str, Any], axis: str, length: int, label: str) 
 def _contradiction(frame: dict[str, Any], label: str, content: dict[str, Any], size: list[int]) -> str | None:
     """Return a message if a focal length and the angle of view beside it differ; None otherwise.
 
-    Only the horizontal angle is compared: Blender's `angle_y` is that of its sensor, whatever the image's height.
+    Only the horizontal angle is compared: Blender's `angle_y` belongs to its sensor, not to the image's height.
     """
     for source in (frame, content):
         if source.get("fl_x") is None or source.get("camera_angle_x") is None:

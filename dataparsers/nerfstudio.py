@@ -48,7 +48,7 @@ class Nerfstudio(Captured):
 
     eval_mode: EvalMode = "interval"
     """Rule for held-out images. interval: every --eval-interval-th. fraction: all but --train-split-fraction. filename:
-    those with eval, val or test in their name. all: none, every split has all images. The file's own train_filenames,
+    images with eval, val or test in their name. all: none, every split has all images. The file's own train_filenames,
     val_filenames and test_filenames take precedence over all rules but the last."""
     train_split_fraction: float = 0.9
     """Fraction of images to train on, evenly spaced, with --eval-mode fraction."""

@@ -17,8 +17,8 @@ from nerfloom.dataparsers.posed_images import Captured, PosedImages
 from nerfloom.geometry.local_origin import local_origin, rounding
 
 Applied = tuple[Tensor, float]
-"""Rigid transform (4, 4) from the original frame to that of a format's poses, and units of the latter per unit of the
-original: x becomes `scale * (transform @ x)`."""
+"""Rigid transform (4, 4) from the original frame to the frame of a format's poses, and units of the latter per unit of
+the original: x becomes `scale * (transform @ x)`."""
 
 
 def placement_of(flags: Captured, images: PosedImages, split: Split, applied: Applied | None) -> Placement:

@@ -32,8 +32,9 @@ class Captured(DataParser):
     """Origin: the cameras' mean position (poses), the point that they look at (focus), or unchanged. No effect on data
     that states a region of interest (dtu, sdfstudio), which becomes the cube."""
     auto_scale_poses: bool = True
-    """Scale camera positions to fit the cube from -1 to 1. If long lenses show less than half a scene unit of what most
-    cameras look at, it is enlarged until they show one. No effect on data that states a region of interest."""
+    """Scale camera positions to fit the cube from -1 to 1. If long lenses show less than half a scene unit around the
+    point that most cameras look at, it is enlarged until they show one. No effect on data that states a region of
+    interest."""
     placement: Path | None = None
     """dataparser_transforms.json of a run, ours or nerfstudio's. Its placement is used instead of all of these."""
     eval_interval: int = 8
@@ -76,7 +77,7 @@ class PosedImages:
     """(M, 4) fx, fy, cx, cy in pixels of an image of `sizes`; for orthographic cameras, pixels per unit of the
     input."""
     sizes: Tensor
-    """(M, 2) int64 width and height that the intrinsics refer to, which may differ from those of the image files."""
+    """(M, 2) int64 width and height that the intrinsics refer to, which may differ from the size of the image files."""
     model: str = "pinhole"
     """Projection, a key of `LENSES`."""
     lens: Tensor | None = None
@@ -88,7 +89,7 @@ class PosedImages:
     times: Tensor | None = None
     """(M,) time of each image in [0, 1]; None for a static scene."""
     points: Tensor | None = None
-    """(K, 3) sparse points in the input's frame; None for those of `tracks`."""
+    """(K, 3) sparse points in the input's frame; None for the points of `tracks`."""
     tracks: Tracks | None = None
     """Which images see which sparse points, in the input's frame; None if that is not known."""
     region: StatedRegion | None = None

@@ -12,7 +12,7 @@ from nerfloom import DataError
 from nerfloom.base.console import say
 
 SINGULAR = 1e-10
-"""A matrix whose determinant is smaller, relative to the product of its rows' lengths, has no inverse."""
+"""Minimum determinant of a matrix with an inverse, relative to the product of its rows' lengths."""
 FACTORS = (1, 1 / 2, 2, 1 / 3, 3, 1 / 4, 4, 1 / 6, 6, 1 / 8, 8)
 """Sizes that are tried, relative to the images'."""
 OFF_CENTRE = 1.1

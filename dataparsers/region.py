@@ -18,11 +18,11 @@ from nerfloom.data.image_files import may_be_transparent, read_image
 from nerfloom.scene.enclosing_box import enclosing_box, is_larger
 
 HALF_SIZE = 1.5
-"""Half the side of a scene's box, scene units: that of NeRF-Synthetic, which methods' settings were tuned on."""
+"""Half the side of a scene's box, scene units: NeRF-Synthetic's, which methods' settings were tuned on."""
 SHOWN = 1.034
 """Half the side of NeRF-Synthetic's box, relative to half the width of the plane through the origin in its images."""
 MAX_IMAGES = 32
-"""Maximum number of images whose silhouettes are used."""
+"""Maximum number of images for silhouettes."""
 SLACK = 0.8
 """Rays start at this fraction of the smallest distance between a camera and the matter. They end at the largest such
 distance divided by it. Cameras of other splits may be nearer or farther."""

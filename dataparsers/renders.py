@@ -26,7 +26,7 @@ OF_LENSES = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "came
 
 @dataclass(frozen=True)
 class Renders:
-    """The images of one split whose files exist."""
+    """The images of one split that have a file."""
 
     images: PosedImages
     """M images."""
@@ -82,7 +82,7 @@ def _existing(paths: Sequence[Path]) -> Tensor:
 def _without_sensor(source: dict[str, Any]) -> dict[str, Any]:
     """Return entries without the vertical angle if the horizontal one is there.
 
-    Blender's `angle_y` is that of its sensor, 36 by 24 mm, whatever the height of the image.
+    Blender's `angle_y` belongs to its sensor, 36 by 24 mm, not to the height of the image.
     """
     if source.get("camera_angle_x") is None:
         return source

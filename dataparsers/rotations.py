@@ -14,7 +14,7 @@ from nerfloom import DataError
 from nerfloom.kernels.math import cross_matrix
 
 MAX_ROUNDING = 0.02
-"""Maximum deviation of R R^T from the identity, and of a quaternion's length from 1, that counts as rounding: that of
+"""Maximum deviation of R R^T from the identity, and of a quaternion's length from 1, that counts as rounding, as of
 numbers with two decimals."""
 EXACT_TOLERANCE = 1e-12
 """A matrix with a smaller deviation is left unchanged."""

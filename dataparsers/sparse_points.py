@@ -78,7 +78,7 @@ def _others(known: Tensor, count: int) -> Tensor:
 
 
 def _on_distances(tracks: Tracks, centers: Tensor, chosen: Tensor) -> str:
-    """Return a report on the `chosen` points (K,): how many have known distances, and what the others lack."""
+    """Return a report on the `chosen` points (K,): how many have known distances, and why others have none."""
     distant = torch.zeros(len(tracks.points), dtype=torch.bool)
     distant[tracks.seen[tracks.known_distances(centers)]] = True
     doubts = tracks.doubts[chosen & ~distant]

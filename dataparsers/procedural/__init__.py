@@ -58,9 +58,9 @@ class Procedural(DataParser):
     changing_sun: bool = False
     """Whether the position of the sun differs between training images of the courtyard or the street."""
     views_per_scene: int = 12
-    """Images of each random scene. Of a held-out scene, every fourth is evaluated and the others are sources."""
+    """Images of each random scene. In a held-out scene, every fourth is evaluated and the others are sources."""
     placement: Path | None = None
-    """dataparser_transforms.json of a run whose placement the street takes. The other scenes are not moved."""
+    """dataparser_transforms.json of a run; the street takes its placement. The other scenes are not moved."""
 
     @classmethod
     def recognizes(cls, path: Path) -> bool:

@@ -37,7 +37,7 @@ def masonry(light: Colour, dark: Colour, joint: Colour, size: tuple[float, float
     """Return cells (3, R) of width and height `size` in rows that are shifted by half a cell, with joints between.
 
     Args:
-        light, dark: colours between which cells vary.
+        light, dark: extreme colours of cells.
         joint: colour of the joints.
         size: width and height of a cell.
         u, v: (R,) coordinates along and across the rows.

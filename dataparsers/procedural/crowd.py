@@ -102,7 +102,7 @@ def crowds(poses: Sequence[npt.NDArray[np.float64]], share: float, seed: int) ->
 def _fill(
     pose: npt.NDArray[np.float64], figures: Sequence[Part], wanted: float, random: np.random.Generator
 ) -> tuple[Parts, float]:
-    """Return distractors that cover about the share `wanted` of the image of a camera, and what they cover."""
+    """Return distractors that cover about the share `wanted` of the image of a camera, and the share they cover."""
     depth, _ = visible_parts(pose, PROBE, COURTYARD)
     hidden = np.zeros(PROBE[::-1], dtype=bool)
     placed: dict[str, Part] = {}

@@ -1,7 +1,7 @@
 """Light from far away in closed form, as sharp or as blurred as a surface reflects it.
 
-It is a sky that brightens upwards, and lamps: functions exp(kappa (cos - 1)) of the angle from a direction, those of
-von Mises and Fisher without their normalisation. A lamp blurred by a distribution of concentration k is very nearly
+It is a sky that brightens upwards, and lamps: functions exp(kappa (cos - 1)) of the angle from a direction, the von
+Mises-Fisher distribution without its normalisation. A lamp blurred by a distribution of concentration k is very nearly
 another lamp, of concentration kappa k / (kappa + k) and the same total light; here this is the definition.
 """
 

@@ -32,10 +32,10 @@ from nerfloom.dataparsers.procedural.views import (
 from nerfloom.kernels.native import torch_on_one_thread
 
 SHOWN, TOUCHED = 255, 128
-"""Values of the truth: for pixels whose centre shows a distractor, and for others that a distractor changes, by its
+"""Values of the truth: for pixels with a distractor at their centre, and for others that a distractor changes, by its
 edge, its shadow or the light that it blocks. All others are 0; they are the same as without distractors."""
 STOPS = 1.0
-"""Maximum exposure of an image above or below that of daylight; one stop doubles the light."""
+"""Maximum exposure of an image above or below daylight's; one stop doubles the light."""
 WARMTH = 0.4
 """Maximum gain of red over green, and of green over blue, in stops."""
 
@@ -53,12 +53,12 @@ class Changing:
 
 
 def lights(count: int, changing: Changing, seed: int) -> list[Light]:
-    """Return the light of each training image: daylight, except for what changes.
+    """Return the light of each training image: daylight, except for the changes.
 
     Args:
         count: number of images.
-        changing: what differs between them.
-        seed: seed of the data set. What changes is the same whether something else changes or not.
+        changing: the properties that differ between them.
+        seed: seed of the data set. Each property changes in the same way whether another changes or not.
     """
     found = []
     for stops, warmth, azimuth, height in np.random.default_rng([seed, 3]).uniform(-1, 1, (count, 4)):
@@ -81,14 +81,14 @@ def write_photographs(
     seed: int = 0,
     progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
-    """Write a data set in NeRF-Synthetic's format, completely or not at all; its files are those of `write_views`.
+    """Write a data set in NeRF-Synthetic's format, completely or not at all; its files are as from `write_views`.
 
     Args:
         folder: folder to create. If another process creates it meanwhile, its content is kept.
         size: width and height of the images, pixels.
         counts: number of images of the splits train, val and test.
         distractors: mean share of the training images' pixels that show a distractor, at most 0.4.
-        changing: what differs between training images.
+        changing: the properties that differ between training images.
         seed: seed of cameras, distractors and light. The same seed gives the same bytes.
         progress: wrapper of the iteration over training images, called with the iterable, a title and their number.
 

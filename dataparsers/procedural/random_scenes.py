@@ -1,6 +1,6 @@
 """Many random scenes: balls and boxes of random size, position and colour, for methods that learn from several scenes.
 
-A data set has training scenes and, in its other splits, scenes that are in no other split. Of these, every fourth view
+A data set has training scenes and, in its other splits, scenes that are in no other split. Every fourth view of these
 is evaluated; the others are source images.
 """
 

@@ -96,7 +96,7 @@ class Box(Shape):
         return face * p.sign()
 
     def interval(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parameters at which lines enter and leave; they miss where the first is not less.
+        """Return the parameters where lines enter and leave; they miss where the first is not less.
 
         Args:
             offset, direction: the lines.
@@ -144,7 +144,7 @@ class BoredBox(Shape):
         return torch.where(on_wall, inwards, self._box.normal(p))
 
     def _hole(self, offset: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the parameters at which lines enter and leave the hole, an endless cylinder; equal where they miss."""
+        """Return the parameters where lines enter and leave the hole, an endless cylinder; equal where they miss."""
         a = (direction[0] ** 2 + direction[1] ** 2).clamp(min=1e-20)  # for vertical lines, a very long interval
         b = offset[0] * direction[0] + offset[1] * direction[1]
         c = offset[0] ** 2 + offset[1] ** 2 - self.radius**2

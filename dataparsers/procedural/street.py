@@ -216,7 +216,7 @@ def write_street(
         size: width and height of the images, pixels.
         counts: number of images of the splits train, val and test.
         cars: maximum number of cars near the camera of each training image.
-        changing: what differs between training images.
+        changing: the properties that differ between training images.
         seed: seed of houses, cameras, cars and light. The same seed gives the same bytes.
         progress: wrapper of the iteration over images, called with the iterable, a title and their number.
 

@@ -64,7 +64,7 @@ def of_bored_box(shape: BoredBox, deviation: float) -> Triangles:
     """Return the surface of the cuboid `shape` with a round hole along z; `deviation` as in `of_sphere`."""
     x, y, z = shape.half
     corner = math.atan2(y, x)
-    # The faces around the hole are divided at directions that include those of the four corners.
+    # The faces around the hole are divided at directions that include the four corners.
     ends = [-corner, corner, math.pi - corner, math.pi + corner]
     count = _divisions(shape.radius, deviation)
     angle = torch.cat([_between(a, b, count) for a, b in zip(ends, [*ends[1:], ends[0] + 2 * math.pi], strict=True)])
@@ -89,7 +89,7 @@ def _angles(count: int) -> Tensor:
 
 
 def _between(start: float, end: float, count: int) -> Tensor:
-    """Return the angles from `start` to before `end`, as far apart as `count` over a circle."""
+    """Return the angles from `start` to before `end`, with the spacing of `count` over a circle."""
     steps = math.ceil(count * (end - start) / (2 * math.pi))
     return start + (end - start) * torch.arange(steps, dtype=torch.float64) / steps
 

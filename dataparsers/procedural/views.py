@@ -184,7 +184,7 @@ def write_dataset(
     seed: int = 0,
     progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
-    """Write a data set of the embedded scene, completely or not at all; its files are those of `write_views`.
+    """Write a data set of the embedded scene, completely or not at all; its files are as from `write_views`.
 
     Args:
         folder: folder to create. If another process creates it meanwhile, its content is kept.

@@ -1,6 +1,6 @@
 """Adds evaluations to a file of results: `python docs/building/add_rows.py docs/results/captures.json FILE.json ...`.
 
-A file is what `ns-eval` writes, and is called what its row shall be: `statue-zip-nerf-600s-half.json`. A row of that
+A file comes from `ns-eval`, and its name is the name of its row: `statue-zip-nerf-600s-half.json`. A row of that
 name is replaced. `python -m benchmarks tables` adds the rows of its tables by itself.
 """
 

@@ -36,7 +36,7 @@ class Page(HTMLParser):
 
 
 def check(site: Path) -> tuple[int, list[str]]:
-    """Return how many links there are, and what is wrong, a line each.
+    """Return the number of links, and the faults, a line each.
 
     Args:
         site: folder of the built site.

@@ -1,11 +1,11 @@
-"""Pictures of captures that go wrong, for the guide: the embedded scene with one fault each, and with what helps.
+"""Pictures of captures that go wrong, for the guide: the embedded scene with one fault each, and with the remedy.
 
     python docs/building/failures.py                      all of them, into docs/pictures/failures
     python docs/building/failures.py blur poses           some of them
     python docs/building/failures.py --steps 2000
 
-Each picture shows a photograph of the faulty capture, a held-out view of what `nerfacto` makes of it, the same view
-with what helps, and the truth. PSNRs of the held-out views are printed and written beside the pictures. The scene is
+Each picture shows a photograph of the faulty capture, a held-out view of nerfacto's result, the same view with the
+remedy, and the truth. PSNRs of the held-out views are printed and written beside the pictures. The scene is
 ours, so that the pictures may be shipped. Behind the solids is a pattern at infinity; a plain wall would be a fault of
 its own.
 """
@@ -56,7 +56,7 @@ class Capture:
     settings: dict[str, Any] = field(default_factory=dict)
     """Settings of the run that learns from it."""
     lens: dict[str, Any] = field(default_factory=dict)
-    """What transforms.json says of the lens of its photographs; nothing of a pinhole."""
+    """Lens of the photographs in transforms.json; empty for a pinhole."""
 
     def write(self, folder: Path, truth: Capture) -> None:
         """Write nerfstudio's transforms.json, with the images of `truth` held out."""
@@ -221,7 +221,7 @@ def repeats() -> tuple[Capture, Capture]:
 
 
 def pinhole_of(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a pinhole would show what a lens with the coefficient K1 shows at x, y, at a distance of 1."""
+    """Return a point's position in a pinhole's image, from its position x, y in a lens with K1, at a distance of 1."""
     wide_x, wide_y = x, y
     for _ in range(50):  # each step leaves less than half of the error
         scale = 1 + K1 * (wide_x**2 + wide_y**2)
@@ -247,7 +247,7 @@ KINDS: dict[str, Callable[[], tuple[Capture, Capture]]] = {
     "cutout": cutout, "repeats": repeats, "lens": lens,
 }  # fmt: skip
 ON_WHITE = ("texture", "cutout")
-"""Kinds whose held-out views have plain white behind the scene."""
+"""Kinds with held-out views that have plain white behind the scene."""
 
 
 def learn(capture: Capture, truth: Capture, steps: int, folder: Path) -> tuple[np.ndarray, float]:
@@ -273,7 +273,7 @@ def tile(image: np.ndarray) -> Image.Image:
 
 
 def draw(kind: str, steps: int, folder: Path) -> dict[str, float]:
-    """Train on the faulty capture and with what helps, and write the picture; the PSNRs of both."""
+    """Train on the faulty capture and with the remedy, write the picture, and return the PSNRs of both."""
     faulty, helped = KINDS[kind]()
     plain, nearer = kind in ON_WHITE, 0.65 if kind == "texture" else 1.0
     where = placed("test", NUM_TEST, nearer)

@@ -60,7 +60,7 @@ def nested_rows(member: str, value: Any) -> list[str]:
 
 
 def row(member: str, shown: str, allowed: str, text: str) -> str:
-    """Return a row of a table; what Markdown or the table could misread is escaped."""
+    """Return a row of a table; text that Markdown or the table could misread is escaped."""
     escaped = " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
     return f"| `--{member.replace('_', '-')}` | {shown} | {allowed} | {escaped} |"
 
@@ -77,7 +77,7 @@ def default_of(value: Any, hint: Any) -> str:
 
 
 def allowed_of(hint: Any, span: tuple[float, float] | None) -> str:
-    """Return what a setting may be: its words, or its range."""
+    """Return the allowed values of a setting: its words, or its range."""
     if span is not None:
         least, most = (_number(end) for end in span)
         return f"at least {least}" if math.isinf(span[1]) else f"{least} to {most}"

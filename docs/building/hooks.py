@@ -14,7 +14,7 @@ from lines import keep_together
 from mkdocs.structure.files import File, Files
 
 EQUATION = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
-"""What pymdownx.arithmatex leaves of an equation."""
+"""Markup that pymdownx.arithmatex makes of an equation."""
 
 
 def on_config(config: Any) -> Any:
@@ -34,7 +34,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Give a page to every notebook, and to every method: its own text, if any, with what is known from its code."""
+    """Give a page to every notebook, and to every method: its own text, if any, with the facts of its code."""
     for name in method_pages.methods():
         path = f"methods/{name}.md"
         written = Path(config.docs_dir, path)
@@ -48,7 +48,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Write equations as MathML, and keep together what is read as one."""
+    """Write equations as MathML, and keep words together that are read as one."""
     return keep_together(EQUATION.sub(lambda found: _mathml(html.unescape(found[2]), found[1] == "div"), content))
 
 

@@ -20,7 +20,7 @@ LONGEST = 18
 def keep_together(content: str) -> str:
     """Return a page's HTML with short words of code, and numbers with their units, kept on one line.
 
-    What is shown is the same: words are wrapped into elements of the class `whole`, and spaces become unbreakable.
+    The text is the same: words are wrapped into elements of the class `whole`, and spaces become unbreakable.
 
     Args:
         content: HTML of a page; preformatted text in it is left as it is.

@@ -1,4 +1,4 @@
-"""The generated part of each method's page: paper, parts, what is left to the data, and every flag."""
+"""The generated part of each method's page: paper, parts, settings left to the data, and every flag."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nerfloom.method import Method
 from nerfloom.registry import Entry, load_method, registered
 
 PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
-"""What `method_pictures.py` has made."""
+"""Results of `method_pictures.py`."""
 
 
 def methods() -> dict[str, Entry]:
@@ -54,7 +54,7 @@ def page(name: str, text: str | None) -> str:
 
 
 def picture(name: str) -> str:
-    """Return the section with the method's picture, and what the run that made it reached; '' if there is none."""
+    """Return the section with the method's picture, and the results of its run; '' if there is none."""
     file = PICTURES / "psnr.json"
     made = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     if name not in made:

@@ -1,11 +1,11 @@
-"""Pictures of what each method makes of the scene that comes with Nerfloom, for its page.
+"""Pictures of each method's result on the scene that comes with Nerfloom, for its page.
 
     python docs/building/method_pictures.py                    all of them, into docs/pictures/methods
     python docs/building/method_pictures.py zip-nerf kplanes   some of them
     python docs/building/method_pictures.py --seconds 120
 
 Each picture is the first comparison that a run of the command below writes: a photograph that training never saw, the
-render, the error, depth and opacity. What the run reached is written beside the pictures, into psnr.json.
+render, the error, depth and opacity. The PSNRs of the run are written beside the pictures, into psnr.json.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ COMMANDS = {
     "vanilla-nerf": "vanilla-nerf --sampler occupancy {}",
     "zip-nerf": "zip-nerf {}",
 }
-"""Method -> what ns-train is given, as one would on a CPU; the budget stands at {}."""
+"""Method -> flags of ns-train, as on a CPU; the budget stands at {}."""
 
 
 def train(words: list[str], folder: Path) -> None:
@@ -66,7 +66,7 @@ def train(words: list[str], folder: Path) -> None:
 
 
 def draw(name: str, seconds: float, target: Path) -> dict[str, Any]:
-    """Train a method and write its picture; return what the run reached."""
+    """Train a method and write its picture; return its PSNRs."""
     words = shlex.split(COMMANDS[name].format(f"--max-seconds {seconds:g}"))
     with tempfile.TemporaryDirectory() as temporary:
         train(words, Path(temporary))

@@ -1,7 +1,8 @@
 """Fills in the tables of the pages from docs/results: `python -m docs.building.tables`.
 
 - A table with a last column headed `result` names a row of a file of results in each line. Cells under headings of
-  `python -m benchmarks tables` become what that row says, with the mean and the spread over its seeds; all others stay.
+  `python -m benchmarks tables` get the values of that row, with the mean and the spread over its seeds; all others
+  stay.
 - A table behind `<!-- results: NAME: HEADING, HEADING -->` shows these headings in every cell, of the result called
   NAME. ROW is the first word in backticks of the line and COLUMN the heading of the column. With `best` behind
   a second colon the highest PSNR of a line is bold.
@@ -87,7 +88,7 @@ def _of_result(runs: Sequence[Any], headings: Sequence[str], cells: Sequence[str
 
 
 def _of_columns(first: str, headings: Sequence[str], mark: re.Match[str], rows: Rows) -> list[str]:
-    """Return the cells of a line of results; those that are not there are empty."""
+    """Return the cells of a line of results; missing ones are empty."""
     names = [mark["name"].replace("ROW", first).replace("COLUMN", _slug(heading)) for heading in headings]
     found = [seeds(name, rows) if name in rows else [] for name in names]
     if not any(found):
@@ -107,7 +108,7 @@ def _slug(heading: str) -> str:
 
 
 def seeds(name: str, rows: Rows) -> list[Any]:
-    """Return a result and those of its further seeds.
+    """Return a result and the results of its further seeds.
 
     Args:
         name: name of the result.

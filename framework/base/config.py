@@ -102,7 +102,7 @@ class TrainConfig:
     eval: Literal["in-time", "all"] = "in-time"
     """Evaluated images. in-time: evenly spaced images that take at most half of the training time; all: all."""
     lpips_weights: Path | None = None
-    """File of LPIPS weights with AlexNet (.npz), for evaluations. Default: those of the lpips package."""
+    """File of LPIPS weights with AlexNet (.npz), for evaluations. Default: the weights of the lpips package."""
     vis: Literal["tensorboard", "viewer", "viewer+tensorboard", "none"] = "tensorboard"
     """Where to show training curves and rendered images: TensorBoard files, a browser, or both."""
     viewer_share: float = 0.1

@@ -64,8 +64,8 @@ class Ceilings:
     def seconds(self, work: Work) -> float:
         """Return the seconds of the slowest part of `work` at its maximum rate.
 
-        For gathers, the rate is that of random reads from the smallest measured table that is large enough. Neighbours
-        in space share many entries, so a kernel can be faster.
+        For gathers, the rate is measured by random reads from the smallest measured table that is large enough.
+        Neighbours in space share many entries, so a kernel can be faster.
         """
         size = next((size for size in TABLES if size * 2**20 >= work.table_bytes), TABLES[-1])
         products = self.bfloat16 if work.bfloat16 else self.float32

@@ -23,7 +23,7 @@ class Errors:
     value: float
     """Maximum error over the maximum value."""
     gradient: float | None
-    """Root mean square error divided by that of the gradient, for the worst input; None without gradients."""
+    """Root mean square error relative to the gradient's, for the worst input; None without gradients."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def of_function(
     work: Work,
     backward: bool = True,
 ) -> Kernel:
-    """Return the kernel `name`, a function of tensors whose first argument has a row per sample.
+    """Return the kernel `name`, a function of tensors with a row per sample in its first argument.
 
     Args:
         inputs: arguments of both functions.

@@ -46,11 +46,11 @@ COPIED, EDGE = 2**28, 8192
 METHODS = ("instant-ngp", "gaussian-splatting")
 """Methods to train."""
 MOMENTS = (2, 5, 15, 60)
-"""Seconds of training after which the PSNR is reported."""
+"""Seconds of training until the PSNR is reported."""
 BINS = 64
 """Intervals per ray."""
 SCENES = {"nerfacto": ball_under_a_sky, "instant-ngp": ball_in_a_box}
-"""Methods whose steps are timed as CUDA graphs, and the scene of each."""
+"""Methods with steps timed as CUDA graphs, and the scene of each."""
 SIZE = 200
 """Width of the images of these scenes, pixels."""
 
@@ -73,7 +73,7 @@ def in_time(
     keep: Callable[[dict[str, Any]], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Measure parts in order, and skip those that would take too long.
+    """Measure parts in order, and skip parts that would take too long.
 
     Args:
         parts: the parts, most important first.
@@ -99,7 +99,7 @@ def measured_kernels(device: torch.device, samples: int, repeats: int, seconds: 
     Args:
         samples: number of samples in a batch.
         repeats: number of runs for medians.
-        seconds: time after which no further kernel is timed.
+        seconds: time until the start of the last kernel.
 
     Returns:
         The machine, its limits, the names of kernels that were not timed, and a row for each kernel, as plain data.

@@ -2,7 +2,7 @@
 
 An extreme input has values that are rare in a run but must be survived: unbounded densities and lengths, exhausted
 light, positions on faces, outside and infinitely far, rays that miss, Gaussians behind the camera or without size. A
-case is a function of named tensors, whose type and device determine the implementation.
+case is a function of named tensors; their type and device determine the implementation.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ STEPS, CELLS = 40, 8
 STEP = float((BOX[1] - BOX[0]).norm()) / STEPS
 WIDTH, HEIGHT = 37, 30
 BOUNDS = slice(Record.CUT, Record.RED)
-"""Columns of records whose gradients are sums of absolute ones."""
+"""Columns of records with sums of absolute gradients as gradients."""
 WIDTHS, REACHES = [Record.U_X, Record.V_Y], [Record.REACH_X, Record.REACH_Y]
 
 
@@ -67,7 +67,7 @@ class Case:
     inputs: Inputs
     """The inputs, float32 on the CPU."""
     followed: str = ""
-    """Names of the inputs whose gradients are compared."""
+    """Names of the inputs with compared gradients."""
 
 
 def cases() -> Iterator[Case]:

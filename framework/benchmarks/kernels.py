@@ -137,7 +137,7 @@ def measured(kernel: Kernel, ceilings: Ceilings, repeats: int, all_threads: int)
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """Return a table of `rows`, as wide as a terminal."""
+    """Return a table of `rows`, with the width of a terminal."""
     grid = Table(title=f"ns a {UNITS}", title_justify="left", box=SIMPLE, padding=(0, 1, 0, 0))
     for heading in ("kernel", "forward", "backward", "torch", "speed-up", "error"):
         grid.add_column(heading, justify="left" if heading == "kernel" else "right", no_wrap=heading != "kernel")
@@ -236,7 +236,7 @@ def _hash_grid(positions: Tensor, log2: int, of_positions: bool) -> Described:
 
 
 def _multisampled(count: int) -> Described:
-    """Look up 6 points around each position, spaced like those of frustums, with half of that as deviations."""
+    """Look up 6 points around each position, spaced as in frustums, with half of the spacing as deviations."""
     layout, spread = HashGridLayout.build(8, 16, 2048, 18), 0.003
     values = torch.randn(layout.num_entries, 4)
     around = rays_and_positions(count)[1][:, None] + spread * torch.randn(count, 6, 3)

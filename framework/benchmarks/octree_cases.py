@@ -29,7 +29,7 @@ def _octree(like: Tensor) -> OctreeLayout:
 
 
 def in_octrees() -> Iterator[Family]:
-    """Yield each operation, its name, what is followed, and its random, extreme and empty inputs."""
+    """Yield each operation, its name, its differentiable inputs, and its random, extreme and empty inputs."""
     count = _octree(torch.zeros(0)).num_leaves
 
     def rays(origins: Tensor, directions: Tensor) -> Rays:

@@ -1,4 +1,4 @@
-"""Time of a training step, in each compiled CPU kernel or each GPU kernel, and in what is left."""
+"""Time of a training step, in each compiled CPU kernel or each GPU kernel, and in the rest."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from nerfloom.training.trainer import Trainer
 MAX_PRINTED, MAX_NAME_LENGTH = 25, 90
 """Number of GPU kernels that are printed, and length of their names."""
 MAX_STEPS, MIN_STEPS, MAX_SECONDS = 200, 8, 30.0
-"""Number of steps over which times are averaged; fewer, but at least the second number, if they take longer than the
-third, seconds."""
+"""Number of steps in an average of times; fewer, but at least the second number, if they take longer than the third,
+seconds."""
 
 
 def measure(run: Run, steps: int, max_seconds: float) -> dict[str, Any]:

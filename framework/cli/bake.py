@@ -32,7 +32,7 @@ class BakeFlags(RunFlags):
     """Cells along the longest edge of the box of all matter, or of each box of a capture, 16 to 1024. Default: up to
     512, and 256 in a capture; fewer for small images or if half of the leaves would not fit."""
     degree: int | None = None
-    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes; that of a run of voxels."""
+    """Degree of the harmonics, 0 to 3. Default: 2, 1 or 0, depending on --max-megabytes, or a voxel run's degree."""
     fine_tune_seconds: float = 30.0
     """Time to learn from the photographs; 0: none."""
 

@@ -38,7 +38,7 @@ class GpuFlags:
     steps: int = 200
     """Number of timed training steps of nerfacto and instant-ngp, with and without CUDA graphs."""
     limit: float = 480.0
-    """Seconds after which nothing new starts. Kernels are skipped first, then whole parts; the report names them."""
+    """Nothing new starts after these seconds. Kernels are skipped first, then whole parts; the report names them."""
     run_dir: Path | None = None
     """Folder of runs and report. Default: outputs/bench-gpu-DATA."""
     output_dir: Path = RESULTS

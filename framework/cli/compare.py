@@ -42,7 +42,7 @@ class CompareFlags(JobFlags, GeometryFlags):
     """Maximum number of held-out views in the final evaluation, evenly spaced. Default: one per second of training, at
     least 25; all without --max-seconds. The report states the number."""
     lpips_weights: Path | None = None
-    """File of LPIPS weights with AlexNet (.npz). Default: those of the lpips package, if installed."""
+    """File of LPIPS weights with AlexNet (.npz). Default: the weights of the lpips package, if installed."""
     curve_images: int = 4
     """Number of views in evaluations during training; 0: none."""
 
@@ -107,7 +107,7 @@ def compare(plan: Plan, launcher: Launcher | None = None) -> list[Row]:
 
     Args:
         plan: the methods, conditions and folder.
-        launcher: what runs them; None for processes on this machine, one after the other.
+        launcher: runs them; None for processes on this machine, one after the other.
 
     Returns:
         A row of the table for each method.

@@ -23,9 +23,9 @@ AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": 
 class EditFlags(RegionFlags, OpenFlags):
     """Edit the Gaussians of a run or of a file, and write them to another file.
 
-    The steps of --recipe are taken first, then --drop-floaters, then those of the other flags, in the order of this
-    list. Positions are in the frame and unit of exports. Where photographs are known, a line says what each step costs
-    on held-out ones."""
+    The steps of --recipe are taken first, then --drop-floaters, then the steps of the other flags, in the order of this
+    list. Positions are in the frame and unit of exports. With photographs, a line reports the cost of each step in
+    held-out ones."""
 
     output_path: Path
     """File to write, .ply, .spz, .sog or .glb."""
@@ -41,9 +41,9 @@ class EditFlags(RegionFlags, OpenFlags):
     drop_floaters: bool = False
     """Remove faint Gaussians that training images see in front of surfaces."""
     reduce_to: int | None = None
-    """Number of Gaussians to keep, those with most weight in training images, or by opacity and area."""
+    """Number of Gaussians to keep: the ones with most weight in training images, or by opacity and area."""
     refit_steps: int = 0
-    """Steps in which the Gaussians of --reduce-to then learn to look like all of them, for files and runs with
+    """Steps of training that make the Gaussians of --reduce-to look like all of them, for files and runs with
     photographs, such as 300; 0: none."""
     degree: int | None = None
     """Highest degree of harmonics to keep, 0 to 3."""

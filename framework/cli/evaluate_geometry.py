@@ -127,7 +127,7 @@ def _f_scores(found: Geometry) -> Table:
 def _notes(
     flags: GeometryFlags, found: Geometry, surface: Surface, reference: Surface, source: str, unit: str
 ) -> list[str]:
-    """Return lines about what was compared, the unit of lengths, and what was left out."""
+    """Return lines about the compared surfaces, the unit of lengths, and the omissions."""
     seen = "every point counts" if flags.min_views == 0 else f"what {flags.min_views} or more training cameras see"
     left_out, reference_left_out = found.left_out.describe(), found.reference_left_out.describe()
     lines = [

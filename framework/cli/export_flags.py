@@ -83,7 +83,7 @@ class SplatFlags(SplatSettings, RegionFlags, ExportFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class LevelsFlags(LevelsSettings, RegionFlags, ExportFlags):
-    """Write scene.levels: Gaussians in chunks, with fewer and larger ones for what is far away.
+    """Write scene.levels: Gaussians in chunks, with fewer and larger ones for distant parts.
 
     Commands open it like a file of Gaussians, and load the chunks that a view needs. A binary PLY file may be larger
     than memory.
@@ -106,8 +106,8 @@ class LevelsFlags(LevelsSettings, RegionFlags, ExportFlags):
 class WebFlags(WebSettings, RegionFlags, ExportFlags):
     """Write scene.html: a page that shows the scene's Gaussians or octree, or ones that are made from a field.
 
-    Beside it, scene.jpg is the start view, for link previews. Of a file of levels, the folder scene has chunks that the
-    page loads from a web server.
+    Beside it, scene.jpg is the start view, for link previews. For a file of levels, the folder scene has chunks that
+    the page loads from a web server.
     """
 
 
@@ -129,4 +129,4 @@ class MarchingCubesFlags(MarchingCubesSettings, MeshFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class TsdfFlags(TsdfSettings, MeshFlags):
-    """Write a mesh of what the training cameras see, from their fused depth images; works with every method."""
+    """Write a mesh of the surfaces that training cameras see, from fused depth images; works with every method."""

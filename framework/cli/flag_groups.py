@@ -77,7 +77,7 @@ def grouped_flags(
 
 
 def groups_of(kind: type[TrainConfig]) -> Iterator[tuple[str, list[str]]]:
-    """Yield title and settings of each group of a config class `kind`, each in that of the first class declaring it."""
+    """Yield title and settings of each group of a config class `kind`; the first class to declare a setting decides."""
     declared = {
         field.name: next(base for base in reversed(kind.__mro__) if field.name in inspect.get_annotations(base))
         for field in dataclasses.fields(kind)

@@ -77,7 +77,7 @@ def _default(label: str) -> str:
 
 
 def _without_none(info: Any, spec: Any) -> Any:
-    """Return a specification whose help omits the None that the flag also takes."""
+    """Return a specification with help that omits the None that the flag also takes."""
     if not isinstance(spec, PrimitiveConstructorSpec) or type(None) not in get_args(info.type):
         return spec
     return dataclasses.replace(spec, metavar=spec.metavar.removeprefix("{None}|").replace("{None,", "{"))

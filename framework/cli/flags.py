@@ -85,7 +85,7 @@ def numbers_in(text: str, count: int, name: str, what: str) -> list[float]:
 
 
 def in_one_line(box: str, prog: str) -> str:
-    """Return tyro's error box `box` as one line: what is wrong, and where to look, in the help of `prog`."""
+    """Return tyro's error box `box` as one line: the fault, and a reference to the help of `prog`."""
     title, *sections = _sections(box)
     what = " ".join(" ".join(sections[0] if sections else title).split()).removeprefix("Error parsing ")
     if what.startswith("Unrecognized options: "):

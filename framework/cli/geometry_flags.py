@@ -35,7 +35,7 @@ class GeometryFlags:
     min_views: int = 1
     """Number of training cameras that have to see a point of a surface; 0: all points count."""
     crop: float | None = None
-    """Judge only what lies in the reference's bounding box, enlarged by this fraction of its longest side."""
+    """Judge only surfaces in the reference's bounding box, enlarged by this fraction of its longest side."""
 
     @property
     def reference(self) -> Path | None:

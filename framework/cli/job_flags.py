@@ -25,11 +25,11 @@ class JobFlags:
     device_type: Literal["auto", "cpu", "cuda", "mps"] = "auto"
     """Device to train on."""
     launcher: Literal["processes", "ray", "slurm"] = "processes"
-    """What runs the jobs: processes on this machine, a Ray cluster, or Slurm, for which a script is written. All
+    """Launcher of the jobs: processes on this machine, a Ray cluster, or a script for Slurm. All
     produce the same files."""
     jobs: int | None = None
-    """Number of simultaneous jobs. Each process has one GPU, or --num-threads CPU cores. Default: 1 for processes; as
-    many as there is room for with ray and slurm."""
+    """Number of simultaneous jobs. Each process has one GPU, or --num-threads CPU cores. Default: 1 for processes; with
+    ray and slurm, all that have room."""
     ray_address: str | None = None
     """Address of a running Ray cluster, such as 10.0.0.1:6379 or auto. Default: one is started on this machine."""
 

@@ -18,11 +18,11 @@ class RegionFlags:
     """The part of space that is kept, in the frame and unit of exports. Of several, what is in all of them is kept."""
 
     crop_box: str | None = None
-    """Keep what is in a box: X,Y,Z,X,Y,Z, its minimum and its maximum corner. Default: everything."""
+    """Keep the inside of a box: X,Y,Z,X,Y,Z, its minimum and its maximum corner. Default: everything."""
     crop_sphere: str | None = None
-    """Keep what is in a sphere: X,Y,Z,RADIUS."""
+    """Keep the inside of a sphere: X,Y,Z,RADIUS."""
     region: Path | None = None
-    """Keep what is in the box or sphere of a file, such as 'sphere: {center: [0, 0, 0], radius: 1}'."""
+    """Keep the inside of the box or sphere of a file, such as 'sphere: {center: [0, 0, 0], radius: 1}'."""
 
     def box(self) -> Box | None:
         """Return the box of --crop-box; None if it is not given.

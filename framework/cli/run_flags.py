@@ -47,10 +47,10 @@ class RunFlags(OpenFlags):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
     level_error: float | None = None
-    """Of a .levels file: largest standard deviation of a merged Gaussian, pixels; 0: merge none. Default: 1."""
+    """For a .levels file: largest standard deviation of a merged Gaussian, pixels; 0: merge none. Default: 1."""
     memory_limit: float | None = None
-    """Memory for Gaussians, MB (1e6 bytes). Of a .levels file: too little makes the level error larger. Default: 2000.
-    Of a run with Gaussians: the run's setting."""
+    """Memory for Gaussians, MB (1e6 bytes). For a .levels file: too little makes the level error larger. Default: 2000.
+    For a run with Gaussians: the run's setting."""
     eval_rendering: Literal["volume", "surface"] | None = None
     """Rendering of a run with a signed distance. volume: as in training; surface: the colour where a ray first meets
     the surface. Default: the run's setting."""

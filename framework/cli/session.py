@@ -38,9 +38,9 @@ from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 
 MAX_PICTURES = 4
-"""Maximum number of held-out views whose pictures are written at the end."""
+"""Maximum number of held-out views with pictures written at the end."""
 MAX_TRAINING = 3
-"""Maximum number of training images with pictures, if the method shows what only one image contains."""
+"""Maximum number of training images with pictures, if the method shows content of single images."""
 FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
 
@@ -49,7 +49,7 @@ def start(run: Run) -> None:
     """Train and evaluate a new `run`.
 
     Raises:
-        Stopped: if a signal ends it; the message says what was saved.
+        Stopped: if a signal ends it; the message names the saved checkpoint.
     """
     with joined_processes() as several:
         run = replace(run, folder=Path(from_first(str(run.folder))))  # its name contains the time
@@ -68,7 +68,7 @@ def resume(run: Run) -> None:
     """Continue a `run` from its newest checkpoint, or from the start if it has none.
 
     Raises:
-        Stopped: if a signal ends it; the message says what was saved.
+        Stopped: if a signal ends it; the message names the saved checkpoint.
     """
     with joined_processes() as several, sole_user(run.folder) if several.first else nullcontext():
         trainer = _prepare(run)
@@ -176,7 +176,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
 
 
 def _count(model: HasGaussians) -> str:
-    """Return a line with the number of Gaussians, and of those that are not finite and never drawn."""
+    """Return a line with the number of Gaussians, and of the ones that are not finite and never drawn."""
     gaussians = model.gaussians()
     bad = len(gaussians) - int(gaussians.finite().sum())
     return f"{len(gaussians):,} Gaussians" + (f", {bad:,} of them not finite and never drawn" if bad else "")

@@ -142,7 +142,7 @@ def _run(method: str, flags: StressFlags) -> Run:
 
 
 def _conditions(flags: StressFlags) -> list[Condition]:
-    """Return the selected conditions, without those that cannot be applied to --data."""
+    """Return the selected conditions that can be applied to --data."""
     from nerfloom.base.console import say
     from nerfloom.stress.conditions import select
 

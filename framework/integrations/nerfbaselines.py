@@ -2,7 +2,7 @@
 
 The protocol is structural, so nothing is imported from nerfbaselines. nerfbaselines counts the steps,
 `max_num_iterations` in total. Overrides are named like the method's flags, with underscores (`max_num_iterations`,
-`machine.seed`), or like those of `FrameFlags`, with the prefix `frame.`. A checkpoint is the trainer's, plus a file
+`machine.seed`), or like the flags of `FrameFlags`, with the prefix `frame.`. A checkpoint is the trainer's, plus a file
 with the background of renders.
 """
 

@@ -35,7 +35,7 @@ TO_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 FAR = 1000.0
 """Distance where an unbounded scene ends, scene units."""
 BOUND_SHARE = 0.9
-"""Near distance as a fraction of the smallest depth stated by the data set. That depth is a percentile; a few are
+"""Near distance as a fraction of the smallest depth stated by the data set. This depth is a percentile; a few are
 smaller."""
 
 
@@ -208,7 +208,7 @@ def _unbounded_frame(images: ArrayImages) -> Frame:
 
 
 def dataset_of(images: ArrayImages, frame: Frame, masks: Masks) -> Dataset:
-    """Construct a data set of `images` in the scene's `frame`; `masks` says what masked-out pixels mean.
+    """Construct a data set of `images` in the scene's `frame`; `masks` says how masked-out pixels count.
 
     Raises:
         DataError: if no pixel has a ray.

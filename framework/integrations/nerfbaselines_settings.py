@@ -54,7 +54,7 @@ def flattened(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def with_matching_background(config: TrainConfig, background: Tensor) -> TrainConfig:
-    """Return the config, with a random training background if its fixed one differs from that of renders.
+    """Return the config, with a random training background if its fixed one differs from the renders'.
 
     Args:
         background: (3,) colour behind renders.

@@ -40,10 +40,10 @@ def check_config(subject: MethodUnderTest) -> str:
 
 
 def check_summary(subject: MethodUnderTest) -> str:
-    """Check that the module of `subject` has a docstring, whose first line is the method's summary."""
+    """Check that the module of `subject` has a docstring; its first line is the method's summary."""
     module = type(subject.method.config).__module__
     docstring = getattr(sys.modules.get(module), "__doc__", None) or ""
     summary = docstring.strip().split("\n")[0]
     if not summary:
-        raise Fault(f"the module {module} has no docstring; its first line is what ns-train --help shows")
+        raise Fault(f"the module {module} has no docstring; ns-train --help shows its first line")
     return summary

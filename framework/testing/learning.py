@@ -21,11 +21,11 @@ from nerfloom.testing.rendering import require_rendered
 from nerfloom.training.optim import first_non_finite
 
 FIRST_STEPS = 3
-"""Number of steps whose gradients are checked."""
+"""Number of steps with checked gradients."""
 GRADIENT_STEPS = 40
 """Each parameter must have a gradient within this number of steps; proposals have one only where they are too low."""
 REPEATED_STEPS = 2
-"""Number of steps after which two models are compared."""
+"""Number of steps before two models are compared."""
 RAYS_PER_PIXEL = 4
 """Rays per pixel of the second checked batch."""
 MAX_ERROR_RATIO = 0.8

@@ -142,14 +142,14 @@ def check_background(subject: MethodUnderTest) -> str:
     if not isinstance(learner.model, RayModel):
         dark, light = (learner.picture(background=value) for value in (0.0, 1.0))
         _require_change(light.rgb - dark.rgb, light.accumulation[..., None], "a picture")
-        return "it shows as far as pixels are not opaque"
+        return "it shows where pixels are not opaque"
     rays = learner.view().rays
     away = replace(rays, directions=-rays.directions)  # the cameras are outside the box and look at it
     _require_background(learner, rays, "rays through the box")
     opaque = float(_require_background(learner, away, "rays that miss the box").max())
     if _ends_at_the_box(learner.model) and opaque > TOLERANCE:
         raise Fault(f"rays that miss the box are up to {opaque:.3g} opaque, although nothing is there")
-    return "it shows as far as rays are not opaque"
+    return "it shows where rays are not opaque"
 
 
 def _require_background(learner: Learner, rays: Rays, what: str) -> Tensor:
@@ -216,7 +216,7 @@ def check_nan_rays(subject: MethodUnderTest) -> str:
     rgb = learner.show(_with_nan(view.rays, broken), view.background).rgb
     wrong = ~((rgb - whole)[others].abs() <= TOLERANCE).all(-1)
     if bool(wrong.any()):
-        raise Fault(f"a ray whose origin is NaN changes the colours of {int(wrong.sum())} of {len(wrong)} other rays")
+        raise Fault(f"a ray with a NaN origin changes the colours of {int(wrong.sum())} of {len(wrong)} other rays")
     return "a ray that is NaN spoils its own colour only"
 
 

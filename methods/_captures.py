@@ -29,8 +29,9 @@ DISTORTION = 2e-3
 PAPER_SAMPLES = 64, 64
 """Intervals per ray of each proposal in mip-NeRF 360 and in Zip-NeRF."""
 POSE_WARMUP = 512
-"""Steps over which the learning rate of poses rises. Before there is a scene, their gradients are noise, and Adam would
-move each camera by about the rate times the square root of the number of steps: half a degree in 100 steps."""
+"""Warm-up steps of the learning rate of poses. Before there is a scene, their gradients are noise, and
+Adam would move each camera by about the rate times the square root of the number of steps: half a degree in 100
+steps."""
 MARCHED_REASON = "marched samples carry no gradient to rays"
 """Reason for not refining inexact poses."""
 MARCHED_SAMPLES = 2**16
@@ -52,7 +53,7 @@ class RefinedConfig(RayConfig):
 
 @dataclass(frozen=True)
 class ProposedConfig(RefinedConfig, SamplingConfig, num_proposal_samples=AUTO, num_nerf_samples=AUTO):
-    """Settings of a method that refines poses with proposals, whose number of samples suits the time."""
+    """Settings of a method that refines poses with proposals; the number of samples suits the time."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def decide_capture(
 
 
 class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
-    """A model whose training poses can be refined.
+    """A model with training poses that can be refined.
 
     Raises:
         ConfigError: if poses are refined in normalised device coordinates, or by samples that carry no gradient to

@@ -1,4 +1,4 @@
-"""Settings and optimiser of methods whose networks can be replaced by hash grids with small networks."""
+"""Settings and optimiser of methods with networks that hash grids with small networks can replace."""
 
 from __future__ import annotations
 

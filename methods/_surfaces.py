@@ -138,7 +138,7 @@ class SurfaceConfig(
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
-    """Fraction of the budget after which --curvature-loss-mult applies: a surface has to find its place first."""
+    """Fraction of the budget until --curvature-loss-mult applies: a surface has to find its place first."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
@@ -151,10 +151,10 @@ class SurfaceConfig(
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
     sharpen_until: float = 0.8
-    """Fraction of the budget over which the upper bound of the inverse width rises, exponentially, to 50 times the
-    first value."""
+    """Fraction of the budget until the upper bound of the inverse width has risen, exponentially, to 50 times the first
+    value."""
     open_levels_until: float = 0.3
-    """Fraction of the budget during which levels of the hash grid open, from coarse to fine (hash-grid)."""
+    """Fraction of the budget until all levels of the hash grid are open, from coarse to fine (hash-grid)."""
 
 
 SurfaceConfigT = TypeVar("SurfaceConfigT", bound=SurfaceConfig)
@@ -293,7 +293,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         self, config: SurfaceConfigT, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
     ) -> None:
         super().__init__(config, scene, field, sampler, renderer)
-        # Meshes and crops cover what the field covers.
+        # Meshes and crops cover the field's box.
         self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
         edges = self.surface.box[1] - self.surface.box[0]
@@ -324,7 +324,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
             sampler.stride = self._step_scale.of(self.step_scale)
 
     def start(self, dataset: Dataset) -> None:
-        """Find what images show, and let the first ball stand on a floor that a reconstruction's points show.
+        """Find the imaged space, and let the first ball stand on a floor that a reconstruction's points show.
 
         A floor often has no texture. Nothing then pulls a surface to it, and the background would explain it.
 

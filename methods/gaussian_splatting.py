@@ -196,7 +196,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         return Loss(terms, enlarged(rgb.detach(), batch.rgb, octaves))
 
     def penalised_opacities(self, gaussians: Gaussians, time: float | None) -> Tensor:
-        """Return the opacities (N,) whose mean is the opacity penalty.
+        """Return the opacities (N,); their mean is the opacity penalty.
 
         Args:
             gaussians: N Gaussians at a time, with gradient.

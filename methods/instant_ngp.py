@@ -106,7 +106,7 @@ class Plan:
     learning_rate: float
     """Initial learning rate of Adam."""
     several_rays_from: float
-    """Fraction of the time after which training uses several rays per pixel."""
+    """Fraction of the time before training uses several rays per pixel."""
     thin: float
     """Samples below this fraction of the mean gradient are thinned."""
     eval_step_scale: float

@@ -89,7 +89,7 @@ class ViewDependence(LossTerm):
 
 
 class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
-    """A model that begins with what a teacher knows, if there is one."""
+    """A model that starts from a teacher's field, if there is a teacher."""
 
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, ViewDependence())
 

@@ -54,7 +54,7 @@ class MipNeRFConfig(
 
 
 class MipNeRF(RayModel[MipNeRFConfig], plain=True):
-    """A model whose coarse level, the same network on the same rays, has a weight of a tenth (section 3.3)."""
+    """A model with the weight 0.1 for the coarse level, the same network on the same rays (section 3.3)."""
 
     losses = (COLOR_ERROR, CoarseColorError(0.1), SamplerLoss(), *KNOWN_DISTANCES)
     steps_repeat = True

@@ -109,7 +109,7 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         super().start(dataset)
 
     def start_without_points(self) -> Literal["field", "silhouettes", "random"]:
-        # A still field blurs what moves, but it shows far surroundings, where no box says where to begin.
+        # A still field blurs moving things, but it shows far surroundings, where no box says where to begin.
         in_a_box = self.scene.moving and not self.scene.unbounded
         return "random" if in_a_box else super().start_without_points()
 
@@ -117,7 +117,7 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         return gaussians if time is None else shown_at(gaussians, time)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
-        """Return the Gaussians at a time, without gradient and without those that have faded.
+        """Return the Gaussians at a time that have not faded, without gradient.
 
         Args:
             time: in [0, 1]; None for all of them, at rest.

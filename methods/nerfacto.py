@@ -74,7 +74,7 @@ class NerfactoConfig(
     }
     """Allowed range of each numeric setting."""
     predict_normals: bool = False
-    """Whether to predict normals, which are smoother than those of the density's gradient. --directional reflected
+    """Whether to predict normals, which are smoother than normals from the density's gradient. --directional reflected
     always does."""
     hidden_width: int = 64
     """Features per hidden layer of the two networks."""

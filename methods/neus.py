@@ -1,7 +1,7 @@
 """NeuS: a signed distance on a hash grid; the surface is where the distance is 0.
 
 Wang et al., "NeuS: Learning Neural Implicit Surfaces by Volume Rendering for Multi-view Reconstruction", NeurIPS 2021.
-The hash grid and the network with ReLU are those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in
+The hash grid and the network with ReLU follow NeuS2 (Wang et al. 2023); levels open from coarse to fine as in
 Neuralangelo (Li et al. 2023). `--encoding frequency` has the paper's networks.
 """
 
@@ -30,7 +30,7 @@ class NeuSConfig(SurfaceConfig):
     RANGES: ClassVar[dict[str, Range]] = {"anneal_slope_until": (0, 1)}
     """Allowed range of each numeric setting."""
     anneal_slope_until: float = 0.5
-    """Fraction of the budget after which the annealing of the slope ends (`surface_opacity`)."""
+    """Fraction of the budget until the annealing of the slope ends (`surface_opacity`)."""
 
 
 class NeuS(SurfaceModel[NeuSConfig]):

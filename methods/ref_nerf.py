@@ -77,9 +77,9 @@ class RefNeRFConfig(
     position_frequencies: int = 16
     """Number of frequencies in the integrated encoding of positions (frequency)."""
     open_levels_until: float = 0.3
-    """Fraction of the budget during which levels of the hash grid open, from coarse to fine (hash-grid)."""
+    """Fraction of the budget until all levels of the hash grid are open, from coarse to fine (hash-grid)."""
     normal_loss_mult: Auto[float] = AUTO
-    """Weight of the difference between predicted normals and those of the density. auto: 0.003 on a hash grid, 0.0003
+    """Weight of the difference between predicted normals and the density's normals. auto: 0.003 on a hash grid, 0.0003
     for the paper's networks."""
     directional = "reflected"  # no flag
 

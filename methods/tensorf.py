@@ -35,7 +35,7 @@ FIRST_SIDE, LAST_SIDE = 128, {"vm": 300, "cp": 500}
 VERTICES_PER_PIXEL = 2
 """Maximum number of vertices per axis, per pixel of the images' longer side; the images do not resolve more."""
 MIN_SAMPLES, MAX_SAMPLES, MIN_SAMPLES_SECONDS = 2**13, 2**15, 150.0
-"""Samples per training step for short and long times, and the seconds after which they grow. On Lego 2^13 and 2^14
+"""Samples per training step for short and long times, and the seconds before they grow. On Lego 2^13 and 2^14
 samples gave 32.18 and 31.91 dB after 150 s."""
 MARGIN = 1
 """Cells of the occupancy grid kept around the occupied ones when the box shrinks."""
@@ -116,7 +116,7 @@ REGULARISERS = Sparsity("sparsity", "sparsity"), TotalVariation("total_variation
 
 
 class TensoRF(RayModel[TensoRFConfig], plain=True):
-    """A model whose factors grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
+    """A model with factors that grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
 
     Args:
         field: the `TensorField`.
@@ -141,7 +141,7 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
 
     @property
     def factors(self) -> TensorField:
-        """The field whose factors are resampled."""
+        """The field with the factors to resample."""
         assert isinstance(self.field, TensorField)
         return self.field
 

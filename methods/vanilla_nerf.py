@@ -116,7 +116,7 @@ def sampler(config: VanillaNeRFConfig, scene: Scene) -> Sampler:
 
 
 class VanillaNeRF(RayModel[VanillaNeRFConfig], plain=True):
-    """A model whose coarse and fine colours are both compared with the images (section 5.3)."""
+    """A model that compares coarse and fine colours with the images (section 5.3)."""
 
     losses = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES, *FEW_IMAGES)
     steps_repeat = True

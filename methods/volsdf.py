@@ -1,7 +1,7 @@
 """VolSDF: a signed distance on a hash grid; a Laplace distribution turns it into density.
 
-Yariv et al., "Volume Rendering of Neural Implicit Surfaces", NeurIPS 2021. The hash grid and the network with ReLU are
-those of NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neuralangelo (Li et al. 2023). `--encoding
+Yariv et al., "Volume Rendering of Neural Implicit Surfaces", NeurIPS 2021. The hash grid and the network with ReLU
+follow NeuS2 (Wang et al. 2023); levels open from coarse to fine as in Neuralangelo (Li et al. 2023). `--encoding
 frequency` has the paper's networks.
 """
 
@@ -41,7 +41,7 @@ class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Number of distances evaluated along a ray at first, and in each further round until the bound holds
     (error-bounded)."""
     opacity_error: float = EPSILON
-    """Maximum error of the opacity from which samples are drawn (error-bounded)."""
+    """Maximum error of the opacity used to draw samples (error-bounded)."""
 
 
 class VolSDF(SurfaceModel[VolSDFConfig]):

@@ -44,9 +44,9 @@ HULL_CELLS = 128
 FOG = 1.0
 """Optical depth of the first leaves along the longest edge of their box."""
 VARIED_BRICKS, STEPS_PER_VARIATION = 32, 4
-"""Number of bricks whose total variation is a term of the loss, and number of steps from one such step to the next."""
+"""Number of bricks with total variation in the loss, and number of steps from one such step to the next."""
 COLOR_VARIATION = 0.1
-"""Weight of the total variation of colours, relative to that of opacities."""
+"""Weight of the total variation of colours, relative to the weight for opacities."""
 NOT_LEARNT = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
 """Settings of methods with samples along rays, which have no meaning here."""
 
@@ -72,21 +72,21 @@ class VoxelsConfig(
     }
     """Allowed range of each numeric setting."""
     resolution: Auto[int] = AUTO
-    """Cells along the longest edge of the box that silhouettes leave, at the end of training. auto: as many as the
-    images and the training time allow."""
+    """Cells along the longest edge of the box that silhouettes leave, at the end of training. auto: chosen from the
+    images and the training time."""
     num_splits: int = 3
     """Number of times that leaves are split into eight. Training starts with --resolution / 2^num_splits cells."""
     max_leaves: int = 2**22
-    """Maximum number of leaves. With more, those with the smallest weights on training rays are dropped."""
+    """Maximum number of leaves. With more, the ones with the smallest weights on training rays are dropped."""
     prune_weight: float = 0.02
-    """Leaves whose weight on every training ray is smaller are dropped. This is the last threshold: earlier ones are
+    """Leaves with a smaller weight on every training ray are dropped. This is the last threshold: earlier ones are
     smaller."""
     total_variation: float = 0.01
     """Weight of the total variation of opacities between neighbouring leaves; colours have a tenth."""
     silhouette_cells: bool = True
     """Place no leaf where an image's alpha channel shows empty space."""
     silhouette_pixels: bool = True
-    """Never draw pixels whose ray passes only through such empty space."""
+    """Never draw pixels if their ray passes only through such empty space."""
 
 
 def decide(config: VoxelsConfig, scene: Scene) -> tuple[VoxelsConfig, list[Decision]]:
@@ -114,7 +114,7 @@ def first_cells(cells: int, num_splits: int) -> int:
 
     Args:
         cells: wanted number of cells after all splits.
-        num_splits: number of splits, each of which doubles the number.
+        num_splits: number of splits; each doubles the number.
     """
     return max(cells >> num_splits, 1)
 

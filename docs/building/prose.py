@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 RULES = {
-    r"(?:^|[.!?]\)? |\*\*)(What|Whatever|Of|By|That)\b(?![^.!?]*\?)": "begin the sentence with a subject that names the thing",
+    r"(?:^|[.!?]\)? |\*\*)(What|Whatever|Of|By|That)\b(?![^.!?]*\?)": "begin the sentence with a named subject",
     r"\b((?:of|by|from|with|at|for|after|above|below|under|without|behind|beyond|through) (?:which|whom))\b": (
         "make two sentences"
     ),

@@ -1,4 +1,4 @@
-"""Kernels are tested on two threads, on which their chunks meet."""
+"""Kernels are tested on two threads, so that chunks of both meet."""
 
 import pytest
 

@@ -81,7 +81,7 @@ def on_image(form: Callable[..., object]) -> Callable[..., Tensor]:
     """Image, distance and transmittance of records (N, RECORD)."""
 
     def run(records: Tensor) -> Tensor:
-        # What bounds a Gaussian has no gradient, whose place the compiled form uses for something else.
+        # The bounds of a Gaussian have no gradient; the compiled form uses their place for other values.
         shape, bounds, rest = records.split([Record.CUT, Record.RED - Record.CUT, RECORD - Record.RED], -1)
         records = torch.cat([shape, bounds.detach(), rest], -1)
         found = form(records, tile_lists(records.float(), 150, 140), 150, 140, torch.ones(3), 4, False)

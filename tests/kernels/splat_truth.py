@@ -1,4 +1,4 @@
-"""Splatting in float64, from its equations: what the kernels are compared with. It knows nothing of tiles.
+"""Splatting in float64, from its equations: the truth for the kernels. It knows nothing of tiles.
 
 The covariance on the image is J W R S S^T R^T W^T J^T + blur I; J is found by autograd, spherical harmonics are made of
 derivatives of Legendre polynomials, and each pixel looks at all Gaussians.
@@ -31,7 +31,7 @@ LENSES = {
 """Coefficients of each lens, in the order of its projection."""
 BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 BOUND = 0.15
-"""Beyond the image's edge by this share of its size, the Jacobian is that of the bound."""
+"""Beyond the image's edge by this share of its size, the Jacobian stays constant."""
 
 
 def scene(count: int, harmonics: int = 15, spread: float = 1.0) -> list[Tensor]:
@@ -47,7 +47,7 @@ def scene(count: int, harmonics: int = 15, spread: float = 1.0) -> list[Tensor]:
 
 
 def camera(width: int, height: int, lens: str = "", **settings: Any) -> SplatCamera:
-    """Return a camera whose focal lengths suit an image's size; its pose is that of the scene's frame."""
+    """Return a camera with focal lengths that suit an image's size; its pose is the scene's frame."""
     focal = 0.5 * (width + height) + 0.5
     bent = Distortion.of(lens, torch.tensor([LENSES[lens]], dtype=torch.float64)) if lens else None
     middle = focal, 1.03 * focal, 0.49 * width, 0.51 * height
@@ -181,7 +181,7 @@ def projected(given: Sequence[Tensor], view: SplatCamera, degree: int) -> Projec
 
 @dataclass(frozen=True)
 class Image:
-    """What is seen, and with what certainty."""
+    """A picture, and the certainty of its pixels."""
 
     image: Tensor
     """(H, W, 7) colours over the background, distance and normals."""
@@ -190,9 +190,9 @@ class Image:
     certain: Tensor
     """(H, W) bool: no alpha, nor transmittance, is so near a bound that float32 could see it on the other side."""
     offsets: Tensor
-    """(H * W, M, 2) from the centres to the pixels, whose gradient is that of each pixel alone."""
+    """(H * W, M, 2) from the centres to the pixels; the gradient belongs to each pixel alone."""
     blended: Tensor
-    """(H * W, M) bool: what is drawn."""
+    """(H * W, M) bool: the drawn Gaussians of each pixel."""
 
 
 def seen(of: Projection, view: SplatCamera, background: Tensor) -> Image:
@@ -250,7 +250,7 @@ class Compared:
     transmittance: float
     gradients: dict[str, float]
     share: float
-    """Of pixels that are certain."""
+    """Share of the certain pixels."""
 
     def worst(self) -> float:
         return max(self.image, self.transmittance, *self.gradients.values())
@@ -270,7 +270,7 @@ def gradients(image: Tensor, through: Tensor, certain: Tensor, inputs: Sequence[
 def compared(
     given: Sequence[Tensor], view: SplatCamera, channels: int = 4, degree: int = 3, dtype: torch.dtype = torch.float32
 ) -> Compared:
-    """Compare value and gradients of what is drawn in `dtype` with the truth."""
+    """Compare value and gradients of a picture in `dtype` with the truth."""
     ours, exact = leaves(given, dtype), leaves(given, torch.float64)
     truth, found = true_image(exact, view, degree=degree), drawn(ours, view, channels, degree)
     known, image = truth.certain, truth.image[..., :channels]
@@ -297,8 +297,9 @@ def compared(
 def growth_error(
     form: Callable[..., Blended], given: Sequence[Tensor], view: SplatCamera, device: torch.device | str = "cpu"
 ) -> float:
-    """Compare what growth goes by, after a form of `blend`, with the truth: of each Gaussian the sum over the pixels of
-    the absolute gradient of its centre through that pixel alone, on an image whose longer side is 2 units."""
+    """Compare the criterion of growth, after a form of `blend`, with the truth: for each Gaussian the sum over the
+    pixels of the absolute gradient of its centre through that pixel alone, on an image with a longer side of 2
+    units."""
     *parameters, pose = given
     truth = true_image(leaves(given, torch.float64), view)
     records = project_gaussians(*parameters, replace(view, pose=pose))[0].to(device).requires_grad_()

@@ -130,7 +130,7 @@ def test_threads_give_the_same_bits(features: int) -> None:
 @pytest.mark.parametrize("place", [0, 4999, 10_002])
 def test_all_finite_sees_a_single_bad_value(bad: float, place: int) -> None:
     values = torch.randn(10_003)
-    others = [torch.full((100,), 3e38), torch.zeros(0)]  # whose squares are infinite, and nothing
+    others = [torch.full((100,), 3e38), torch.zeros(0)]  # with infinite squares, and empty
     for judged in (all_finite, all_finite_reference, *(each.run for each in ALL_FINITE.implementations)):
         if judged is ALL_FINITE.implementations[0].run and not native.available():
             continue
@@ -176,7 +176,7 @@ def test_verdict_and_rate_of_dense_adam(update) -> None:
         update(values, grads, means, squares, steps, rate, BETAS, 1e-8, *verdict)
         return [*values, *means, *squares, *steps]
 
-    if update is DENSE_ADAM.implementations[0].run:  # C++, whose verdict is Python's
+    if update is DENSE_ADAM.implementations[0].run:  # C++; Python decides
         if native.available():
             torch.testing.assert_close(after(0.01)[0], dense_once(0.01))
         return

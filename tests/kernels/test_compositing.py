@@ -140,7 +140,7 @@ def test_extreme_densities_and_lengths(per_ray: int | None) -> None:
     weights.sum().backward()
     assert sigma.grad is not None
     assert bool(torch.isfinite(sigma.grad).all())
-    assert weights[: len(EXTREMES)].sum().item() == 0  # no length, no weight, whatever the density
+    assert weights[: len(EXTREMES)].sum().item() == 0  # no length, no weight, at any density
 
 
 def test_nan_density_is_seen() -> None:

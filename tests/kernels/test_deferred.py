@@ -53,7 +53,7 @@ def added_up(encoding: HashGrid | FeaturePlanes) -> Tensor:
 
 
 def test_a_gradient_of_positions_alone_leaves_nothing(make) -> None:
-    """Nor does one of a network's weights behind, or a pass whose inputs are others."""
+    """Gradients of a network's weights alone, and a pass with other inputs, leave nothing either."""
     encoding, x, weight = make(), positions(), torch.rand(encoding_width(make), requires_grad=True)
     features = encoding(x)
     (of_positions,) = torch.autograd.grad(features.sum(), x, retain_graph=True)
@@ -90,7 +90,7 @@ def test_an_optimiser_does_not_apply_what_was_asked_of_positions(make) -> None:
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_what_waits_is_the_dense_gradient(make, times: int) -> None:
-    """Of two look-ups, and, as gradients accumulate, of a second pass through the same graph."""
+    """Two look-ups, and a second pass through the same graph, add up as dense gradients do."""
     encoding, dense, x = make(), make(sparse=False), positions()
     found = []
     for each in (encoding, dense):

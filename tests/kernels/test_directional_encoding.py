@@ -42,8 +42,8 @@ def test_its_first_bands_are_those_of_spherical_harmonics() -> None:
 
 
 def drawn(mean: torch.Tensor, kappa: float, count: int) -> torch.Tensor:
-    """Directions (count, 3) of von Mises and Fisher's distribution, float64: the inverse of its distribution of cosines
-    (Wood 1994, in three dimensions), at evenly spaced ranks; the angles around the mean are those of a lattice."""
+    """Directions (count, 3) of the von Mises-Fisher distribution, float64: the inverse of its distribution of cosines
+    (Wood 1994, in three dimensions), at evenly spaced ranks; the angles around the mean come from a lattice."""
     ranks = (torch.arange(count, dtype=torch.float64) + 0.5) / count
     cosines = 1 + torch.log(ranks + (1 - ranks) * np.exp(-2 * kappa)) / kappa
     angles = 2 * np.pi * torch.frac(torch.arange(count, dtype=torch.float64) * (5**0.5 - 1) / 2)

@@ -1,4 +1,4 @@
-"""The table of operations: what is taken when, each implementation against its reference, and room for more."""
+"""The table of operations: the choice of an implementation, each one against its reference, and additions."""
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -124,7 +124,7 @@ def signed_distance() -> SignedDistance:
 
 
 def through_a_box(count: int) -> March:
-    """A march of some rays whose steps are all occupied."""
+    """A march of some rays with all steps occupied."""
     occupied = torch.ones(16**3, dtype=torch.bool)
     return march(rays()[:count], Occupancy(occupied, BOX, 16), 0.05, 0.0, None, 0.0)
 
@@ -168,7 +168,7 @@ def projected() -> Tensor:
 
 
 def everywhere(left: int, right: int) -> Tensor:
-    """Records on an image of 32 x 32, all of whose tiles they meet; some are not visible, and many as far as others."""
+    """Records that meet all tiles of an image of 32 x 32; some are not visible, and many are at equal distances."""
     records = torch.zeros(60, RECORD)
     records[:, :2], records[:, [Record.U_X, Record.V_Y]] = 32 * torch.rand(60, 2), 1.0
     records[:, Record.CUT], records[:, [Record.REACH_X, Record.REACH_Y]] = 1e5 * torch.rand(60) - 2e4, 40.0
@@ -177,7 +177,7 @@ def everywhere(left: int, right: int) -> Tensor:
 
 
 def grouped(outputs: int) -> Arguments:
-    """Rows, the network of each, and six networks 7-8-`outputs`, of which two have no rows."""
+    """Rows, the network of each, and six networks 7-8-`outputs`; two of these have no rows."""
     owners = torch.tensor([0, 1, 3, 5])[torch.randint(4, (60,))]
     return [rand(60, 5), rand(60, 2)], owners, rand(6, 64 + 9 * outputs) - 0.6, (7, 8, outputs)
 
@@ -297,7 +297,7 @@ PAIRS = [  # Triton's are compared in tests/kernels/triton
     ("operation", "index"), PAIRS, ids=[f"{o.name}-{o.implementations[i].backend.name}" for o, i in PAIRS]
 )
 def test_an_implementation_computes_what_its_reference_does(operation: Operation[..., Any], index: int) -> None:
-    """Values, and what is written in place. Gradients are compared in test_gradients_kept.py."""
+    """Values, and tensors written in place, are compared. Gradients are compared in test_gradients_kept.py."""
     implementation = operation.implementations[index]
     if not implementation.backend.available():
         pytest.skip(f"{implementation.backend.name} cannot be used on this machine")
@@ -320,7 +320,7 @@ def taken(operation: Operation[..., Any], tensors: Sequence[Tensor | None], *arg
 
 @needs_kernels
 def test_what_is_taken() -> None:
-    """By device, type, gradients and the shapes that there are kernels for."""
+    """The choice depends on device, type, gradients, and the shapes that kernels support."""
     positions, table = torch.rand(9, 3), rand(GRID.num_entries, 2)
 
     def grid(positions: Tensor, table: Tensor) -> str:
@@ -380,7 +380,7 @@ def test_what_is_taken() -> None:
     ],
 )
 def test_no_gradient_is_dropped(operation: Operation[..., Any], followed: int, expected: str) -> None:
-    """What an implementation has no gradient for is left to torch, where gradients are asked for."""
+    """If an implementation has no gradient for a required input, torch computes the operation."""
     arguments, here = CASES[operation](), [rand(3) for _ in range(7)]
     here[followed].requires_grad_()
     assert taken(operation, here, *arguments) == expected
@@ -444,7 +444,7 @@ def elsewhere() -> Iterator[list[int]]:
 
 
 def test_a_third_backend_is_one_more_implementation(elsewhere: list[int]) -> None:
-    """The operation's function, and what calls it, stay as they are."""
+    """The operation's function and its callers stay as they are."""
     table = rand(GRID.num_entries, 2)
     hash_grid(torch.rand(4, 3), table, GRID)
     assert elsewhere == []

@@ -27,7 +27,7 @@ def arguments(count: int = 3000, kind: torch.dtype = torch.float64) -> Arguments
 
 
 def loss_of(found: Tensor) -> Tensor:
-    """A loss by outputs and gradient, whose gradients by each depend on the other."""
+    """A loss of outputs and gradient; its gradient by each depends on the other."""
     torch.manual_seed(1)
     outputs, gradient = found[:, :-3], found[:, -3:]
     eikonal = (gradient.norm(dim=-1) - 1).square().mean()
@@ -98,7 +98,7 @@ def test_a_deferred_gradient_is_that_of_the_table() -> None:
 
 
 def test_the_reference_has_the_gradient_of_its_output() -> None:
-    """Central differences inside cells; and those of the loss, by table, weights and positions."""
+    """Central differences inside cells agree, also for the loss, by table, weights and positions."""
     positions, table, first, second = arguments(200)
     inside = positions[(positions > 0.01).all(-1) & (positions < 0.99).all(-1)][:50]
     found = distance_network_reference(inside, table, first, second, LAYOUT)

@@ -18,7 +18,7 @@ def test_a_weight_is_the_share_of_a_gaussian_within_half_a_cell() -> None:
 
 
 def test_the_gradient_is_the_densitys_at_the_cells_border() -> None:
-    """By the chain rule: d/ds of 2 Phi(h / s) - 1 is -2 phi(h / s) h / s^2."""
+    """The chain rule gives it: d/ds of 2 Phi(h / s) - 1 is -2 phi(h / s) h / s^2."""
     deviations = DEVIATIONS.clone().requires_grad_()
     level_weights(deviations, RESOLUTIONS).sum().backward()
     half_cells, s = 0.5 / RESOLUTIONS.double(), DEVIATIONS[:, None]

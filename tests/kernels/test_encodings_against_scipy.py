@@ -15,7 +15,7 @@ def unit_vectors(count: int) -> torch.Tensor:
 
 
 def real_harmonic(degree: int, order: int, directions: torch.Tensor) -> np.ndarray:
-    """From scipy's complex ones, with the Condon-Shortley phase they carry."""
+    """A real harmonic from scipy's complex ones, with their Condon-Shortley phase."""
     x, y, z = directions.numpy().T
     polar, azimuth = np.arccos(z), np.arctan2(y, x)
     if hasattr(special, "sph_harm_y"):

@@ -1,4 +1,4 @@
-"""Torch's forms in few operations, for GPUs: values and gradients are those of the readable references, in float64."""
+"""Torch's forms in few operations, for GPUs: values and gradients equal the readable references' in float64."""
 
 from collections.abc import Callable
 from typing import Any
@@ -190,7 +190,7 @@ def test_lists_of_tiles() -> None:
 
 @pytest.mark.parametrize("room", [0, 100, 400, 5000])
 def test_lists_of_tiles_with_little_room(room: int) -> None:
-    """The lists of the nearest Gaussians; what is behind them has no meaning, and is not seen."""
+    """The lists hold the nearest Gaussians; entries behind them are undefined, and not visible."""
     records, camera = splats()
     found = few(TILES)(records, camera.width, camera.height, True, room)
     truth = tile_lists_reference(records, camera.width, camera.height, True, room)
@@ -212,7 +212,7 @@ def test_lists_of_tiles_with_little_room(room: int) -> None:
 @pytest.mark.parametrize("model", ["pinhole", "equirectangular"])
 @pytest.mark.parametrize("basis", [0, 8])
 def test_projection(basis: int, model: str) -> None:
-    """With Gaussians behind the camera, without a size, and that are not finite, and a pose that learns."""
+    """Some Gaussians are behind the camera, without a size, or not finite, and the pose has a gradient."""
     torch.manual_seed(5)
     means = 2 * torch.randn(60, 3).double()
     rows = [torch.randn(60, 3) - 2, torch.randn(60, 4), torch.randn(60), torch.rand(60, 3), torch.rand(60, 3, 8)]

@@ -43,7 +43,7 @@ def test_slots_are_shared_out(counts: list[int], capacity: int) -> None:
 
 
 def of_rays(placed: Placed) -> list[list[tuple[float, float]]]:
-    """The intervals of each ray, without those of empty slots."""
+    """The intervals of each ray, without empty slots."""
     offsets, found = placed.slots.offsets.tolist(), []
     for first, count in zip(offsets, placed.slots.counts.tolist(), strict=False):
         here = slice(first, first + count)
@@ -99,7 +99,7 @@ def test_rays_without_room_are_left_out_whole_and_counted(room: tuple[int, int])
     assert missing
     assert kept[missing[0] :] == [[]] * (len(kept) - missing[0])  # the first ones have room
     assert int(found.left_out) >= len(missing)
-    assert int(found.runs) == int(everything.runs)  # what would have had to fit is known all the same
+    assert int(found.runs) == int(everything.runs)  # the required number is known all the same
     if room[0] == 4096:
         assert int(found.candidates) == int(everything.candidates)
 
@@ -130,7 +130,7 @@ def test_light_ends_rays_where_the_definition_says() -> None:
 
 
 def test_empty_slots_show_nothing_and_learn_nothing() -> None:
-    """Composited colours are those of the samples alone, and so are gradients, whatever the density in empty slots."""
+    """Colours and gradients come from the samples alone, for any density in empty slots."""
     torch.manual_seed(1)
     rays, grid = random_rays(30), occupancy(8, 0.4)
     placed = fill(rays, grid, SIZE, STEPS, None, (4096, 2048)).placed

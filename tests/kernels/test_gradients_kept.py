@@ -80,7 +80,7 @@ Function = Callable[..., Tensor]
 
 @dataclass(frozen=True)
 class Operation:
-    """What is compiled, what is true, and inputs whose gradients are compared."""
+    """A compiled form, its reference, and inputs with gradients to compare."""
 
     compiled: Function
     reference: Function
@@ -91,7 +91,7 @@ class Operation:
 
 
 class DeferredVariation(torch.autograd.Function):
-    """The variation of bands whose gradient is deferred, and is then taken."""
+    """The variation of bands with a deferred gradient, which is then taken."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ def on_image(form: Function) -> Function:
     def run(pose: Tensor, **rows: Tensor) -> Tensor:
         camera = SplatCamera(pose, (20.0, 22.0, 10.0, 8.0), 20, 17, antialiased=True)
         records = form(*rows.values(), camera, 3)[0]
-        # What gradients go through.
+        # The columns with gradients.
         return torch.cat([records[:, : Record.CUT], records[:, Record.RED : Record.NORMAL_X]], -1)
 
     return run
@@ -219,7 +219,7 @@ def on_image(form: Function) -> Function:
 
 def blended(form: Function) -> Function:
     def run(records: Tensor) -> Tensor:
-        # What bounds a Gaussian has no gradient, whose place the compiled form uses for something else.
+        # The bounds of a Gaussian have no gradient; the compiled form uses their place for other values.
         shape, bounds, rest = records.split([Record.CUT, Record.RED - Record.CUT, RECORD - Record.RED], -1)
         records = torch.cat([shape, bounds.detach(), rest], -1)
         found = form(records, tile_lists(records, 20, 17), 20, 17, torch.ones(3), 4, False)
@@ -459,8 +459,8 @@ OPERATIONS = {
 COLORS = torch.randint(256, (9, 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
 WITHOUT_A_GRADIENT = {
     "pack_occupancy", "refresh_occupancy", "march_begin", "march_wave", "march_advance",  # refused, as tested below
-    "trace_rays", "trace_take",  # whose values the operations are given that have the gradient (test_trace.py)
-    "spaced_distances", "first_covisible",  # of what has no gradient
+    "trace_rays", "trace_take",  # operations with the gradient receive their values (test_trace.py)
+    "spaced_distances", "first_covisible",  # of inputs without gradients
     "proposal_weights",  # likewise (test_proposals.py)
     "traced_error", "traced_error_take",  # compared in test_traced_error.py
     "traced_colors",  # for pictures alone, and refused where a gradient is asked for
@@ -468,8 +468,8 @@ WITHOUT_A_GRADIENT = {
     "adam_sparse", "adam_dense", "all_finite", "hash_grid_adam", "hash_grid_tangent_adam", "multisampled_grid_adam",
     "hash_grid_tangent_forward",  # of the optimiser; and refused where a gradient is asked for
     "signed_distances", "crossings_find", "crossings_take",  # without one, for occupancy and pictures
-    "opaque_sums", "hold_balls", "pixels_near_balls",  # whose results are counted or true and false
-    "splat_sort", "splat_bound", "splat_bin", "group_rows",  # whose results are indices
+    "opaque_sums", "hold_balls", "pixels_near_balls",  # with counts or booleans as results
+    "splat_sort", "splat_bound", "splat_bin", "group_rows",  # with indices as results
     "octree_weights", "adam_rows", "octree_trace_packed",  # documented to have none; of the optimiser; of bytes
     "splat_project_packed",  # for pictures alone, and refused where a gradient is asked for
 }  # fmt: skip
@@ -487,7 +487,7 @@ CASES = [(name, given) for name, operation in OPERATIONS.items() for given in (*
 
 @pytest.mark.parametrize(("name", "given"), CASES, ids=[f"{name}-{given}" for name, given in CASES])
 def test_the_gradient_is_the_references(name: str, given: str) -> None:
-    """Of an input alone, and of all together."""
+    """Gradients of an input alone, and of all together, equal the reference's."""
     operation, found = OPERATIONS[name], []
     torch.manual_seed(0)
     inputs = operation.inputs()

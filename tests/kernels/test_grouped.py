@@ -1,4 +1,4 @@
-"""Many small networks at once: each row is what its own network computes, in value and gradient."""
+"""Many small networks at once: each row equals its own network's output, in value and gradient."""
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -64,7 +64,7 @@ def one_by_one(
 def value_and_gradients(
     run: Callable[..., Tensor], inputs: list[Tensor], table: Tensor, direction: Tensor, kind: torch.dtype
 ) -> list[Tensor]:
-    """What `run` makes of inputs and table, and the gradients of them all along `direction`."""
+    """Results of `run` for inputs and table, and the gradients of them all along `direction`."""
     leaves = [values.to(kind, copy=True).requires_grad_() for values in (*inputs, table)]
     out = run(leaves[:-1], leaves[-1])
     return [out.detach(), *torch.autograd.grad((out * direction.to(kind)).sum(), leaves)]
@@ -82,7 +82,7 @@ BLOCKS = {
     "blocks": torch.cat([torch.full((70,), 2), torch.arange(7), torch.full((33,), 5)]),
 }
 PIECES = torch.cat([torch.full((2100,), 1), torch.full((1023,), 3), torch.full((1025,), 4), torch.arange(7)]).roll(500)
-"""Rows of networks whose gradients are summed in three pieces, in one, and in two."""
+"""Rows of networks with gradients summed in three pieces, in one, and in two."""
 
 
 @pytest.mark.parametrize("activation", ["none", "relu", "sigmoid"])
@@ -103,7 +103,7 @@ def test_each_row_is_that_of_its_network(kind: str, activation: Activation) -> N
 
 
 def assert_as_in_float64(owners: Tensor, widths: tuple[int, ...], activation: Activation) -> None:
-    """Of two parts of the input; a third of the rows has no gradient."""
+    """Compare with float64 for an input of two parts; a third of the rows has no gradient."""
     table = as_table(*networks(widths))
     inputs = [torch.randn(len(owners), width, dtype=torch.float64) for width in (2, widths[0] - 2)]
     direction = torch.randn(len(owners), widths[-1], dtype=torch.float64)
@@ -139,7 +139,7 @@ def test_networks_of_many_rows_against_float64(activation: Activation) -> None:
 @pytest.mark.parametrize("asked", ["density", "features", "both"])
 @pytest.mark.parametrize("kind", OWNERS)
 def test_density_and_features_against_float64(kind: str, asked: str) -> None:
-    """Of log-densities beyond 15, where they are clipped. The first feature is the network, without a gradient."""
+    """Log-densities go beyond 15, where they are clipped. The first feature is the network, without a gradient."""
     owners, table = OWNERS[kind], as_table(*networks())
     table[:, -15:-11] *= 8  # the last layer's weights of the first output
     x = torch.randn(len(owners), 5, dtype=torch.float64)
@@ -174,7 +174,7 @@ def test_layers_are_views_of_the_table() -> None:
 
 @needs_kernels
 def test_columns_of_a_larger_tensor_are_an_input() -> None:
-    """As the features of one network are those of the next: without their first, and without a copy."""
+    """The features of one network, without the first, are the next one's input without a copy."""
     owners, table, wide = OWNERS["mixed"], as_table(*networks()).float(), torch.randn(13, 9, requires_grad=True)
     parts, copied = [wide[:, 1:4], wide[:, 7:]], [wide[:, 1:4].contiguous(), wide[:, 7:].contiguous()]
     found = []
@@ -198,7 +198,7 @@ def test_rows_are_sorted_by_network(kind: str) -> None:
 @needs_kernels
 @pytest.mark.parametrize("widths", [WIDTHS, FIELD[0]], ids=str)
 def test_threads_agree_bit_for_bit(widths: tuple[int, ...]) -> None:
-    """Of networks with a few rows, and of one whose rows are summed in several pieces."""
+    """Some networks have a few rows, and one has rows that are summed in several pieces."""
     owners = torch.cat([PIECES, torch.randint(NETWORKS, (700,))])
     table, x = as_table(*networks(widths)).float(), torch.randn(len(owners), widths[0])
     direction, before, found = torch.randn(len(owners), widths[-1]), torch.get_num_threads(), []
@@ -276,7 +276,7 @@ def test_the_gradient_of_the_table_waits_where_it_is_asked_for(asked: str) -> No
 @needs_kernels
 @pytest.mark.parametrize("same", [True, False])
 def test_adam_of_networks_is_sparse_adam(same: bool) -> None:
-    """Of the sum of what was asked of some networks, and of the rows of those or of others."""
+    """The loss is a sum of outputs of some networks; Adam takes the rows of these or of others."""
     owners, table = OWNERS["mixed"], as_table(*networks()).float().requires_grad_()
     state, count = [torch.rand(table.shape), torch.rand(table.shape), torch.full((NETWORKS,), 3.0)], len(owners)
     x, deferred, rows = torch.randn(count, 5), RowGradient(), owners.unique() if same else torch.tensor([0, 2])

@@ -1,4 +1,4 @@
-"""What Gaussians grow by is the same on every backend: absolute gradients of their centres, against float64.
+"""The criterion of growth is the same on every backend: absolute gradients of their centres, against float64.
 
 Triton's form: tests/kernels/triton/test_splats.py.
 """
@@ -31,7 +31,7 @@ def test_growth_is_by_the_pixels_absolute_gradients(name: str, size: tuple[int, 
 
 @pytest.mark.parametrize("form", [blend_reference, few(BLEND)])
 def test_growth_by_images_with_normals(form: Callable[..., Blended]) -> None:
-    """Whose gradient no compiled form has."""
+    """No compiled form has the gradient of images with normals."""
 
     def with_normals(*given: Any) -> Blended:
         drawn = form(*given[:-2], CHANNELS["normals"], False)

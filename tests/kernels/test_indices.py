@@ -30,7 +30,7 @@ CALLS: dict[str, tuple[int, Callable[[Tensor], object]]] = {
     "owners": (4, lambda index: sort_by_ray(index, torch.ones(len(index), dtype=torch.uint8), 4)),
     "photographs": (7, lambda index: Appearance(3, 7)(index, len(index))),
 }
-"""What takes indices, and how many there are."""
+"""Functions that take indices, and the number of valid ones."""
 
 
 @pytest.mark.parametrize("name", CALLS)

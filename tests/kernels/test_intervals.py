@@ -98,7 +98,7 @@ def test_excess(rays: int, bins: int, proposed: int) -> None:
 
 @pytest.mark.parametrize("function", [proposal_excess, proposal_excess_reference])
 def test_excess_in_closed_form(function) -> None:
-    """An interval of weight 0.9 inside a proposed one of 0.5 has 0.4 too much; what is bounded costs nothing."""
+    """An interval of weight 0.9 inside a proposed one of 0.5 has 0.4 too much; a bounded interval costs nothing."""
     edges, weights = torch.tensor([[0.1, 0.2, 0.6]]), torch.tensor([[0.9, 0.1]])
     proposed, guess = torch.tensor([[0.0, 0.5, 1.0]]), torch.tensor([[0.5, 0.5]], requires_grad=True)
     loss = function(edges, weights, proposed, guess)

@@ -1,4 +1,4 @@
-"""Results kept for the backward pass: values and gradients are those of a plain evaluation, whatever a field does."""
+"""Results kept for the backward pass: values and gradients equal a plain evaluation's, for every field."""
 
 import math
 import threading
@@ -35,7 +35,7 @@ Density = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def at(field: Field, positions: Tensor, times: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return what a field has at positions."""
+    """Return a field's density and features at positions."""
     return field.density(Points(positions, times))
 
 
@@ -97,14 +97,14 @@ class Sorted(Plugin):
 
 
 class Chunks(Plugin):
-    """At most 42 positions are looked up at once: all of a wave, and not all that are chosen."""
+    """At most 42 positions are looked up at once: all of a wave, but not all chosen ones."""
 
     def features(self, unit: Tensor) -> Tensor:
         return torch.cat([self.first(self.grid(part)) for part in unit.split(42)])
 
 
 class Masked(Plugin):
-    """What lies in one half is looked up."""
+    """Only positions in one half are looked up."""
 
     def features(self, unit: Tensor) -> Tensor:
         inside = unit[:, 0] > 0.5
@@ -113,7 +113,7 @@ class Masked(Plugin):
 
 
 class InPlace(Plugin):
-    """What ours return is changed in place."""
+    """The results of our functions are changed in place."""
 
     def features(self, unit: Tensor) -> Tensor:
         return self.first(self.grid(unit).mul_(2))
@@ -164,7 +164,7 @@ def tensors() -> TensorField:
 def cells() -> NetworkGrid:
     found = NetworkGrid(BOX, 3, width=8, position_frequencies=3)
     nn.init.normal_(found.trunk.table, std=0.3)
-    found.trunk.deferred = None  # autograd accumulates the gradient, as that of the others
+    found.trunk.deferred = None  # autograd accumulates this gradient too
     return found
 
 
@@ -210,7 +210,7 @@ def chosen(count: int = 45) -> Tensor:
 
 
 def in_waves(density: Density, order: Tensor) -> tuple[tuple[Tensor, ...], list[Tensor], set[str]]:
-    """What is chosen; the densities of the waves; the compiled functions that evaluated what is chosen."""
+    """The chosen samples; the densities of the waves; the compiled functions that evaluated the chosen samples."""
     positions, times = inputs()
     waves, seen = Waves(), []
     for x, t in zip(positions, times, strict=True):
@@ -224,7 +224,7 @@ def in_waves(density: Density, order: Tensor) -> tuple[tuple[Tensor, ...], list[
 
 
 def assert_as_plain(field: nn.Module, density: Density, order: Tensor) -> set[str]:
-    """Hold values and gradients against those of one plain evaluation; the compiled functions that ran meanwhile."""
+    """Compare values and gradients with one plain evaluation; return the compiled functions that ran meanwhile."""
     positions, times = inputs()
     found, seen, ran = in_waves(density, order)
     plain = density(torch.cat(positions)[order], torch.cat(times)[order])
@@ -256,7 +256,7 @@ def test_a_field_is_differentiated_and_not_evaluated_again(name: str) -> None:
 
 @needs_kernels
 def test_a_distance_whose_levels_open_is_not_evaluated_again() -> None:
-    """At each call the weights of the open levels are other memory with the same values."""
+    """The weights of the open levels have new memory at each call, with the same values."""
     torch.manual_seed(0)
     opening = HashGrid(4, 2, 4, 32, 9, opening=0.5)
     nn.init.normal_(opening.table, std=0.01)
@@ -320,7 +320,7 @@ def test_however_many_are_chosen(count: int) -> None:
 
 
 def test_the_tables_gradient_waits_once() -> None:
-    """The optimiser gets the gradient of what was chosen, and no other."""
+    """The optimiser gets the gradient of the chosen samples, and no other."""
     torch.manual_seed(0)
     field, order = EncodedField(BOX, grid(sparse=True)), chosen()
     found, _, _ = in_waves(partial(at, field), order)
@@ -360,7 +360,7 @@ def test_what_is_not_compiled_is_evaluated_once(kind: torch.dtype) -> None:
 
 @needs_kernels
 def test_large_layers_of_torch_are_not_evaluated_twice_for_an_encoding() -> None:
-    """What has no parameters is not worth it."""
+    """An encoding without parameters is not worth keeping."""
     torch.manual_seed(0)
     layer, asked = nn.Linear(15, 2), []
 
@@ -405,7 +405,7 @@ def test_parameters_that_were_changed_meanwhile_count() -> None:
 
 
 class Broken(Exception):
-    """What a field raises."""
+    """The error of a field."""
 
 
 @needs_kernels
@@ -428,7 +428,7 @@ def test_an_error_leaves_nothing_behind(stage: str) -> None:
 
 
 def test_another_thread_is_left_alone() -> None:
-    """What a second thread evaluates meanwhile is neither kept nor replaced."""
+    """Evaluations of a second thread meanwhile are neither kept nor replaced."""
     torch.manual_seed(0)
     field, other = EncodedField(BOX, grid()), EncodedField(BOX, grid())
     elsewhere: list[Tensor] = []

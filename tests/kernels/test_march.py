@@ -51,7 +51,7 @@ def walk(march, limit: int = 16, sigma: float = 0.0):
 @pytest.mark.parametrize("cone", [0.0, 1 / 64])
 @pytest.mark.parametrize(("resolution", "share"), [(5, 0.3), (16, 0.03), (33, 0.02), (64, 0.01), (64, 1.0), (8, 0.0)])
 def test_compiled_finds_what_the_reference_finds(resolution: int, share: float, cone: float) -> None:
-    """Rounding decides about steps whose middle lies on a cell's face: less than one in a thousand."""
+    """Rounding decides about steps with the middle on a cell's face: less than one in a thousand."""
     rays, grid = random_rays(300), occupancy(resolution, share)
     shift = torch.rand(300, generator=torch.Generator().manual_seed(1))
     found = []
@@ -168,7 +168,7 @@ def test_cone_steps_are_even_and_then_geometric() -> None:
 
 @pytest.mark.parametrize("kind", [CompiledMarch, ReferenceMarch])
 def test_each_ray_marches_through_the_slice_of_its_time(kind) -> None:
-    """As rays do, slice by slice, through a grid that has this slice alone; 5^3 cells do not fill whole bytes."""
+    """The result equals a march through a grid with this slice alone; 5^3 cells do not fill whole bytes."""
     if kind is CompiledMarch and not native.available():
         pytest.skip("the compiled kernels are not installed")
     slices, resolution = 3, 5

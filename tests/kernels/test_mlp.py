@@ -154,7 +154,7 @@ def test_biases_and_activations(activation: Activation, bfloat16: bool) -> None:
 @pytest.mark.parametrize("asked", ["density", "outputs", "both"])
 @pytest.mark.parametrize(("parts", "layers"), [((32,), (64, 16)), ((5, 3), (1,)), ((40,), (30, 17))])
 def test_density_and_outputs_against_the_reference(parts, layers, asked: str) -> None:
-    """Of log-densities from -30 to 40, which are clipped at 15, in batches that are not whole blocks."""
+    """Log-densities go from -30 to 40 and are clipped at 15; batches are not whole blocks."""
     inputs, weights = network(parts, layers, 333)
     weights[-1][0] *= 8
     of_density, of_outputs = torch.randn(333) * 1e-3, torch.randn(333, layers[-1])
@@ -173,7 +173,7 @@ def test_density_and_outputs_against_the_reference(parts, layers, asked: str) ->
 
 
 def test_the_density_is_its_own_derivative_and_nan_stays_where_it_is() -> None:
-    """exp(min(x, 15)), whose slope by x is the value itself, beyond 15 too (Instant-NGP's trunc_exp)."""
+    """The density is exp(min(x, 15)); its slope by x is the value itself, beyond 15 too (Instant-NGP's trunc_exp)."""
     logs = torch.tensor([-100.0, -3.0, 0.0, 14.5, 16.0, 80.0, torch.nan], requires_grad=True)
     density, out = density_mlp([logs[:, None]], [torch.ones(1, 1)])
     (slope,) = torch.autograd.grad(density.sum(), logs)

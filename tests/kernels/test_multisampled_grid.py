@@ -38,7 +38,7 @@ def points(count: int, each: int, spread: float, seed: int = 0) -> Tensor:
 
 
 def test_features_are_weighted_means_of_those_of_single_points() -> None:
-    """In float64, with the weights by their formula."""
+    """The truth is computed in float64, with the weights by their formula."""
     x = points(30, 6, 0.05).double()
     table = torch.randn(LAYOUT.num_entries, 2, dtype=torch.float64)
     found = multisampled_grid(x, table, LAYOUT).view(30, 4, 2)
@@ -60,7 +60,7 @@ def test_one_point_without_size_is_a_plain_look_up() -> None:
 @pytest.mark.parametrize("features", [1, 2, 4, 8])
 @pytest.mark.parametrize(("each", "spread"), [(6, 1e-4), (6, 0.02), (6, 1.0), (1, 0.1), (3, 0.01)])
 def test_compiled_values_and_gradients_are_the_references(each: int, spread: float, features: int) -> None:
-    """With points that share their cells at all levels, at some, and at none."""
+    """Points share their cells at all levels, at some, or at none."""
     x, found = points(603, each, spread), []
     table = torch.randn(LAYOUT.num_entries, features, generator=torch.Generator().manual_seed(1))
     direction = torch.randn(603, 4 * features, generator=torch.Generator().manual_seed(2))
@@ -93,7 +93,7 @@ def test_deferred_gradients_of_parts_with_different_numbers_of_points_are_the_de
 
 @needs_kernels
 def test_a_step_of_adam_moves_the_entries_that_were_used() -> None:
-    """By the learning rate against the sign of the gradient, as any first step of Adam."""
+    """They move by the learning rate against the sign of the gradient, as in any first step of Adam."""
     torch.manual_seed(0)
     grid = MultisampledHashGrid(4, 4, 4, 300, 9, sparse=True)
     assert grid.deferred is not None
@@ -114,7 +114,7 @@ def test_a_step_of_adam_moves_the_entries_that_were_used() -> None:
 
 
 def test_the_decay_is_the_gradient_of_the_mean_square_of_each_levels_features(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the mean over the places at which every eighth frustum is taken; one place alone leaves the others be."""
+    """The mean over all choices of every eighth frustum has it; one choice does not change the other frustums."""
     torch.manual_seed(0)
     grids = [MultisampledHashGrid(4, 2, 4, 300, 9, decay=decay) for decay in (0.0, 0.1)]
     x = points(40, 6, 0.01)
@@ -228,7 +228,7 @@ def test_a_ball_has_the_mean_and_the_volume_of_points_in_its_frustum(contracted:
 
 
 def gradients_of_rays(form: str, cones: Frustums, box: Tensor, contracted: bool) -> tuple[Tensor, Tensor]:
-    """The gradients by origins and directions of a random direction in what stands for the frustums, in one form."""
+    """The gradients by origins and directions, along a random direction of the values of frustums, in one form."""
     origins, directions = (x.clone().requires_grad_() for x in (cones.origins, cones.directions))
     learnt = replace(cones, origins=origins, directions=directions)
     if "ball" in form:

@@ -1,4 +1,4 @@
-"""Finding the compiled library, and what is checked before an address leaves Python."""
+"""Finding the compiled library, and the checks before an address leaves Python."""
 
 import platform
 import shutil
@@ -105,7 +105,7 @@ def test_every_variant_that_fits_this_processor_gives_the_same_answer(variant: s
 
 @needs_kernels
 def test_libraries_of_other_sources_are_not_called(tmp_path: Path, forks: Forks) -> None:
-    """As after an update of a checkout: what a function takes may have changed, and it would read foreign memory."""
+    """After an update of a checkout, a function's arguments may have changed, and it would read foreign memory."""
     code = (
         "from pathlib import Path\n"
         "from nerfloom.kernels import native\n"

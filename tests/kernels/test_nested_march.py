@@ -53,7 +53,7 @@ def rays_of(kind: str, count: int = 40) -> Rays:
 
 
 def steps_by_brute_force(rays: Rays, cells: Occupancy, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (N, 2) of the steps of a ray whose middle lies in an occupied cell, and whether that is sure (N,)."""
+    """Ends (N, 2) of the steps of a ray with their middle in an occupied cell, and whether this is certain (N,)."""
     half, levels = 2.0 ** (cells.levels - 1), cells.levels
     center = np.array([0.0, -0.5, 0.5])
     origin, direction = (part[index].double().numpy() for part in (rays.origins, rays.directions))
@@ -111,7 +111,7 @@ def test_the_steps_are_those_of_brute_force(form: type[March], share: float, kin
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_full_grid_has_no_gaps_where_the_box_changes(form: type[March]) -> None:
-    """From where the ray starts to where it leaves the largest box, each step begins where the last one ends."""
+    """Each step begins where the last one ends, from the ray's start to the end of the largest box."""
     rays, cells = rays_of("inside"), grid(2.0)
     ends, owners = marched(of(form, rays, cells, STEP, CONE, None, 0.0))
     leave = intersect_box(rays.origins, rays.directions, cells.outer)[1].double().numpy()
@@ -169,7 +169,7 @@ def test_the_middle_of_a_box_says_what_the_smaller_one_holds() -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_one_box_is_marched_as_ever(form: type[March]) -> None:
-    """Nested boxes whose larger ones are empty hold the samples of the smallest alone."""
+    """If the larger boxes are empty, the samples are the smallest box's alone."""
     single, rays = grid(0.3, levels=1), rays_of("between")
     nested = Occupancy(torch.cat([single.occupied, torch.zeros(4 * RESOLUTION**3, dtype=torch.bool)]), BOX, 16, 5)
     starts = torch.zeros(len(rays))
@@ -183,7 +183,7 @@ def test_one_box_is_marched_as_ever(form: type[March]) -> None:
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_the_rest_is_one_sample_behind_the_grid(form: type[March], share: float) -> None:
-    """On rays that light is left on, from where they leave the largest box, evaluated half way to their far ends."""
+    """Rays with light left get one where they leave the largest box, evaluated half way to their far ends."""
     rays, cells = rays_of("inside"), grid(share)
     march = of(form, rays, cells, STEP, CONE, None, 1e-2)
     opaque = torch.arange(len(rays)) % 2 == 0

@@ -112,7 +112,7 @@ def test_the_reference_is_the_integral_over_every_leaf(degree: int) -> None:
     rays, background = rays_at(layout, 60), torch.rand(60, 3)
     exact = in_float64(rays)
     found = trace_octree_reference(layout, raw.double(), coefficients.double(), exact, background.double())
-    # A ray in the face of cells is in those on either side, or in none: those are left out of the comparison.
+    # A ray in a face of cells is in the cells on either side, or in none: such rays are left out of the comparison.
     slow = rays.directions.abs().amin(-1) > 1e-6
     truth = by_hand(layout, raw, coefficients, rays, background)
     pick = lambda light: OctreeLight(*(part[slow] for part in light))  # noqa: E731
@@ -142,7 +142,7 @@ def test_distances_between_bricks_are_those_by_brute_force() -> None:
 
 
 def test_a_closed_form() -> None:
-    """A row of leaves of one density: the opacity of its length, whatever cells it is cut into."""
+    """A row of leaves of one density has the opacity of its length, for cells of any size."""
     cells = torch.stack([torch.arange(16), torch.full((16,), 3), torch.full((16,), 5)], -1)
     layout = layout_of(cells)
     raw = torch.full((16, 1), 0.3)
@@ -166,7 +166,7 @@ def test_compiled_against_float64(degree: int) -> None:
     raw, coefficients = values(layout, degree)
     rays, background = rays_at(layout, 3000), torch.rand(3000, 3)
     found = trace_octree(layout, raw, coefficients, rays, background)
-    # In the reference's own type, rays in faces of cells are on the same side of them.
+    # The reference's own type puts rays in faces of cells on the same side of them.
     truth = trace_octree_reference(layout, raw.double(), coefficients.double(), in_float64(rays), background.double())
     slow = rays.directions.abs().amin(-1) > 1e-6
     pick = lambda light: OctreeLight(*(part[slow] for part in light))  # noqa: E731
@@ -197,7 +197,7 @@ def test_gradients_against_float64(degree: int, stop: float) -> None:
     for ours, truth in zip(*found, strict=True):
         error = relative_error(ours, truth)
         print(f"gradient: {error:.2g}")
-        # With a stop, rounding may end a ray one leaf earlier or later.
+        # Rounding may end a ray one leaf earlier or later if there is a stop.
         assert error < (1e-4 if stop == 0 else 3e-3)
 
 

@@ -135,7 +135,7 @@ def test_levels_have_gradients_and_weights() -> None:
 
 @needs_kernels
 def test_wide_pixels_alone_see_coarser_leaves_in_the_same_box() -> None:
-    """What is as narrow as in the finest level keeps its bits; a box that is no multiple of two bricks is padded."""
+    """Rays as narrow as in the finest level keep their bits; a box that is no multiple of two bricks is padded."""
     torch.manual_seed(5)
     cells = torch.cartesian_prod(*[torch.arange(BRICK * count) for count in (3, 2, 1)])
     origin = torch.tensor([-1.0, -0.7, -0.3])

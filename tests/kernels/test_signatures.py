@@ -1,4 +1,4 @@
-"""Each declaration of a C function in Python says what its C++ source says: a wrong one would read foreign memory."""
+"""Each declaration of a C function in Python agrees with its C++ source: a wrong one would read foreign memory."""
 
 import importlib
 import pkgutil
@@ -21,7 +21,7 @@ def without_comments(text: str) -> str:
 
 
 def exported(text: str) -> dict[str, tuple[str, ...]]:
-    """The parameters' types of every exported function that returns a status: a letter, or p and what it points to."""
+    """The parameters' types of every exported function that returns a status: a letter, or p and its target's type."""
     found = {}
     for name, parameters in re.findall(r"\bEXPORT\s+int\s+(\w+)\s*\(([^)]*)\)", without_comments(text)):
         found[name] = tuple(kind(parameter) for parameter in parameters.split(",") if parameter.strip())
@@ -29,7 +29,7 @@ def exported(text: str) -> dict[str, tuple[str, ...]]:
 
 
 def kind(parameter: str) -> str:
-    """As `float* out` is p:float, and `int64_t count` is q."""
+    """For example, `float* out` is p:float, and `int64_t count` is q."""
     words = re.sub(r"\bconst\b|\w+\s*$", "", parameter).split()  # the last word is the name
     target, stars = re.fullmatch(r"(\w+)\s*([*\s]*)", " ".join(words)).groups()
     return f"p:{target}" if stars else LETTERS[target]
@@ -49,7 +49,7 @@ def declared() -> dict[str, list[native.Function]]:
 
 
 def problem(function: native.Function, parameters: tuple[str, ...]) -> str | None:
-    """What a declaration says otherwise than the source; None where nothing."""
+    """The difference between a declaration and the source; None if there is none."""
     *read, written = parameters if function.result else (*parameters, "")
     letters = "".join(parameter[0] for parameter in read)
     if letters != function.arguments:
@@ -94,7 +94,7 @@ def test_every_declaration_is_its_source() -> None:
         ("piffd", "q", "takes pqfid, not piffd"),  # an int for 64 bits
         ("qqfid", "q", "takes pqfid, not qqfid"),  # a number for a pointer
         ("pqfid", "i", "writes p:int64_t through its last argument, not i"),
-        ("pqfid", "", "takes pqfidp, not pqfid"),  # what it writes is not asked for
+        ("pqfid", "", "takes pqfidp, not pqfid"),  # no address for its result
     ],
 )
 def test_a_wrong_declaration_is_found(arguments: str, result: str, said: str | None) -> None:

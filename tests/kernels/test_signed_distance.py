@@ -112,7 +112,7 @@ def test_a_broken_table_shows_in_values() -> None:
 
 
 def test_a_step_of_a_distance_with_bounded_slope_passes_no_surface() -> None:
-    """A distance that is `stretch` times too long, for which the safety is exactly enough, on rays of any angle."""
+    """A distance that is `stretch` times too long, so that the safety is exactly enough, on rays of any angle."""
     torch.manual_seed(0)
     stretch = SAFETY
     origins = 2 * torch.nn.functional.normalize(torch.randn(500, 3, dtype=torch.float64), dim=-1)
@@ -198,7 +198,7 @@ def test_edges_cover_the_same_share_as_in_the_readable_form() -> None:
 
 @needs_kernels
 def test_a_ray_that_starts_inside_leaves_first() -> None:
-    """From inside of the ball it meets nothing, or the floor from above, as does one from outside."""
+    """A ray from inside the ball meets nothing, or the floor from above, as does one from outside."""
     origins = torch.tensor([[0.0, 0.0, 0.2], [0.0, 0.0, 0.2], [0.9, 0.0, 0.5]])
     directions = torch.tensor([[0.0, 0.0, 1.0], [0.8, 0.0, -0.6], [0.0, 0.6, -0.8]])
     found = met(Rays(origins, directions), ball())

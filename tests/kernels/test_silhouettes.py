@@ -57,7 +57,7 @@ def test_balls_are_held_as_by_the_reference(distance: float, every: bool, closed
     print(f"{changed} of 5000 changed, {differ} otherwise than in the reference")
     assert changed > 20
     assert differ <= 5  # where rounding moves an edge across a pixel
-    assert bool(found[0]) == bool(known[0] or not every)  # nothing is known of what is nowhere
+    assert bool(found[0]) == bool(known[0] or not every)  # an empty ball has no place
 
 
 @pytest.mark.parametrize("distance", [0.05, 1.2, 2.0, 6.0])

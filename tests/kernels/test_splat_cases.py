@@ -17,7 +17,7 @@ from tests.kernels.splat_truth import NAMES, camera, compared, drawn, leaves, sc
 pytestmark = needs_kernels
 BLACK = torch.zeros(3)
 FOCAL = 1e4
-"""So long, in pixels, that no perspective stretches what is not on the axis."""
+"""A focal length, pixels, that is long enough to neglect perspective off the axis."""
 
 
 def logit(opacity: float) -> float:
@@ -52,7 +52,7 @@ def together(*scenes: list[Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 4.0])
 @pytest.mark.parametrize("opacity", [0.1, 0.5, 0.95])
 def test_the_integral_of_alpha(opacity: float, sigma: float, antialiased: bool) -> None:
-    """Over where alpha is at least m: 2 pi variance (opacity - m). Antialiasing keeps what it would be without blur."""
+    """Where alpha is at least m, it is 2 pi variance (opacity - m). Antialiasing keeps the integral without blur."""
     blur = 0.3
     drawn_one = drawn(ball(50.3, 49.8, sigma, opacity), straight(100, 100, blur=blur, antialiased=antialiased))
     found = float((1 - drawn_one.transmittance.double()).sum())
@@ -65,7 +65,7 @@ def test_the_integral_of_alpha(opacity: float, sigma: float, antialiased: bool) 
 
 @pytest.mark.parametrize("near_one", [0, 1])
 def test_two_that_overlap(near_one: int) -> None:
-    """The nearer is in front, in whatever order they are given; the image is a + (1 - a) b over the background."""
+    """The nearer is in front, in any order of rows; the image is a + (1 - a) b over the background."""
     colors, opacities = (0.9, 0.2), (0.6, 0.7)
     far_one = 1 - near_one
     pair = [
@@ -157,7 +157,7 @@ def test_normals_are_of_the_shortest_axis_and_face_the_camera(axis: int) -> None
     ids=["needles", "discs", "dust", "sheets around the camera"],
 )
 def test_far_from_round(sizes: tuple[float, float, float], bound: float, antialiased: bool) -> None:
-    """Up to 100 000 times as long as they are thick. With antialiasing, needles and dust are not seen."""
+    """Gaussians are up to 100 000 times as long as they are thick. Antialiasing hides needles and dust."""
     torch.manual_seed(1)
     given = scene(30)
     given[1] = torch.tensor(sizes).expand(30, 3).contiguous()
@@ -327,7 +327,7 @@ def test_nothing_to_see(count: int) -> None:
 
 
 def test_a_hundred_thousand_at_one_point() -> None:
-    """They are as far from the camera, so their order is that of their indices."""
+    """All have the same distance from the camera, so their indices determine their order."""
     count = 100_000
     given = [tensor.expand(count, *tensor.shape[1:]).contiguous() for tensor in ball(2.5, 2.5, 3.0, 0.02)[:6]]
     given[4] = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
@@ -350,7 +350,7 @@ def test_a_hundred_thousand_at_one_point() -> None:
 
 
 def test_far_from_the_origin_and_tiny_or_huge_scenes() -> None:
-    """Scales of the scene change nothing but the near plane; positions lose what float32 has not."""
+    """Scales of the scene change only the near plane; positions lose digits that float32 does not have."""
     torch.manual_seed(7)
     given, view = scene(40), camera(30, 30)
     expected = true_image(given, view)
@@ -400,7 +400,7 @@ def test_what_is_refused() -> None:
 
 
 def test_beyond_a_lenss_reach_nothing_is_drawn() -> None:
-    """A barrel lens of k1 = -0.3 would fold back what is farther than 1 / sqrt(0.9) from its axis."""
+    """A barrel lens of k1 = -0.3 would fold back points farther than 1 / sqrt(0.9) from its axis."""
     lens = Distortion.of("opencv", torch.tensor([[-0.3] + [0.0] * 8]))
     view = SplatCamera(torch.eye(3, 4), (50.0, 50.0, 40.0, 40.0), 80, 80, lens=lens, model="opencv")
     across = torch.tensor([0.0, 0.5, 1.04, 1.07, 1.2, 1.8, -1.2, -0.5])

@@ -22,7 +22,7 @@ from tests.kernels.compiled import needs_kernels, relative_error
 from tests.kernels.splat_truth import LENSES, NAMES, camera, leaves, real_harmonics, scene, turned
 
 COEFFICIENTS = {"opencv": LENSES["opencv"], "fisheye": (-0.02, 6e-3, -2e-3, 2e-4)}
-"""Of each lens; the fisheye shows all directions."""
+"""Coefficients of each lens; the fisheye shows all directions."""
 SMOOTH = [*range(Record.CUT), Record.RED, Record.GREEN, Record.BLUE, Record.DISTANCE]
 """Columns of a record that pass gradients on."""
 DISTANCE = 3.0
@@ -40,7 +40,7 @@ PLACES = [
 
 
 def view(model: str, blur: float = 1e-6, **settings: Any) -> SplatCamera:
-    """Return an unscented camera whose frame is the scene's."""
+    """Return an unscented camera in the scene's frame."""
     pose, given = torch.eye(3, 4, dtype=torch.float64), COEFFICIENTS.get(model)
     lens = None if given is None else Distortion.of(model, torch.tensor([given], dtype=torch.float64))
     settings |= {"near": 0.1, "blur": blur, "lens": lens, "model": model, "unscented": True}
@@ -58,7 +58,7 @@ def toward(longitude: float, latitude: float, distance: float = DISTANCE) -> lis
 
 
 def gaussians(places: list[list[float]], size: float = 0.04, harmonics: int = 3) -> list[Tensor]:
-    """Return parameters of turned Gaussians in float64, whose size is an angle at DISTANCE, radians."""
+    """Return parameters of turned Gaussians in float64; their size is an angle at DISTANCE, radians."""
     chance, count = torch.Generator().manual_seed(1), len(places)
 
     def some(*shape: int) -> Tensor:
@@ -156,7 +156,7 @@ def test_gradients_by_finite_differences(model: str) -> None:
 
 @pytest.mark.parametrize("model", ["fisheye", "equirectangular"])
 def test_what_is_drawn(model: str) -> None:
-    """What lies beside and behind the camera is; what is too near is not, nor what is exactly behind a fisheye."""
+    """Gaussians beside and behind the camera are drawn; too near ones, and ones exactly behind a fisheye, are not."""
     directions = [(0, 0), (100, 0), (170, 0), (-90, 20)]
     places = [*(toward(*each) for each in directions), [0, 0, -DISTANCE], toward(100, 0, 0.05)]
     records, dropped = project_gaussians(*gaussians(places), view(model))
@@ -269,7 +269,7 @@ def test_packed_is_as_rows(model: str) -> None:
 
 
 def test_copies_are_where_the_image_shows_another_side() -> None:
-    """Of two at the edges, one that is wider than the image, one in the middle, and one that is not visible."""
+    """Two are at the edges, one is wider than the image, one is in the middle, and one is not visible."""
     records = torch.zeros(5, RECORD)
     records[:, Record.X] = torch.tensor([3.0, 98.0, 40.0, 50.0, 1.0])
     records[:, Record.REACH_X] = torch.tensor([5.0, 4.0, 90.0, 10.0, 9.0])
@@ -301,8 +301,7 @@ def panorama_camera(width: int, pose: Tensor) -> Cameras:
 
 
 def test_turning_the_camera_turns_the_panorama() -> None:
-    """By half a turn: the picture is rolled by half of its width, so the seam is as good as the middle. Gradients, too,
-    are those of the same picture."""
+    """A half turn rolls the picture by half of its width, so the seam is as good as the middle. Gradients agree too."""
     given, width = cloud(150), 160
     weights = torch.rand(width // 2, width, 3, generator=torch.Generator().manual_seed(4))
     pictures, slopes = [], []

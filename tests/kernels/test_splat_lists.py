@@ -44,7 +44,7 @@ def needed(records: Tensor, width: int, height: int) -> Tensor:
 
 
 def check(lists: TileLists, records: Tensor, width: int, height: int) -> Tensor:
-    """Check the lists' form and order. Returns (N, T) bool: what is listed."""
+    """Check the lists' form and order. Returns (N, T) bool: whether a Gaussian is in a tile's list."""
     count, entries = len(records), len(lists.ids)
     tiles = -(-width // TILE) * -(-height // TILE)
     assert all(part.dtype == torch.int32 for part in lists[:4])
@@ -61,7 +61,7 @@ def check(lists: TileLists, records: Tensor, width: int, height: int) -> Tensor:
     near, far = records[ids[:-1], Record.DISTANCE], records[ids[1:], Record.DISTANCE]
     ordered = (near < far) | ((near == far) & (ids[:-1] < ids[1:]))
     assert bool((ordered | (tile[:-1] != tile[1:])).all())
-    # Slots: sorted by Gaussian, and those of each by tile.
+    # Slots are sorted by Gaussian, and within one by tile.
     place = torch.empty(entries, dtype=torch.long)
     place[lists.slots.long()] = torch.arange(entries)
     assert torch.equal(ids[place], torch.repeat_interleave(lists.firsts.diff().long()))

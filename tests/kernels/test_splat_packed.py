@@ -21,7 +21,7 @@ def posed(lens: str, pose: torch.Tensor, **settings: object) -> SplatCamera:
     ("count", "harmonics", "degree"), [(1, 15, 3), (16, 3, 1), (333, 15, 3), (334, 8, 1), (47, 0, 3)]
 )
 def test_records_are_those_of_rows(lens: str, count: int, harmonics: int, degree: int) -> None:
-    """Of needles, giants, and what lies behind the camera or beside the image; compilers round in another order."""
+    """Some are needles, giants, behind the camera or beside the image; compilers round in another order."""
     torch.manual_seed(count)
     *rows, pose = scene(count, harmonics, spread=4.0)
     rows[0][::3, 2] -= 4
@@ -64,7 +64,7 @@ def ring(count: int) -> list[torch.Tensor]:
 
 
 def test_blocks_whose_balls_the_image_does_not_show_are_not_read() -> None:
-    """Not even where their Gaussians, against what the ball says, are in the middle of the image."""
+    """They are not read even if their Gaussians, against the ball, are in the middle of the image."""
     torch.manual_seed(0)
     seen, packed = camera(57, 43), pack_gaussians(*ring(64))
     truth = project_packed(packed, seen)

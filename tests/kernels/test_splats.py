@@ -83,7 +83,7 @@ def test_images_and_gradients(lens: str, antialiased: bool, channels: int) -> No
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("harmonics", [0, 3, 8, 15])
 def test_harmonics_of_each_degree(degree: int, harmonics: int) -> None:
-    """Those that there are not, or that do not count yet, have neither effect nor gradient."""
+    """Harmonics that are missing, or do not count yet, have neither effect nor gradient."""
     torch.manual_seed(2)
     given = scene(40, harmonics)
     assert compared(given, camera(20, 18), degree=degree).worst() < BOUND
@@ -159,7 +159,7 @@ def test_what_the_channels_hold(lens: str) -> None:
 
 @needs_kernels
 def test_the_sum_of_the_pixels_absolute_gradients() -> None:
-    """In the columns ABSOLUTE_X and ABSOLUTE_Y, whatever comes from outside: those of x and of y."""
+    """The columns ABSOLUTE_X and ABSOLUTE_Y have the sums of x and of y, whatever gradient comes from outside."""
     torch.manual_seed(5)
     given, view = scene(80), camera(37, 41)
     *parameters, pose = given
@@ -240,7 +240,7 @@ def test_memory_in_another_order_and_gradients_of_some() -> None:
 
 @needs_kernels
 def test_gradients_of_image_and_transmittance_add_up() -> None:
-    """Each alone, and both; those of the image have another order in memory."""
+    """Each alone, and both, are tested; the image's gradient has another order in memory."""
     torch.manual_seed(9)
     given, view = scene(50), camera(22, 19)
     ours = leaves(given)
@@ -256,7 +256,7 @@ def test_gradients_of_image_and_transmittance_add_up() -> None:
 
 @needs_kernels
 def test_nothing_is_read_that_was_not_written() -> None:
-    """New memory is filled with NaN. Many entries of the lists are behind what is opaque, and many rows not visible."""
+    """New memory is filled with NaN. Many entries of the lists are behind opaque ones, and many rows not visible."""
     torch.manual_seed(10)
     given, view = scene(1003), camera(37, 41, antialiased=True)
     given[1] += 1.5

@@ -48,7 +48,7 @@ def value_and_gradient(
 
 
 def compared(image: Tensor, target: Tensor) -> tuple[float, float]:
-    """Return the error of the value, and that of the gradient over its largest, of `ssim` against float64."""
+    """Return the errors of the value, and of the gradient relative to its largest, of `ssim` against float64."""
     value, gradient = value_and_gradient(ssim, image, target)
     truth, true_gradient = value_and_gradient(ssim_reference, image.double(), target.double())
     assert value.dtype == gradient.dtype == torch.float32
@@ -344,7 +344,7 @@ def window_by_window(image: Tensor, target: Tensor, kept: Tensor, of_means: bool
 @pytest.mark.parametrize("size", [(11, 30, 3), (37, 26, 1), (45, 29, 4)], ids=str)
 @pytest.mark.parametrize("of_means", [True, False])
 def test_windows_with_ignored_pixels_do_not_count(size: tuple[int, int, int], of_means: bool) -> None:
-    """Nor does what stands in such pixels."""
+    """The values in such pixels do not count either."""
     torch.manual_seed(0)
     target = smooth(*size)
     image = noisy(target, 0.2)

@@ -43,7 +43,7 @@ def test_blurred_weights_are_integrals_of_the_convolution(radius: float) -> None
 
 
 def test_monte_carlo_agrees() -> None:
-    """Positions drawn from the histogram and moved by what is drawn from the box are counted in the bins."""
+    """Positions drawn from the histogram and moved by draws from the box are counted in the bins."""
     torch.manual_seed(0)
     edges, weights = histogram(1, 12)
     proposed = torch.linspace(-0.2, 1.2, 15, dtype=F64)[None]
@@ -52,7 +52,7 @@ def test_monte_carlo_agrees() -> None:
     x += 0.1 * (2 * torch.rand(len(x), dtype=F64) - 1)
     counted = torch.histogram(x, proposed[0]).hist / len(x) * weights.sum()
     found = blurred_weights(edges, weights, proposed, 0.1)[0]
-    print(f"blurred weights: off those of {len(x):,} draws by {(found - counted).abs().max():.1e}")
+    print(f"blurred weights: off {len(x):,} draws by {(found - counted).abs().max():.1e}")
     assert (found - counted).abs().max().item() < 5 * 0.5 / len(x) ** 0.5
     assert found.sum().item() == pytest.approx(weights.sum().item(), abs=1e-12)
 

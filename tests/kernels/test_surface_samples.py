@@ -50,7 +50,7 @@ def double(values: tuple) -> tuple:
 
 
 def results(run: object, values: tuple) -> tuple[Tensor, ...]:
-    """What stops light, features, and the gradients of a loss of both by network and sharpness."""
+    """Opacity or density, features, and the gradients of a loss of both by network and sharpness."""
     network, slope = (each.clone().requires_grad_() for each in values[:2])
     stopping, features = run(network, slope, *values[2:])  # type: ignore[operator]
     torch.manual_seed(1)
@@ -145,7 +145,7 @@ def test_the_first_shape_keeps_its_digits_under_autocast() -> None:
 
 @needs_kernels
 def test_gradients_become_unit_vectors() -> None:
-    """Of any length, 0 too; the other features stay."""
+    """Gradients may have any length, 0 too; the other features stay."""
     torch.manual_seed(0)
     features = torch.randn(300, 8) * torch.logspace(-6, 6, 300)[:, None]
     features[5, :3] = 0

@@ -1,4 +1,4 @@
-"""Thinned gradients: their mean over draws, and that kernels leave out what is zero without another bit."""
+"""Thinned gradients: their mean over draws, and the same bits from kernels that leave out zeros."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ COPIES = 4_000
 
 
 def gradients(floor: float, count: int, copies: int = 1) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Density (N,), its gradient and that of the colour (copies, N, 4), true and found, of sizes over five decades."""
+    """Density (N,), gradients of it and of the colour (copies, N, 4), true and found, with sizes over five decades."""
     generator = torch.Generator().manual_seed(0)
     sigma = torch.rand(count, generator=generator) * 3
     true = torch.randn(count, 4, generator=generator) * 10 ** -(5 * torch.rand(count, 1, generator=generator))

@@ -1,4 +1,4 @@
-"""Results do not depend on threads: neither on how many are asked for, nor on how many come, nor on who takes what."""
+"""Results do not depend on threads: on their wanted and real number, and on their shares of the work."""
 
 import json
 import os
@@ -35,7 +35,7 @@ Measured = dict[str, tuple[float, list[Tensor]]]
 
 @pytest.fixture(scope="module")
 def here() -> Measured:
-    """What this process measures on one thread."""
+    """Measurements of this process on one thread."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     found = measured()
@@ -94,7 +94,7 @@ def test_several_callers_at_once_get_what_one_gets() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
 def test_a_forked_process_has_threads_of_its_own(forks: Forks) -> None:
-    """In a process of its own: what is forked here would hold this one's files."""
+    """The test runs in a process of its own, because a fork of this one would hold its files."""
     code = (
         "import os, torch\n"
         "from nerfloom.kernels.networks.mlp import mlp\n"

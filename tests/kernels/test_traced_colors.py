@@ -1,4 +1,4 @@
-"""What traced rays show in one call, against single operations and float64, and pictures by it."""
+"""Colours of traced rays in one call, against single operations and float64, and pictures of them."""
 
 from pathlib import Path
 

@@ -30,7 +30,7 @@ pytestmark = needs_kernels
 
 
 class Case(NamedTuple):
-    """What differs between comparisons."""
+    """The settings that differ between comparisons."""
 
     rays: int = 600
     rays_per_pixel: int = 1
@@ -128,13 +128,13 @@ def test_value_and_gradient_are_those_of_single_operations(case: Case, bfloat16:
     assert ours.num_samples == theirs.num_samples > case.rays / 2
     torch.testing.assert_close(ours.error, theirs.error, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(ours.rgb, theirs.rgb, rtol=1e-4, atol=1e-5)
-    # bfloat16 rounds gradients, whose last bits in float32 differ.
+    # bfloat16 rounds gradients that differ in their last float32 bits.
     assert_near(own, expected, 3e-3 if bfloat16 else 2e-5)
 
 
 @pytest.mark.parametrize("case", CASES[:4], ids=str)
 def test_value_and_gradient_are_those_of_float64(case: Case) -> None:
-    """Of the same samples."""
+    """The truth uses the same samples."""
     found, own = learnt(case)
     torch.manual_seed(0)
     field = field_of(case)

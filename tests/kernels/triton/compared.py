@@ -53,7 +53,7 @@ def compare(
 ) -> list[Tensor]:
     """Run a function on float32 inputs, and on the same in float64, where the reference runs; return the results.
 
-    Gradients of the inputs named in `followed` are those of the results times fixed random numbers.
+    Gradients of the inputs named in `followed` come from the results times fixed random numbers.
     """
     found = []
     for dtype, device, name in ((torch.float32, DEVICE, expected), (torch.float64, torch.device("cpu"), "reference")):
@@ -69,7 +69,7 @@ def compare(
             total = torch.zeros((), dtype=dtype, device=device)
             for result in (result for result in results if result.requires_grad):
                 factors = torch.rand(result.shape, generator=random) * 2 - 0.5
-                # What is infinite or NaN would hide all gradients.
+                # Infinities and NaNs would hide all gradients.
                 total = total + (result * factors.to(result)).masked_fill(~result.detach().isfinite(), 0).sum()
             results += torch.autograd.grad(total, [given[key] for key in followed.split()])
         found.append([result.detach() for result in results])

@@ -1,6 +1,6 @@
 """All kernels, compiled for a GPU that need not be there: `python -m tests.kernels.triton.compile_all cuda 80`.
 
-The interpreter accepts what the compiler does not, such as a variable whose type changes in a loop.
+The interpreter accepts code that the compiler refuses, such as a variable that changes its type in a loop.
 """
 
 import sys
@@ -52,7 +52,7 @@ compiled: set[str] = set()
 
 
 def compile_only(kernel: JITFunction, programs: tuple[int, ...]) -> Callable[..., Any]:
-    """What starts a kernel, but only compiles it."""
+    """A launcher that only compiles its kernel."""
 
     def run(*arguments: Any, **constants: Any) -> Any:
         found = kernel.warmup(*arguments, grid=programs, **constants)
@@ -151,7 +151,7 @@ def marching() -> None:
 
 
 def octrees() -> None:
-    """Of one level and of two, with and without a choice by the width of pixels."""
+    """Octrees of one level and of two, with and without a choice by the width of pixels."""
     rays, leaves = random_rays(33), torch.tensor([[1, 2, 3], [4, 5, 6]])
     inner, _ = OctreeLayout.build(torch.zeros(3), 0.1, (1, 1, 1), leaves)
     outer, _ = OctreeLayout.build(inner.around(), 0.2, (1, 1, 1), leaves)

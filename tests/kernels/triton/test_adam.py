@@ -1,4 +1,4 @@
-"""Adam of rows: those with a gradient are updated, and no others."""
+"""Adam of rows: only rows with a gradient are updated."""
 
 import math
 

@@ -29,7 +29,7 @@ def test_harmonics_leave_gradients_to_the_reference() -> None:
 
 @pytest.mark.parametrize(("bands", "count"), [(1, 1), (2, 300), (3, 0), (4, 17), (5, 300)])
 def test_directional_encoding(bands: int, count: int) -> None:
-    """Poles and the equator, and roughness from none to that of a matt surface."""
+    """Directions include poles and the equator, and roughness goes from none to a matt surface's."""
     torch.manual_seed(bands)
     directions = torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
     directions[: min(count, 4)] = torch.tensor([[0.0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0]])[: min(count, 4)]

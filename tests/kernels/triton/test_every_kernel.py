@@ -1,4 +1,4 @@
-"""Every operation that Triton has, at random, extreme and no inputs: what `ns-bench gpu` prints."""
+"""Every operation that Triton has, at random, extreme and no inputs, as `ns-bench gpu` prints them."""
 
 import pytest
 
@@ -11,7 +11,7 @@ LARGEST = 1e-5
 
 @pytest.mark.slow  # every kernel has tests of its own beside this
 def test_errors_of_every_kernel_are_of_rounding() -> None:
-    """Those of differences that cancel are larger than others."""
+    """Errors of cancelling differences are larger than others."""
     rows = measured(DEVICE)
     for row in rows:
         print(row)

@@ -21,7 +21,7 @@ from tests.kernels.triton.test_march import in_float64, on_device
     ],
 )  # fmt: skip
 def test_slots_have_the_references_candidates(resolution: int, share: float, slices: int) -> None:
-    """Rounding decides about steps whose middle lies on a cell's face: one in a hundred, and one."""
+    """Rounding decides about steps with the middle on a cell's face: one in a hundred, and one."""
     rays, grid = random_rays(33), occupancy(resolution, share)
     if slices == 2:
         rays = replace(rays, times=torch.linspace(0, 1, 33))

@@ -28,7 +28,7 @@ def in_float64(rays: Rays, grid: Occupancy) -> tuple[Rays, Occupancy]:
     [(5, 0.3, 0.0), (33, 0.2, 1 / 64), pytest.param(8, 1.0, 1 / 64, marks=pytest.mark.slow), (8, 0.0, 0.0)],
 )
 def test_samples(resolution: int, share: float, cone: float) -> None:
-    """Rounding decides about steps whose middle lies on a cell's face: one in a hundred, and one."""
+    """Rounding decides about steps with the middle on a cell's face: one in a hundred, and one."""
     rays, grid = random_rays(33), occupancy(resolution, share)
     shift = torch.rand(33, generator=torch.Generator().manual_seed(1))
     with backends() as names:
@@ -106,7 +106,7 @@ def test_rays_that_miss_and_no_rays() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.2])
 def test_distances_of_blocks(share: float) -> None:
-    """As the processor's kernel finds them, up to the largest that is told apart."""
+    """They equal the CPU kernel's, up to the largest distance that is told apart."""
     grid = occupancy(70, 0.0)
     grid.occupied[: int(share * 70**3)] = torch.rand(int(share * 70**3)) > 0.99
     side = -(-70 // 4)

@@ -42,7 +42,7 @@ def test_learnt_leaves(grids: str, degree: int, stop: float) -> None:
         found = trace_octree(layout.to(raw.device), raw, coefficients, Rays(**rays), background, stop)
         return found.color, found.opacity, found.moment
 
-    # With a stop, rounding may end a ray one leaf earlier or later.
+    # Rounding may end a ray one leaf earlier or later if there is a stop.
     tolerance = 3e-3 if stop else TOLERANCE
     compare(light, {**given, "background": torch.rand(40, 3)}, "raw coefficients", tolerance)
 
@@ -64,7 +64,7 @@ def test_leaves_of_bytes(grids: str, width: float) -> None:
     compare(light, {**some_rays(40), "background": torch.rand(40, 3), "radii": width * torch.rand(40)}, "", TOLERANCE)
     one, two = (each.median.double().cpu() for each in found)
     assert ((one - two).abs() > 0.01).sum() <= 1  # a transmittance of 0.5 between two leaves
-    # Of several grids, rays also meet leaves over lengths of rounding, at the borders of grids.
+    # With several grids, rays also meet leaves over lengths of rounding, at the borders of grids.
     apart = (found[0].visits.cpu().long() - found[1].visits.cpu().long()).abs()
     assert (apart > 0).sum() <= (1 if levels == 1 else 8)
     assert apart.max() <= 2

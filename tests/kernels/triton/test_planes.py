@@ -28,7 +28,7 @@ def test_features(name: str, count: int, features: int) -> None:
 
 
 def test_extremes() -> None:
-    """Faces, corners, far outside and NaN; a table with zeros, through which no gradient is lost."""
+    """Positions are on faces, corners, far outside and NaN; zeros in the table lose no gradient."""
     torch.manual_seed(0)
     layout = LAYOUTS["vm"]
     places = [0.0, 1.0, -1e30, math.inf, 1 - 2**-24]

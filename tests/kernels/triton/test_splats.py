@@ -151,7 +151,7 @@ def test_blending(count: int, width: int, height: int, channels: int) -> None:
 
 
 def test_extremes_of_blending() -> None:
-    """A stack of walls, at which light ends within a batch and a pixel's alpha is at its bound; and thin veils."""
+    """A stack of walls ends light within a batch, with a pixel's alpha at its bound; and there are thin veils."""
     records = torch.zeros(30, RECORD)
     records[:, :2], records[:, WIDTHS] = torch.tensor([8.5, 7.5]), 0.05
     records[:, Record.OPACITY] = torch.tensor([0.004, 0.9, 1.0, 0.5, 0.99, 0.3] * 5)
@@ -159,12 +159,12 @@ def test_extremes_of_blending() -> None:
     records[:, Record.RED : Record.DISTANCE] = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
     records[:, Record.DISTANCE] = torch.arange(30.0) + 1
     given = {"records": records, "background": torch.zeros(3)}
-    compare(blended(16, 16, 4, median=True), given, "records", tolerance=1e-4)  # what is left is 1e-4 at most
+    compare(blended(16, 16, 4, median=True), given, "records", tolerance=1e-4)  # at most 1e-4 of the light is left
 
 
 @pytest.mark.parametrize("size", [(37, 41), pytest.param((60, 20), marks=pytest.mark.slow)])
 def test_growth_is_by_the_pixels_absolute_gradients(size: tuple[int, int]) -> None:
-    """As on the other backends: tests/kernels/test_growth.py."""
+    """The other backends are tested in tests/kernels/test_growth.py."""
     from nerfloom.kernels.splats.blend_triton import blend as triton_blend
 
     torch.manual_seed(5)

@@ -20,7 +20,7 @@ def test_random_images(shape: tuple[int, ...]) -> None:
 
 
 def test_extremes() -> None:
-    """The same image, black beside white, and values far outside [0, 1], whose similarity is next to 0."""
+    """The same image, black beside white, and values far outside [0, 1] with a similarity near 0."""
     torch.manual_seed(0)
     image = torch.rand(12, 11, 2)
     assert compare(ssim, {"image": image, "target": image})[0] == 1

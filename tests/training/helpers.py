@@ -264,7 +264,7 @@ def tiny_run(kind: str, data: Path, folder: Path, **changes: Any) -> Run:
 
 
 def tiny_trainer(kind: str, data: Path, folder: Path, evaluated: bool = False, **changes: Any) -> Trainer:
-    """A trainer whose folder exists."""
+    """A trainer with an existing folder."""
     run = tiny_run(kind, data, folder, **changes)
     create_folder(run)
     return Trainer.of(run, load_split(run, "train"), load_split(run, "val") if evaluated else None)
@@ -286,13 +286,13 @@ def assert_same_bits(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> 
 
 
 TRAINED = ("method", "scene", "transform", "scale", "model", "optimizer", "state", "errors")
-"""What a checkpoint holds of training; the settings name folders, which differ."""
+"""Parts of a checkpoint that training determines; the settings name folders, which differ."""
 CLOCKS = r"/state/(seconds|curve/\d+/[06]|looks/.*)"
-"""Where in it seconds are, and what follows them."""
+"""Places in a checkpoint with seconds, and with values that follow from them."""
 
 
 def said_otherwise(method: str, data: Path, folder: Path, facts: dict[str, Any], **settings: Any) -> Trainer:
-    """A trainer on a tiny data set, of whose scene other `facts` are said."""
+    """A trainer on a tiny data set with other `facts` of its scene."""
     still = tiny_trainer(method, data, folder / "still").train_set
     (folder / "run").mkdir()
     changed = dataclasses.replace(still, scene=dataclasses.replace(still.scene, **facts))
@@ -300,12 +300,12 @@ def said_otherwise(method: str, data: Path, folder: Path, facts: dict[str, Any],
 
 
 def chosen(trainer: Trainer) -> dict[str, str]:
-    """What was decided by the data, by name."""
+    """The decisions from the data, by name."""
     return {decision.option: decision.choice for decision in trainer.profile.decisions}
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """What the newest checkpoints of two runs' folders do not have in common, to the last bit; clocks do not count."""
+    """The differences between the newest checkpoints of two runs' folders, to the last bit; clocks do not count."""
     mine, theirs = _trained(first), _trained(second)
     return sorted(name for name in mine.keys() | theirs.keys() if not _same(mine.get(name), theirs.get(name)))
 

@@ -1,8 +1,7 @@
 """CUDA graphs in the place of a GPU: operations that are noted as they reach torch's dispatcher, and run again.
 
-As with a graph, what runs again are operations on the tensors that the recorded ones had, with the numbers of Python's
-that these had, and with fresh random numbers; recording itself changes nothing. What a GPU must be waited for cannot be
-recorded.
+As in a graph, the repeated operations use the tensors and Python numbers of the recorded ones, and fresh random
+numbers; recording itself changes nothing. An operation that waits for the GPU cannot be recorded.
 """
 
 from collections.abc import Callable
@@ -28,7 +27,7 @@ class Tape(TorchDispatchMode):
         self.own: set[int] = set()
         """Memory that operations on the tape have made."""
         self.before: dict[int, tuple[Tensor, Tensor]] = {}
-        """What else they have written to, and what it was."""
+        """Other memory that they have written to, and its earlier content."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -47,7 +46,7 @@ class Tape(TorchDispatchMode):
         return out
 
     def undo(self) -> None:
-        """Take back what was written."""
+        """Undo the writes."""
         for tensor, value in reversed(self.before.values()):
             tensor.copy_(value)
 

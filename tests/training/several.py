@@ -1,6 +1,6 @@
 """One of two processes that train together, for test_processes: `python -m tests.training.several DATA FOLDER PORT`.
 
-It leaves what it has in FOLDER/RANK.pt. At the end it runs ns-train, connected through another port.
+It leaves its state in FOLDER/RANK.pt. At the end it runs ns-train, connected through another port.
 """
 
 import math
@@ -52,7 +52,7 @@ class PartSource(PixelSource):
 
 
 def trainer_of_parts(data: Path, folder: Path) -> Trainer:
-    """A trainer without any random number but those that draw batches; its grid stays as it is."""
+    """A trainer with random numbers for batches only; its grid stays as it is."""
     trainer = tiny_trainer("instant-ngp", data, folder, adam_eps=1e-5, mixed_precision=False, thin_gradients=0)
     trainer.source = PartSource(trainer.train_set, "random", 7)
     sampler = trainer.model.sampler
@@ -77,7 +77,7 @@ def parts(data: Path, folder: Path) -> Found:
 
 
 def of_method(method: str, data: Path, folder: Path) -> Found:
-    """What a method has learnt, and its losses, which are those of this process's batches."""
+    """The parameters of a method, and its losses on this process's batches."""
     trainer = tiny_trainer(method, data, folder / method, max_num_iterations=METHODS[method])
     losses = [sum(trainer.train_step().losses.values()) for _ in range(METHODS[method])]
     trainer.train()
@@ -85,7 +85,7 @@ def of_method(method: str, data: Path, folder: Path) -> Found:
 
 
 def resumed(data: Path, folder: Path) -> Found:
-    """A run of one process, whose checkpoint the first alone reads."""
+    """A run of one process; only the first process reads its checkpoint."""
     trainer = tiny_trainer("instant-ngp", data, folder / f"resumed-{processes().rank}", max_num_iterations=2 * SHORT)
     if processes().first:
         content = load_newest(folder / "alone" / FOLDER)

@@ -1,4 +1,4 @@
-"""Teachers about which everything is known, and placements of an input that is far from its origin."""
+"""Fully known teachers, and placements of an input that is far from its origin."""
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ def placed(seed: int, scale: float) -> Placement:
 
 
 class Marble(Field):
-    """Smooth density around the origin, whose colour depends on position and direction."""
+    """Smooth density around the origin, with a colour that depends on position and direction."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class Marble(Field):
 
 
 def marble() -> RayModel:
-    """A model of the marble in a box, whose parts are known in closed form."""
+    """A model of the marble in a box, with parts in closed form."""
     scene = Scene(BOX, 1.0, 5.0, num_cameras=1, has_alpha=True, moving=False, image_size=24)
     config = RayConfig(mixed_precision=False)
     return RayModel(config, scene, Marble(), UniformSampler(64), VolumeRenderer()).eval()

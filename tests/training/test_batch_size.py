@@ -20,7 +20,7 @@ def steps(config: RayConfig, budget: float, fixed: float, each: float, slower: f
         budget: seconds of the run.
         fixed: seconds of a step without rays.
         each: seconds of a ray.
-        slower: ratio of all times in the second half of the run to those in the first.
+        slower: ratio of all times in the second half of the run to the times in the first.
     """
     sizes, seconds, rays = BatchSize(config, recorded=False), 0.0, []
     while seconds < budget:

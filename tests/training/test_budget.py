@@ -75,7 +75,7 @@ def test_no_limit_at_all_is_refused() -> None:
 
 
 def test_flags_recipes_and_runs_say_what_is_given(tiny: Path, tmp_path: Path) -> None:
-    """A method's number of steps is a default; what stands in a file or a flag is not, even if it is the same."""
+    """A method's number of steps is a default; a value in a file or a flag is not, even if it is the same."""
 
     def limits(run: Run) -> tuple[int | None, float | None]:
         return run.config.max_num_iterations, run.config.max_seconds

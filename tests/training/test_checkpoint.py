@@ -28,7 +28,7 @@ def test_the_two_newest_are_kept(tmp_path: Path) -> None:
 
 
 def test_a_damaged_later_one_pushes_nothing_out(tmp_path: Path) -> None:
-    """A run that went on from step 2, as what came after it cannot be read."""
+    """A run went on from step 2, because later checkpoints cannot be read."""
     paths = [save(tmp_path, step, keep_all=True) for step in (1, 2, 8, 9)]
     for path in paths[2:]:
         path.write_bytes(b"damaged")
@@ -44,7 +44,7 @@ def test_a_damaged_later_one_pushes_nothing_out(tmp_path: Path) -> None:
 
 
 def test_the_one_that_stays_can_be_read(tmp_path: Path) -> None:
-    """A run that went on from step 4, as that of step 8 is damaged, and is past it: the damaged one goes."""
+    """A run went on from step 4, because checkpoint 8 is damaged; past step 8, the damaged one is deleted."""
     for step in (2, 4, 8):
         save(tmp_path, step, keep_all=True)
     (tmp_path / "step-000000008.ckpt").write_bytes(b"damaged")
@@ -78,7 +78,7 @@ def test_one_cut_short_falls_back_to_the_one_before(
 
 
 def test_no_byte_may_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Those of a tensor least of all, which torch reads as they are."""
+    """This holds above all for the bytes of a tensor, because torch does not check them."""
     save(tmp_path, 1)
     newest = save(tmp_path, 2)
     whole = newest.read_bytes()
@@ -133,7 +133,7 @@ def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:
 
 
 def test_one_that_would_unfold_to_more_than_it_holds_is_refused(tmp_path: Path) -> None:
-    """torch compresses nothing, but unfolds what is: 10 kB may stand for 10 MB, and 10 MB for more than memory has."""
+    """torch unpacks compressed files too: 10 kB may stand for 10 MB, and 10 MB for more than memory has."""
     path = save(tmp_path, 1)
     with zipfile.ZipFile(path) as stored, zipfile.ZipFile(tmp_path / "bomb.ckpt", "w", zipfile.ZIP_DEFLATED) as packed:
         for name in stored.namelist():

@@ -1,4 +1,4 @@
-"""The learning curve: every run has one, it costs what is stated, and it changes nothing that is learnt."""
+"""The learning curve: every run has one, it has the stated cost, and it does not change training."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def written(trainer: Trainer) -> list[dict[str, Any]]:
 def test_every_run_has_a_curve_at_its_price(
     learnt: float, shown: float, rays_per_pixel: int, size: int, seconds: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By a clock of its own: short steps after a first one of a second, and pictures at a given speed."""
+    """A fake clock gives short steps after a first one of a second, and pictures at a given speed."""
     clock = [0.0]
     monkeypatch.setattr("nerfloom.training.curve.time.perf_counter", lambda: clock[0])
     few = FewImages.__new__(FewImages)

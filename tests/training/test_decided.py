@@ -1,4 +1,4 @@
-"""What was decided for a run is kept with it: in its config.yml, its checkpoints, and when it goes on."""
+"""Decisions for a run are kept with it: in its config.yml, its checkpoints, and when it goes on."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Steps that are recorded and repeated learn what steps learn; whatever fails is said, and changes nothing."""
+"""Recorded and repeated steps equal plain steps; a failure is reported, and changes nothing."""
 
 import dataclasses
 import functools
@@ -30,7 +30,7 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 from tests.training.recorded import FakeRecorder, ahead
 
 LEARN_UNTIL, STEPS = 6, 14
-"""Step until which proposals learn in every step here, and steps."""
+"""Number of steps while proposals learn in every step here, and number of all steps."""
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def repeat_by(trainer: Trainer, graphs: StepGraphs[Any]) -> None:
 
 @functools.cache
 def idle(method: str, moving: bool = False) -> Trainer:
-    """A trainer of a method, which is not trained; that of nerfacto is on an unbounded scene."""
+    """A trainer of a method, not trained; nerfacto's has an unbounded scene."""
     return trainer_of(method, Path("unused"), moving_ball if moving else None)
 
 
@@ -92,7 +92,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 COVERED = ("vanilla-nerf", "mip-nerf")
-"""Their parts are others' too: frequencies and two passes those of dnerf and nerf-plus-plus, cones of mip-nerf-360."""
+"""Other methods cover their parts: dnerf and nerf-plus-plus frequencies and two passes, mip-nerf-360 cones."""
 
 
 def mark_of(variant: str) -> list[Any]:
@@ -106,7 +106,7 @@ def mark_of(variant: str) -> list[Any]:
 def test_repeated_steps_learn_what_steps_learn(
     variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, said: list[str]
 ) -> None:
-    """To the bit, with rates, annealing and draws that differ from step to step."""
+    """All bits agree, with rates, annealing and draws that differ from step to step."""
     ahead(monkeypatch)
     monkeypatch.setattr(proposal, "ALWAYS_LEARN_UNTIL", LEARN_UNTIL)
     usual, repeating = (small(tmp_path / name, **VARIANTS[variant]) for name in ("usual", "repeating"))
@@ -164,7 +164,7 @@ def test_repeated_steps_with_an_occupancy_grid_learn_what_steps_learn(
     assert usual.state.samples_per_ray != State().samples_per_ray  # was read
     assert moving or len(kinds) > 1  # of 16 slices in time, 34 steps empty none
     assert recorder.repeated > steps / 4
-    assert len(recorder.tapes) <= len(kinds) + 1  # that of the first step
+    assert len(recorder.tapes) <= len(kinds) + 1  # one more for the first step
     assert said == ["training steps are captured as CUDA graphs and replayed"]
     assert repeating.model.sampler.capacity.left_out == 0
 
@@ -255,7 +255,7 @@ class Toy:
 def steps_of(
     toy: Toy, count: int, step: Callable[[], Tensor], seed: Callable[[], None], must: bool = False
 ) -> list[Tensor]:
-    """Results of some steps of a toy, whose rates differ."""
+    """Results of some steps of a toy, with rates that differ."""
     found, recorder = [], FakeRecorder()
     steps = StepGraphs[Tensor](recorder, lambda: [toy.weight], must)
     for toy.steps in range(count):
@@ -269,7 +269,7 @@ def steps_of(
 
 
 def truth(count: int) -> list[Tensor]:
-    """What the steps of a toy give."""
+    """The results of steps of a toy."""
     found, weight = [], torch.zeros(5)
     for number in range(count):
         torch.manual_seed(number)
@@ -331,7 +331,7 @@ def test_what_cannot_be_repeated_is_found_and_said(fault: str, said: list[str]) 
 
 
 def test_another_loss_is_found(said: list[str]) -> None:
-    """Though what is learnt is the same."""
+    """Another loss is found even if its gradient is the same."""
     toy = Toy()
 
     def step() -> Tensor:
@@ -370,7 +370,7 @@ def test_what_moves_later_is_found(said: list[str], monkeypatch: pytest.MonkeyPa
 
 
 def test_what_stays_infinite_is_alike(said: list[str]) -> None:
-    """As the density of cells that no step has looked at."""
+    """The density of cells that no step has looked at is infinite."""
     toy = Toy()
     toy.weight[0] = torch.inf
     steps_of(toy, 9, toy.step, toy.seed)
@@ -378,7 +378,7 @@ def test_what_stays_infinite_is_alike(said: list[str]) -> None:
 
 
 def test_few_kinds_are_kept(said: list[str]) -> None:
-    """Each holds memory: those that were taken last."""
+    """The last ones used are kept, because each holds memory."""
     toy = Toy()
     steps = StepGraphs[Tensor](recorder := FakeRecorder(), lambda: [toy.weight])
     for turn in range(2):
@@ -504,7 +504,7 @@ def test_graphs_are_recorded_on_the_stream_on_which_steps_warmed_up(monkeypatch:
     repeat()
     assert result == 4
     assert calls == [f"begin graph {own}", "step", f"end graph {own}", "replay"]
-    assert recorder.record(gc.isenabled)[0] is False  # what is freed meanwhile would spoil the recording
+    assert recorder.record(gc.isenabled)[0] is False  # memory freed meanwhile would spoil the recording
     assert gc.isenabled()
 
 
@@ -538,7 +538,7 @@ def test_a_recording_that_breaks_the_gpu_ends_the_run_in_a_line(
 
 
 def test_a_step_that_waits_for_the_gpu_is_not_recorded(monkeypatch: pytest.MonkeyPatch, said: list[str]) -> None:
-    """A recording of it would break what comes after; torch's warning of it tells the line of the program."""
+    """A recording of it would break later steps; torch's warning names the line of the program."""
     modes = ["default"]
 
     def set_mode(mode: str) -> None:

@@ -28,11 +28,11 @@ BOUNDS = {
     "neus": (1240, 0.3),
     "volsdf": (1190, 0.3),
 }
-"""Operations and waits of a step: what was counted when this was written, and a tenth more operations, in which
-torch's releases may differ. Marched samples take a fixed number of slots, so that only updates of the occupancy grid,
-in every eighth or sixteenth step, ask how many cells they look at. Whether a step is finite is asked for Gaussians
-alone, whose number changes. The choice of transparent pixels of a scene that moves would have a wait. Where rays start
-takes some 100 of those of methods for captures."""
+"""Operations and waits of a step: counted when this was written, plus a tenth more operations, because torch's releases
+may differ. Marched samples take a fixed number of slots, so that only updates of the occupancy grid,
+in every eighth or sixteenth step, ask how many cells they look at. Only for Gaussians, which change in number, is each
+step checked to be finite. The choice of transparent pixels of a scene that moves would have a wait. In methods for
+captures, some 100 operations find the starts of rays."""
 
 
 @pytest.fixture
@@ -113,7 +113,7 @@ def test_views_and_empty_tensors_are_no_operations_and_the_backward_pass_counts(
     assert forward.count == 2
     with Counting() as backward:
         loss.backward()
-    assert backward.count >= 3  # the product's gradient, and its place in that of all values
+    assert backward.count >= 3  # the product's gradient, and its place in the gradient of all values
 
 
 def test_errors_that_are_read_late_make_the_same_mean(shared_tiny: Path, tmp_path: Path) -> None:
@@ -140,5 +140,5 @@ def test_a_loss_is_found_bad_together_with_its_gradients(bad: float, monkeypatch
     assert weight.grad is None
     assert not backward(torch.tensor(bad), optimizer)
     assert backward(torch.tensor(1.0), optimizer)
-    assert not backward((weight - 1).sqrt().sum(), optimizer)  # 0, whose slope is infinite
+    assert not backward((weight - 1).sqrt().sum(), optimizer)  # 0, with an infinite slope
     assert optimizer.first_bad() is weight

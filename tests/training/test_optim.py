@@ -97,7 +97,7 @@ def test_a_state_of_other_groups_is_refused_and_changes_nothing() -> None:
 
 
 def test_a_gradient_that_no_step_took_is_gone_at_the_next() -> None:
-    """Of a step that was dropped, also where the gradient of a table is kept for the optimiser."""
+    """A dropped step's gradient is gone, also where a table's gradient is kept for the optimiser."""
     torch.manual_seed(0)
     encoding = HashGrid(3, 2, 4, 16, 8, True)
     deferred = {} if encoding.deferred is None else {encoding.table: encoding.deferred}
@@ -115,7 +115,7 @@ def test_a_gradient_that_no_step_took_is_gone_at_the_next() -> None:
 
 
 def test_a_gradient_that_waits_and_one_of_autograd_are_one_step() -> None:
-    """As where a table is looked up, and is a term of the loss itself too: Adam takes their sum."""
+    """If a table is looked up, and is a term of the loss itself too, Adam takes the sum of both gradients."""
     found = []
     for waits in (True, False):
         torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""Every method trains and renders on another device than the CPU, and learns there what it learns on the CPU."""
+"""Every method trains and renders on another device than the CPU, and learns the same there."""
 
 import dataclasses
 from pathlib import Path

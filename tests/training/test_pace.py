@@ -1,4 +1,4 @@
-"""Steps that are timed, and machines whose speed is measured."""
+"""Timed steps, and measured speeds of machines."""
 
 import dataclasses
 

@@ -59,7 +59,7 @@ def test_the_same_data_are_read_as_before(tmp_path: Path, capsys: pytest.Capture
 def test_without_a_photograph_the_others_stay_where_they_were(
     changes: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By the mean of those that are left, every one would be elsewhere."""
+    """The mean of the remaining positions would move every camera."""
     run = trained_on(tmp_path, Nerfstudio(), **changes)
     then = poses_of(run)
     without_a_photograph(run)
@@ -79,7 +79,7 @@ def test_without_a_photograph_the_others_stay_where_they_were(
 
 
 def test_a_placement_that_is_asked_for_is_that_of_the_run(tmp_path: Path) -> None:
-    """Whatever else is asked for, and for another part of the photographs."""
+    """Other settings, and another part of the photographs, do not change the placement."""
     run = trained_on(tmp_path, Nerfstudio())
     then = poses_of(run)
     without_a_photograph(run)

@@ -37,7 +37,7 @@ from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_trainer
 
 COUNT = 2
 STATISTICS = "model.strategy.gradients.sums"
-"""What each process has seen of its own images, until Gaussians are added the next time."""
+"""Statistics of each process over its own images, until Gaussians are added the next time."""
 
 
 def free_port() -> int:
@@ -88,7 +88,7 @@ def ended(process: subprocess.Popen[str]) -> str:
 
 @dataclasses.dataclass
 class Two:
-    """What two processes have left."""
+    """The files of two processes."""
 
     folder: Path
     found: list[dict[str, Any]]
@@ -124,7 +124,7 @@ def test_large_gradients_are_averaged_as_small_ones_are(monkeypatch: pytest.Monk
 
 @pytest.fixture(scope="module")
 def whole(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What this process alone finds of the whole batches."""
+    """This process's results on the whole batches."""
     return several.parts(shared_tiny, tmp_path_factory.mktemp("whole"))
 
 
@@ -332,7 +332,7 @@ def test_processes_of_a_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_one_process_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With torchrun's variables for one process, or with some of them, as other programs set them."""
+    """torchrun's variables are set for one process, or only some of them, as other programs set them."""
     for name, value in (("RANK", "0"), ("WORLD_SIZE", "1"), ("MASTER_ADDR", "127.0.0.1")):
         monkeypatch.setenv(name, value)
     with processes.joined_processes() as one:

@@ -1,4 +1,4 @@
-"""What stands for a run: its folder, its settings, or a folder above it, whose newest run is taken."""
+"""Paths of a run: its folder, its settings, or a folder above it, which stands for its newest run."""
 
 import os
 from pathlib import Path

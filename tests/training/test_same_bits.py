@@ -51,7 +51,7 @@ def test_another_seed_leaves_another_checkpoint(shared_tiny: Path, tmp_path: Pat
 def test_two_processes_leave_the_same_checkpoints(
     threads: int, kernels: str, shared_tiny: Path, tmp_path: Path
 ) -> None:
-    """However Python orders what it hashes, and whatever lay in memory before."""
+    """Python's order of hashed values, and the earlier content of memory, have no effect."""
     processes = [
         subprocess.Popen(
             [sys.executable, "-c", TRAIN, str(shared_tiny), str(tmp_path / str(index)), str(threads)],

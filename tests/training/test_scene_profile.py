@@ -1,4 +1,4 @@
-"""What is read from the data, what is decided by it, and that both are what the run then does."""
+"""Facts read from the data, decisions from them, and a run that follows both."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""--robust scout: which tiles a field's errors contradict, with people whose place is known, and the run around it."""
+"""--robust scout: the tiles that a field's errors contradict, with people at known places, and the run around it."""
 
 import dataclasses
 from pathlib import Path
@@ -87,7 +87,7 @@ def test_people_are_found_among_errors_of_texture(share: float) -> None:
     noise = 0.05 * torch.randn(errors.shape, generator=generator)
     out = contradicted(compared(errors + noise), tiles_of().neighbours()).view(there.shape)
     recall, precision = float(out[there].float().mean()), float(there[out].float().mean())
-    print(f"{share:.0%}: {recall:.0%} of people found, {precision:.0%} of what is left out are people")
+    print(f"{share:.0%}: {recall:.0%} of people found, {precision:.0%} of the left-out pixels are people")
     assert recall > 0.9
     assert precision > 0.5
 
@@ -186,7 +186,7 @@ def over_white(dataset: Dataset) -> Tensor:
 
 @pytest.mark.medium
 def test_discs_are_found_by_a_field_that_shows_what_is_behind_them() -> None:
-    """With three images from each camera. Four of eight see a place, and discs often cover nearly all of these."""
+    """Each camera has three images. Four of eight cameras see a place, and discs often cover nearly all."""
     clean = chosen(ball_in_a_box(96), [*range(8)] * 3)
     dataset = with_distractors(clean, 0.2)
     changed = (over_white(dataset) - over_white(clean)).abs().amax(-1)
@@ -205,7 +205,7 @@ def test_discs_are_found_by_a_field_that_shows_what_is_behind_them() -> None:
     assert not bool(found["clean"].any())
     recall = float(found["discs"][changed > 0.2].float().mean())
     precision = float((changed[found["discs"]] > 0.02).float().mean())
-    print(f"{recall:.0%} of the discs found, {precision:.0%} of what is left out are discs")
+    print(f"{recall:.0%} of the discs found, {precision:.0%} of the left-out pixels are discs")
     assert recall > 0.95
     assert precision > 0.5
 

@@ -1,4 +1,4 @@
-"""What is skipped is reported, can be switched off, and changes what is rendered as little as it says."""
+"""Each kind of skipping is reported, can be switched off, and changes renders within its stated bound."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -66,7 +66,7 @@ def test_every_switch_switches(shared_tiny: Path, tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_drawn_see_cells_alone_that_are_empty(tmp_path: Path) -> None:
-    """Along their rays, step by step, there is no cell left; and what is opaque is drawn."""
+    """Along their rays, step by step, no cell is left, and opaque pixels are drawn."""
     data = write_tiny(tmp_path / "ball", 64)
     trainer = tiny_trainer("instant-ngp", data, tmp_path / "run", grid_resolution=64)
     trainer.prepare()

@@ -1,4 +1,4 @@
-"""A teacher beside the photographs: its share, its frame, its rays, and what cannot teach."""
+"""A teacher beside the photographs: its share, its frame, its rays, and refused teachers."""
 
 import math
 from dataclasses import replace
@@ -69,7 +69,7 @@ def test_any_share_is_kept_from_the_first_step_on(share: float) -> None:
 
 
 class Named(BatchSource):
-    """Draws its own name, and notes what it is told."""
+    """Draws its own name, and records its arguments."""
 
     contradicted = None
 
@@ -310,7 +310,7 @@ def test_methods_learn_from_both(kind: str, shared_tiny: Path, tmp_path: Path) -
 
 @pytest.mark.medium
 def test_a_pupil_learns_what_the_teacher_knows() -> None:
-    """From its views alone; the photographs show a ball of other colours."""
+    """The pupil learns from the teacher's views alone; the photographs show a ball of other colours."""
     dataset, method = ball_in_a_box(), load_method("instant-ngp")
     teacher = octree_teacher(dataset)[2]
     config = replace(method.config, vis="none", max_num_iterations=150, **TINY["instant-ngp"])
@@ -346,7 +346,7 @@ def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp
 
 
 def test_a_run_knows_its_teacher(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From any folder."""
+    """The path of the teacher is found from any folder."""
     file = octree_file(tmp_path)
     monkeypatch.chdir(tmp_path)
     tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", teacher=Path(file.name), teacher_share=0.25)
@@ -358,7 +358,7 @@ def test_a_run_knows_its_teacher(shared_tiny: Path, tmp_path: Path, monkeypatch:
 
 
 def refused_teacher(shared_tiny: Path, tmp_path: Path, teacher: Path, kind: str = "instant-ngp") -> str:
-    """The one line in which a teacher is refused, before a step."""
+    """The one-line refusal of a teacher, before a step."""
     with pytest.raises(ConfigError) as error:
         tiny_trainer(kind, shared_tiny, tmp_path / "pupil", teacher=teacher)
     assert "\n" not in str(error.value)

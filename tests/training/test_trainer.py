@@ -32,11 +32,11 @@ from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, ti
 
 KINDS = list(TINY)
 RAY_KINDS = [kind for kind in TINY if kind not in ("gaussian-splatting", "moving-gaussians")]
-"""Those that render rays, in chunks."""
+"""Methods that render rays, in chunks."""
 
 
 QUICK = ("instant-ngp", "vanilla-nerf", "nerfacto", "gaussian-splatting")
-"""Those that learn, and render in chunks, in the fast set; test_check_method.py asks both of all, in less time."""
+"""Methods that learn, and render in chunks, in the fast set; test_check_method.py tests both for all, faster."""
 
 
 def quick(kinds: list[str]) -> list[Any]:
@@ -60,7 +60,7 @@ def test_it_learns(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
 
 
 FEW_RAYS = {"num_rays_per_batch": 48, "samples_per_batch": 1024}
-"""Smaller batches than those of tiny runs: what is equal to the bit need not learn much."""
+"""Smaller batches than in tiny runs: a comparison of bits needs little training."""
 
 
 @pytest.mark.medium
@@ -78,7 +78,7 @@ def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp
     assert first.eval_set is not None
     evaluate(first.model, first.eval_set)
     checkpoint = first.save()
-    torch.rand(7)  # whatever happens to the generator in between
+    torch.rand(7)  # other draws in between have no effect
     second = tiny_trainer(kind, shared_tiny, tmp_path / "second", **settings)
     second.restore(load_checkpoint(checkpoint))
     assert second.state.step == 13
@@ -416,7 +416,7 @@ def test_a_checkpoint_of_another_method_is_refused(shared_tiny: Path, tmp_path: 
 def test_rays_per_second_are_those_since_errors_were_read(
     shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a device that runs ahead, only a step that reads from it takes the time of those before it."""
+    """On a device that runs ahead, only a step that reads from it takes the time of the steps before it."""
     trainer = tiny_trainer("vanilla-nerf", shared_tiny, tmp_path, num_rays_per_batch=30)
     trainer.steps_per_read = 4
     trainer.prepare()
@@ -452,7 +452,7 @@ def test_a_trainer_without_a_folder_learns_the_same_and_writes_nothing(
 
 
 def test_what_others_have_set_is_not_started_anew(shared_tiny: Path, tmp_path: Path) -> None:
-    """As the Gaussians of a web page, which are set where a field has its surfaces."""
+    """The Gaussians of a web page, for example, are set where a field has its surfaces."""
     run = tiny_run("gaussian-splatting", shared_tiny, tmp_path, max_num_iterations=1, start="random")
     trainer = Trainer(load_method(run.method), run.config, load_split(run, "train"))
     trainer.prepare(start=False)

@@ -1,6 +1,6 @@
 """A step of nerfacto on a device that has no values: Python reads nothing from it, and brings it nothing but numbers.
 
-The device is PyTorch's "meta", whose tensors have sizes alone: to read a value is an error, and so is to compute with
+The device is PyTorch's "meta". Its tensors have sizes alone: to read a value is an error, and so is to compute with
 tensors of the CPU.
 """
 
@@ -97,7 +97,7 @@ def test_a_number_of_a_step_is_a_float_here_and_one_tensor_elsewhere(monkeypatch
 
 
 def test_draws_of_a_step_depend_on_seed_step_and_process_alone() -> None:
-    """Not on what was drawn before; on a GPU by the same seeds, and Philox's counter of draws since."""
+    """They do not depend on earlier draws; a GPU uses the same seeds, and Philox's counter of draws since."""
 
     def draws(seed: int, step: int, rank: int, before: int = 0) -> Tensor:
         torch.rand(before)
@@ -112,7 +112,7 @@ def test_draws_of_a_step_depend_on_seed_step_and_process_alone() -> None:
 
 
 def test_depths_that_are_not_known_do_not_count() -> None:
-    """As the mean over the rays whose distance is known, from the definition; 0 if none is."""
+    """The loss is the mean over the rays with a known distance, from the definition; 0 if none is known."""
     from nerfloom.geometry.rays import Samples
 
     torch.manual_seed(0)

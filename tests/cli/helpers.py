@@ -29,7 +29,7 @@ def run(name: str, *arguments: object, folder: Path | None = None) -> subprocess
 
 
 def called(name: str, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """The same within this process, which saves the second that a new one takes to begin; for what ends soon."""
+    """Run a short command within this process, which saves the second that a new process takes to begin."""
     return _called(_entry(name).load(), [name, *map(str, arguments)], folder)
 
 

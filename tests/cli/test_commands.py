@@ -58,7 +58,7 @@ def test_errors_are_one_line(arguments: list[str], words: str, tmp_path: Path) -
     ],
 )
 def test_a_flag_out_of_range_is_one_line(flag: str, value: str, words: str, beside: list[str]) -> None:
-    """In pairs of flags and values, beside a format's name, and beside a flag of several values."""
+    """The flag stands in pairs of flags and values, beside a format's name, and beside a flag of several values."""
     done = called("ns-train", "instant-ngp", flag, value, *beside)
     assert done.returncode == 2
     assert done.stderr.strip() == f"error: {words}"

@@ -1,4 +1,4 @@
-"""Where newcomers get stuck: each is answered in a line that says what to do, or simply works."""
+"""Where newcomers get stuck: each case works, or gets an error of one line with advice."""
 
 import json
 import shutil
@@ -150,6 +150,6 @@ def test_output_over_the_input(tmp_path: Path, refused: Refused) -> None:
         said = refused(process_data.main, "images", "--data", data, "--output-dir", folder.parent)
         assert words in said
         assert said.endswith(f"--output-dir {tmp_path / 'scan-processed'}")
-    shutil.move(folder, folder.with_name("raw"))  # beside what is written: nothing is in danger
+    shutil.move(folder, folder.with_name("raw"))  # beside the output: no file is in danger
     said = refused(process_data.main, "images", "--data", folder.with_name("raw"), "--output-dir", folder.parent)
     assert "has 'raw' but no transforms.json; choose a new folder or use --overwrite" in said

@@ -1,4 +1,4 @@
-"""What `--version --environment` prints, and that it prints on a broken installation too."""
+"""The output of `--version --environment`, also on a broken installation."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""ns-eval: its numbers against the pictures it writes, and what it says where something is wrong."""
+"""ns-eval: its numbers against the pictures it writes, and its errors."""
 
 import json
 import pickle

@@ -47,7 +47,7 @@ def written(file: Path, radius: float = 1.0, shift: float = 0.0) -> Path:
 
 
 def judge(run: Path, folder: Path, *flags: object) -> tuple[dict[str, Any], str]:
-    """The metrics of the surface, and what is printed."""
+    """The metrics of the surface, and the output."""
     done = called("ns-eval", run, "--output-path", folder / "e.json", "--max-images", 1, *flags)
     assert done.returncode == 0, done.stderr
     return json.loads((folder / "e.json").read_text())["geometry"], done.stderr
@@ -185,7 +185,7 @@ def test_missing_packages_are_named(ball: Path, tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_mesh_judged_by_itself(tmp_path: Path, ball: Path) -> None:
-    """What the exact surface itself would reach."""
+    """The exact surface is judged by itself."""
     reference = written(tmp_path / "true.ply")
     found, _ = judge(ball, tmp_path, "--reference-mesh", reference, "--mesh", reference)
     assert found["chamfer_percent"] < 1e-3

@@ -69,7 +69,7 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
         mesh = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
         assert len(mesh.visual.vertex_colors) == len(mesh.vertices)
         distances = np.linalg.norm(mesh.vertices, axis=1)
-        # What 200 steps on 20 x 20 pixels know; and no view sees the ball from below.
+        # 200 steps on 20 x 20 pixels are not exact, and no view sees the ball from below.
         assert np.median(np.abs(distances - 1)) < 0.2
         assert len(mesh.faces) > 300
         if "--target-num-faces" in flags:

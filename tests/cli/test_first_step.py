@@ -1,4 +1,4 @@
-"""The way to the first training step: what it must not import, since each of these takes a second or more."""
+"""The way to the first training step: it must not import packages that take a second or more."""
 
 import json
 import subprocess
@@ -45,7 +45,7 @@ SLOW = {
 
 @pytest.mark.medium
 def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
-    """Also with TensorBoard's files: what that alone imports comes after what is imported without.
+    """This holds with TensorBoard's files too: its own imports come after the others.
 
     Torch is imported from the start, and its own imports are not slow.
     """
@@ -67,7 +67,7 @@ for name, words, folder in json.load(sys.stdin):
     imported = [module for module in ("torch", "numpy") if module in sys.modules]
     print(json.dumps([done.returncode, done.stderr, imported]))
 """
-"""A program that runs commands, and prints the exit status of each, what it says, and which of two are imported."""
+"""A program that runs commands, and prints exit status and output of each, and which of two packages are imported."""
 PATHS = {
     "no data": ("ns-train", ["instant-ngp", "--data", "{0}/capturs"], "Did you mean 'capture'?"),
     "no output": ("ns-train", ["nerfacto", "--data", "{0}/capture", "--output-dir", "{0}/file/x"], "cannot write"),
@@ -94,7 +94,7 @@ def what_there_is(folder: Path) -> list[str]:
 
 
 def with_a_run(folder: Path) -> Path:
-    """Write a folder for data, a file, and a run without a checkpoint, whose data is not there."""
+    """Write a folder for data, a file, and a run without a checkpoint and without its data."""
     (folder / "capture").mkdir()
     (folder / "file").touch()
     run = folder / "outputs" / "one" / "m" / "t"

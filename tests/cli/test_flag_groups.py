@@ -32,7 +32,7 @@ FORMATS = (
     "blender", "colmap", "dnerf", "dtu", "llff", "nerfstudio", "phototourism", "polycam", "record3d", "sdfstudio",
 )  # fmt: skip
 QUICK = ("instant-ngp", "nerfacto", "vanilla-nerf", "blender", "nerfstudio")
-"""Of which help is read in the fast set: they have every box, and a format few flags or many."""
+"""Methods and formats with help read in the fast set: they have every box, and a format few flags or many."""
 Capture = pytest.CaptureFixture[str]
 
 
@@ -43,7 +43,7 @@ def one_column(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def boxes(said: str) -> dict[str, list[str]]:
-    """The flags of a help text, by the titles of the boxes that they are in, whose edges not every terminal shows."""
+    """The flags of a help text, by the titles of their boxes; not every terminal shows the edges."""
     found: dict[str, list[str]] = {}
     flags: list[str] = []
     for line in said.splitlines():
@@ -91,7 +91,7 @@ def test_every_flag_once_and_the_everyday_ones_first(method: str) -> None:
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])
 def test_the_short_help_shows_the_everyday_flags_alone(flag: str) -> None:
-    """Whatever the method and the data format are, and whatever other flags there are."""
+    """This holds for every method and data format, and beside other flags."""
     all_flags, short = help_of("nerfacto", "blender"), help_of("nerfacto", "--num-levels", "3", "blender", flag=flag)
     assert short == {"options": [], "everyday options": all_flags["everyday options"]}
     assert help_of("dnerf", flag=flag) == short
@@ -170,7 +170,7 @@ class Water:
 
 @dataclass(frozen=True)
 class Shared(SamplingConfig):
-    """What several methods of a plugin have in common."""
+    """Settings that several methods of a plugin share."""
 
     murk: float = 0.5
     """How little is seen

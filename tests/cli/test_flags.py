@@ -1,4 +1,4 @@
-"""Errors in the flags of any command: one line, which says what is wrong and where to look, and exit status 2."""
+"""Errors in the flags of any command: one line with the fault and a reference, and exit status 2."""
 
 import sys
 from importlib.metadata import entry_points
@@ -28,7 +28,7 @@ COMMANDS = {
     "ns-train": ["instant-ngp"],
     "ns-viewer": [],
 }
-"""Each command, and what it needs before its flags."""
+"""Each command, and the arguments before its flags."""
 
 
 def said(name: str, *words: object) -> str:
@@ -126,12 +126,12 @@ def test_what_is_said(name: str, words: list[str], line: str) -> None:
     ],
 )
 def test_a_value_out_of_range(name: str, words: list[object], line: str) -> None:
-    """As in ns-train, whose values are held by test_commands.py."""
+    """Other commands agree with ns-train, which test_commands.py covers."""
     assert said(name, *words) == f"error: {line}"
 
 
 def test_terminals_without_frames() -> None:
-    """Those that show ASCII alone."""
+    """Terminals that show ASCII alone."""
     box = (
         " Required options\n"
         " ---------------- \n"

@@ -1,4 +1,4 @@
-"""ns-new-method: what it writes is a method, and what it refuses."""
+"""ns-new-method: its file is a method, and its errors."""
 
 import ast
 import dataclasses
@@ -18,14 +18,14 @@ IGNORED = {"__pycache__", ".pytest_cache", "build"}
 
 
 def files(folder: Path) -> dict[str, str]:
-    """What a folder holds, less what Python leaves there."""
+    """The files of a folder, without Python's caches."""
     found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     kept = (path for path in found if not any(p in IGNORED or p.endswith(".egg-info") for p in path.parts))
     return {path.as_posix(): (folder / path).read_text(encoding="utf-8") for path in kept}
 
 
 def test_the_example_is_what_the_command_writes() -> None:
-    """To renew it: rm -r examples/plugin-method; ns-new-method dense-grid --dir examples/plugin-method"""
+    """Commands to renew it: rm -r examples/plugin-method; ns-new-method dense-grid --dir examples/plugin-method"""
     assert files(EXAMPLE) == package_of("dense-grid")
 
 
@@ -58,7 +58,7 @@ def test_it_writes_a_package_and_says_how_to_go_on(
 
 
 def test_no_class_hides_what_it_imports() -> None:
-    """Whatever the name: what the file defines ends in what it does not import."""
+    """No name defined in the file ends like an imported one, for every name of a method."""
     (template,) = (TEMPLATES / "src").iterdir()
     tree = ast.parse(template.read_text(encoding="utf-8").replace("${Class}", "Any").replace("$", ""))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}

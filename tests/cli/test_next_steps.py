@@ -1,4 +1,4 @@
-"""What a training names at its end: commands for the run that suit its data."""
+"""The commands that a training prints at its end: they suit the run and its data."""
 
 import shlex
 from dataclasses import replace

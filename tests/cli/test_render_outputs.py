@@ -1,4 +1,4 @@
-"""ns-render: what its files hold, against a ball whose distance from every camera is known; and renders that go on."""
+"""ns-render: its files against a ball at a known distance from every camera, and resumed renders."""
 
 import errno
 import json
@@ -27,7 +27,7 @@ from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, POINTS, WIDTH, po
 from tests.training.helpers import tiny_trainer
 
 CENTER, RADIUS = POINTS.mean(0), 0.4
-"""Of the ball, in the frame and the units of the input."""
+"""Centre and radius of the ball, in the frame and the units of the input."""
 FEW = ("--max-num-iterations", 1, "--max-eval-images", 0)
 
 
@@ -45,7 +45,7 @@ def ball_run(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def distances(origins: np.ndarray, directions: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
-    """Of a ball along rays; NaN where they miss it."""
+    """Distances of a ball along rays; NaN where they miss it."""
     away = origins - center
     half = (away * directions).sum(-1)
     with np.errstate(invalid="ignore"):
@@ -75,7 +75,7 @@ def shows_a_ball(monkeypatch: pytest.MonkeyPatch, capture_run: Path) -> float:
 
 
 def expected_distances(pose: np.ndarray) -> np.ndarray:
-    """Of the ball in a photograph, from the cameras of the input alone."""
+    """Distances of the ball in a photograph, from the cameras of the input alone."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     local = np.stack([(columns - CX) / FX, -(rows - CY) / FY, -np.ones_like(rows)], axis=-1)
     directions = local @ pose[:3, :3].T
@@ -376,7 +376,7 @@ def test_a_video_has_the_size_the_opening_and_the_length_that_are_asked_for(
 def test_a_path_around_exports_is_in_their_frame(
     capture_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A camera where a photograph's is in the frame of the input sees what the photograph does in the scene."""
+    """A camera at a photograph's pose in the frame of the input sees the photograph's part of the scene."""
     asked: list[View] = []
 
     def render_view(model: Any, view: View, background: Tensor) -> Picture:

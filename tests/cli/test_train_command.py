@@ -1,4 +1,4 @@
-"""ns-train on bad input, damaged files and recipes: one line that says what, where and what to do."""
+"""ns-train on bad input, damaged files and recipes: one line with the fault, the place and advice."""
 
 import json
 import re
@@ -188,7 +188,7 @@ def test_help_of_a_method_states_its_own_defaults(shared_tiny: Path) -> None:
 
 @pytest.mark.parametrize("flag", ["--help", "--version"])
 def test_what_answers_at_once_imports_little(flag: str) -> None:
-    """Of other packages rich alone; torch or a method would take a second."""
+    """rich is the only other package imported; torch or a method would take a second."""
     code = "import sys; from nerfloom.cli.train import main; main(); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code, flag], capture_output=True, text=True, check=True)
     imported = set(done.stdout.splitlines()[-1].split())
